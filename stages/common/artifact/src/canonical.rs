@@ -1,0 +1,91 @@
+use serde::Serialize;
+use serde_json::Value;
+
+/// The canonical JSON of a value: keys sorted, no white space, numbers as `serde_json` prints them. Only this form is hashed.
+///
+/// # Panics
+/// When the value can't be JSON at all (a map with keys that aren't strings): a programming error.
+pub fn canonical(value: &impl Serialize) -> String {
+    let value = serde_json::to_value(value).expect("hashed types serialise to JSON");
+    let mut text = String::new();
+    write(&value, &mut text);
+    text
+}
+
+/// The blake3 of [`canonical`], in hexadecimal.
+pub fn hash_json(value: &impl Serialize) -> String {
+    blake3::hash(canonical(value).as_bytes()).to_hex().to_string()
+}
+
+fn write(value: &Value, out: &mut String) {
+    match value {
+        Value::Object(map) => {
+            // Sorted here, because `serde_json` keeps insertion order once any crate asks for its `preserve_order`.
+            let mut entries: Vec<_> = map.iter().collect();
+            entries.sort_by_key(|(key, _)| key.as_str());
+            out.push('{');
+            for (i, (key, value)) in entries.into_iter().enumerate() {
+                if i > 0 {
+                    out.push(',');
+                }
+                out.push_str(&Value::from(key.as_str()).to_string());
+                out.push(':');
+                write(value, out);
+            }
+            out.push('}');
+        }
+        Value::Array(items) => {
+            out.push('[');
+            for (i, item) in items.iter().enumerate() {
+                if i > 0 {
+                    out.push(',');
+                }
+                write(item, out);
+            }
+            out.push(']');
+        }
+        other => out.push_str(&other.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn any_json() -> impl Strategy<Value = Value> {
+        let leaf = prop_oneof![
+            Just(Value::Null),
+            any::<bool>().prop_map(Value::from),
+            any::<i64>().prop_map(Value::from),
+            any::<f64>().prop_filter("finite", |x| x.is_finite()).prop_map(Value::from),
+            ".*".prop_map(Value::from),
+        ];
+        leaf.prop_recursive(4, 32, 6, |inner| {
+            prop_oneof![
+                prop::collection::vec(inner.clone(), 0..6).prop_map(Value::from),
+                prop::collection::vec((".*", inner), 0..6).prop_map(|v| Value::Object(v.into_iter().collect())),
+            ]
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn canonical_form_parses_back_and_is_stable(value in any_json()) {
+            let text = canonical(&value);
+            let back: Value = serde_json::from_str(&text).unwrap();
+            prop_assert_eq!(&back, &value);
+            prop_assert_eq!(canonical(&back), text);
+        }
+
+        #[test]
+        fn key_order_does_not_matter(mut entries in prop::collection::btree_map(".*", any::<i32>(), 0..8)) {
+            let forward: serde_json::Map<_, _> = entries.iter().map(|(k, v)| (k.clone(), (*v).into())).collect();
+            let mut backward = serde_json::Map::new();
+            while let Some((k, v)) = entries.pop_last() {
+                backward.insert(k, v.into());
+            }
+            prop_assert_eq!(hash_json(&forward), hash_json(&backward));
+        }
+    }
+}

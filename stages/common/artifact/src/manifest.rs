@@ -1,0 +1,247 @@
+use std::fs::{self, File};
+use std::io;
+use std::path::{Component, Path, PathBuf};
+
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::canonical::hash_json;
+
+/// The manifest's name inside an artifact.
+pub const MANIFEST_FILE: &str = "artifact.json";
+
+/// Version of the manifest's own form.
+const SCHEMA: u32 = 1;
+
+/// `artifact.json`: what an artifact is made of. Who made it, when and from what is not here: two actions may end in one object.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Manifest {
+    /// Kind of artifact: `dataset`, `scene`, `field`, `views`, `metrics`, …
+    pub kind: String,
+    /// Version of the manifest's form.
+    pub schema: u32,
+    /// Every file but the manifest, sorted by path.
+    pub files: Vec<FileEntry>,
+}
+
+/// A file of an artifact.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct FileEntry {
+    /// Path inside the artifact, `/` between the parts.
+    pub path: String,
+    /// Size in bytes.
+    pub size: u64,
+    /// blake3 of the content, hexadecimal.
+    pub blake3: String,
+}
+
+/// A file that isn't what the manifest says.
+#[derive(Debug, thiserror::Error)]
+pub enum Damage {
+    /// The file is not there or can't be read.
+    #[error("{path}: {source}; the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// The size differs.
+    #[error("{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    Size {
+        /// The file.
+        path: PathBuf,
+        /// Size by the manifest.
+        expected: u64,
+        /// Size on disk.
+        found: u64,
+    },
+    /// The content differs.
+    #[error("{path}: the content is not what was written (blake3 differs); the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    Content {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The manifest itself can't be used.
+    #[error("{path}: not a manifest: {reason}")]
+    Manifest {
+        /// The manifest.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Manifest {
+    /// Hashes every file below `folder` (but its manifest).
+    pub fn of_folder(kind: &str, folder: &Path) -> io::Result<Self> {
+        let mut files = hash_folder(folder)?;
+        files.retain(|f| f.path != MANIFEST_FILE);
+        Ok(Self { kind: kind.to_owned(), schema: SCHEMA, files })
+    }
+
+    /// Reads `folder/artifact.json`, refusing paths that would leave the folder.
+    pub fn read(folder: &Path) -> Result<Self, Damage> {
+        let path = folder.join(MANIFEST_FILE);
+        let bytes = fs::read(&path).map_err(|source| Damage::Unreadable { path: path.clone(), source })?;
+        let invalid = |reason: String| Damage::Manifest { path: path.clone(), reason };
+        let manifest: Self = serde_json::from_slice(&bytes).map_err(|e| invalid(e.to_string()))?;
+        if manifest.schema != SCHEMA {
+            return Err(invalid(format!("schema {} where {SCHEMA} is known", manifest.schema)));
+        }
+        for file in &manifest.files {
+            relative_path(&file.path).map_err(invalid)?;
+        }
+        if !manifest.files.is_sorted_by(|a, b| a.path < b.path) {
+            return Err(invalid("files are not sorted by path".to_owned()));
+        }
+        Ok(manifest)
+    }
+
+    /// The artifact's identity: blake3 of the manifest's canonical JSON.
+    pub fn identity(&self) -> String {
+        hash_json(self)
+    }
+
+    /// The manifest of a folder inside the artifact, its kind `KIND/FOLDER`.
+    pub fn subtree(&self, folder: &str) -> Self {
+        let prefix = format!("{folder}/");
+        let inside = |f: &FileEntry| {
+            f.path.strip_prefix(&prefix).map(|path| FileEntry { path: path.to_owned(), ..f.clone() })
+        };
+        Self {
+            kind: format!("{}/{folder}", self.kind),
+            schema: self.schema,
+            files: self.files.iter().filter_map(inside).collect(),
+        }
+    }
+
+    /// Bytes of all files.
+    pub fn size(&self) -> u64 {
+        self.files.iter().map(|f| f.size).sum()
+    }
+
+    /// Checks that every file is there with its size. Cheap: no content is read.
+    pub fn check_sizes(&self, folder: &Path) -> Result<(), Damage> {
+        for file in &self.files {
+            let path = folder.join(&file.path);
+            match fs::metadata(&path) {
+                Ok(meta) if meta.len() == file.size => {}
+                Ok(meta) => return Err(Damage::Size { path, expected: file.size, found: meta.len() }),
+                Err(source) => return Err(Damage::Unreadable { path, source }),
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks every file's size and content; names the first that differs.
+    pub fn check_contents(&self, folder: &Path) -> Result<(), Damage> {
+        self.check_sizes(folder)?;
+        let checks: Vec<Result<(), Damage>> = self
+            .files
+            .par_iter()
+            .map(|file| {
+                let path = folder.join(&file.path);
+                match hash_file(&path) {
+                    Ok(hash) if hash == file.blake3 => Ok(()),
+                    Ok(_) => Err(Damage::Content { path }),
+                    Err(source) => Err(Damage::Unreadable { path, source }),
+                }
+            })
+            .collect();
+        checks.into_iter().collect()
+    }
+}
+
+/// Path, size and blake3 of every file below `folder`, sorted by path. Symbolic links are followed.
+pub fn hash_folder(folder: &Path) -> io::Result<Vec<FileEntry>> {
+    let mut found = Vec::new();
+    for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
+        let entry = entry.map_err(io::Error::from)?;
+        if entry.file_type().is_file() {
+            let relative = entry.path().strip_prefix(folder).map_err(io::Error::other)?;
+            let path = relative
+                .components()
+                .map(|part| part.as_os_str().to_str())
+                .collect::<Option<Vec<_>>>()
+                .ok_or_else(|| io::Error::other(format!("{}: a file name that isn't UTF-8", entry.path().display())))?
+                .join("/");
+            found.push((path, entry.into_path()));
+        }
+    }
+    let mut files: Vec<FileEntry> = found
+        .into_par_iter()
+        .map(|(path, file)| Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? }))
+        .collect::<io::Result<_>>()?;
+    files.sort();
+    Ok(files)
+}
+
+fn hash_file(path: &Path) -> io::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(File::open(path)?)?;
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// A path from a file that may be hostile: relative, `/`-separated, never upwards.
+pub fn relative_path(text: &str) -> Result<PathBuf, String> {
+    let path = Path::new(text);
+    let plain = path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    if text.is_empty() || !plain || text.contains('\0') {
+        return Err(format!("{text:?} is not a path inside the folder"));
+    }
+    Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn example() -> (tempfile::TempDir, Manifest) {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("train")).unwrap();
+        fs::write(dir.path().join("train/a.txt"), "alpha").unwrap();
+        fs::write(dir.path().join("b.txt"), "beta").unwrap();
+        let manifest = Manifest::of_folder("scene", dir.path()).unwrap();
+        (dir, manifest)
+    }
+
+    #[test]
+    fn files_are_sorted_and_hashed() {
+        let (_dir, manifest) = example();
+        let paths: Vec<_> = manifest.files.iter().map(|f| f.path.as_str()).collect();
+        assert_eq!(paths, ["b.txt", "train/a.txt"]);
+        assert_eq!(manifest.files[0].blake3, blake3::hash(b"beta").to_hex().as_str());
+    }
+
+    #[test]
+    fn a_subtree_depends_on_nothing_outside_it() {
+        let (dir, before) = example();
+        fs::write(dir.path().join("b.txt"), "changed").unwrap();
+        let after = Manifest::of_folder("scene", dir.path()).unwrap();
+        assert_ne!(before.identity(), after.identity());
+        assert_eq!(before.subtree("train").identity(), after.subtree("train").identity());
+        assert_eq!(after.subtree("train").files[0].path, "a.txt");
+    }
+
+    #[test]
+    fn a_flipped_byte_is_noticed_and_named() {
+        let (dir, manifest) = example();
+        manifest.check_contents(dir.path()).unwrap();
+        fs::write(dir.path().join("train/a.txt"), "alphA").unwrap();
+        manifest.check_sizes(dir.path()).unwrap();
+        let damage = manifest.check_contents(dir.path()).unwrap_err();
+        assert!(matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")), "{damage}");
+    }
+
+    #[test]
+    fn a_manifest_can_not_point_outside() {
+        for path in ["../x", "/etc/passwd", "a/../../x", "", "a\0b"] {
+            assert!(relative_path(path).is_err(), "{path:?}");
+        }
+        assert_eq!(relative_path("./train/r_0").unwrap(), Path::new("train/r_0"));
+    }
+}

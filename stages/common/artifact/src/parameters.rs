@@ -1,0 +1,105 @@
+use serde_json::{Map, Value};
+
+/// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and in the stage alike.
+pub struct Schema {
+    schema: Value,
+    validator: jsonschema::Validator,
+}
+
+/// A parameter that doesn't fit, in words for a person.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("parameter {name}: {problem}")]
+pub struct ParameterProblem {
+    /// The parameter.
+    pub name: String,
+    /// What is wrong and what would be right.
+    pub problem: String,
+}
+
+impl Schema {
+    /// Compiles the schema of `describe`; the error says what is wrong with it.
+    pub fn new(schema: &Value) -> Result<Self, String> {
+        let validator = jsonschema::validator_for(schema).map_err(|e| format!("not a JSON Schema: {e}"))?;
+        Ok(Self { schema: schema.clone(), validator })
+    }
+
+    /// Names of all parameters, sorted.
+    pub fn names(&self) -> Vec<&str> {
+        let mut names: Vec<_> = self.properties().map(|p| p.keys().map(String::as_str).collect()).unwrap_or_default();
+        names.sort_unstable();
+        names
+    }
+
+    /// Every parameter with its value: the given one, else the default. The result is what is hashed and passed to the stage.
+    pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
+        let mut resolved = Map::new();
+        for (name, property) in self.properties().into_iter().flatten() {
+            if let Some(default) = property.get("default") {
+                resolved.insert(name.clone(), default.clone());
+            }
+        }
+        let mut problems = Vec::new();
+        for (name, value) in given {
+            if self.properties().is_some_and(|p| p.contains_key(name)) {
+                resolved.insert(name.clone(), value.clone());
+            } else {
+                let known = self.names();
+                let known = if known.is_empty() { "there are none".to_owned() } else { format!("known: {}", known.join(", ")) };
+                problems.push(ParameterProblem { name: name.clone(), problem: format!("unknown; {known}") });
+            }
+        }
+        let resolved = Value::Object(resolved);
+        for error in self.validator.iter_errors(&resolved) {
+            let path = error.instance_path().to_string();
+            let name = path.trim_start_matches('/').to_owned();
+            let name = if name.is_empty() { "(all)".to_owned() } else { name };
+            problems.push(ParameterProblem { name, problem: error.to_string() });
+        }
+        if problems.is_empty() { Ok(resolved) } else { Err(problems) }
+    }
+
+    fn properties(&self) -> Option<&Map<String, Value>> {
+        self.schema.get("properties").and_then(Value::as_object)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn schema() -> Schema {
+        Schema::new(&json!({
+            "type": "object",
+            "additionalProperties": false,
+            "properties": {
+                "scale": {"type": "integer", "minimum": 1, "default": 2},
+                "kernel": {"type": "string", "enum": ["box", "lanczos"], "default": "lanczos"}
+            }
+        }))
+        .unwrap()
+    }
+
+    fn resolve(given: Value) -> Result<Value, Vec<ParameterProblem>> {
+        schema().resolve(given.as_object().unwrap())
+    }
+
+    #[test]
+    fn defaults_are_filled_in() {
+        assert_eq!(resolve(json!({"scale": 4})).unwrap(), json!({"kernel": "lanczos", "scale": 4}));
+    }
+
+    #[test]
+    fn unknown_names_types_and_ranges_are_refused() {
+        for (given, name, word) in [
+            (json!({"kernal": "box"}), "kernal", "known: kernel, scale"),
+            (json!({"scale": 0}), "scale", "minimum"),
+            (json!({"scale": "two"}), "scale", "integer"),
+            (json!({"kernel": "gauss"}), "kernel", "lanczos"),
+        ] {
+            let problems = resolve(given).unwrap_err();
+            assert_eq!(problems[0].name, name);
+            assert!(problems[0].problem.contains(word), "{}", problems[0]);
+        }
+    }
+}

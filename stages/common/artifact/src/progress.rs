@@ -1,0 +1,117 @@
+use std::io::{IsTerminal, Write};
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+/// How a stage shows that it is getting on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum ProgressMode {
+    /// A bar on a terminal, a line every ten seconds elsewhere.
+    Plain,
+    /// JSON lines on stdout, for the runner.
+    Json,
+    /// Nothing.
+    None,
+}
+
+/// A line of `--progress json`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "event", rename_all = "lowercase")]
+pub enum Event {
+    /// `done` of `total` steps of `label`.
+    Progress {
+        /// What is being done.
+        label: String,
+        /// Steps done.
+        done: u64,
+        /// Steps in all.
+        total: u64,
+        /// A figure that matters (loss, PSNR), in a few words.
+        note: String,
+    },
+}
+
+/// Progress of one piece of long work. Cheap to call often: at most ten updates a second leave it.
+pub struct Progress {
+    label: String,
+    total: u64,
+    mode: ProgressMode,
+    bar: Option<indicatif::ProgressBar>,
+    state: Mutex<State>,
+}
+
+struct State {
+    done: u64,
+    note: String,
+    started: Instant,
+    shown: Option<Instant>,
+}
+
+impl Progress {
+    /// Starts at 0 of `total`.
+    pub fn new(label: &str, total: u64, mode: ProgressMode) -> Self {
+        let bar = (mode == ProgressMode::Plain && std::io::stderr().is_terminal()).then(|| {
+            let style = indicatif::ProgressStyle::with_template("{prefix:>14} [{bar:30}] {percent:>3}% {msg} · {eta} left")
+                .expect("the template is constant");
+            indicatif::ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned())
+        });
+        let state = State { done: 0, note: String::new(), started: Instant::now(), shown: None };
+        Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state) }
+    }
+
+    /// Sets the count.
+    pub fn set(&self, done: u64, note: &str) {
+        self.update(|state| {
+            state.done = done;
+            note.clone_into(&mut state.note);
+        });
+    }
+
+    /// Adds to the count: for work that ends in any order.
+    pub fn add(&self, steps: u64) {
+        self.update(|state| state.done += steps);
+    }
+
+    fn update(&self, change: impl FnOnce(&mut State)) {
+        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        change(&mut state);
+        let interval = if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
+        let last = state.shown.unwrap_or(state.started);
+        let due = last.elapsed() >= Duration::from_millis(interval);
+        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.shown.is_some())) {
+            return;
+        }
+        state.shown = Some(Instant::now());
+        if let Some(bar) = &self.bar {
+            bar.set_position(state.done);
+            bar.set_message(state.note.clone());
+        } else if self.mode == ProgressMode::Json {
+            let event =
+                Event::Progress { label: self.label.clone(), done: state.done, total: self.total, note: state.note.clone() };
+            let line = serde_json::to_string(&event).expect("an event is plain JSON");
+            // A runner that went away is no reason to stop: the stage's work still counts.
+            writeln!(std::io::stdout(), "{line}").ok();
+        } else {
+            let left = eta(state.started.elapsed(), state.done, self.total);
+            eprintln!("{}: {} of {} {} · {left} left", self.label, state.done, self.total, state.note);
+        }
+    }
+}
+
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Time left in words, from the time taken so far.
+pub fn eta(elapsed: Duration, done: u64, total: u64) -> String {
+    if done == 0 {
+        return "?".to_owned();
+    }
+    let seconds = elapsed.as_secs_f64() * total.saturating_sub(done) as f64 / done as f64;
+    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) }
+}

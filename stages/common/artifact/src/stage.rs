@@ -1,0 +1,381 @@
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context as _, anyhow};
+use clap::{CommandFactory, Parser};
+use schemars::JsonSchema;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
+
+use crate::describe::{Description, Input, Output};
+use crate::failure::{Failure, FailureExt, exit_code, one_line};
+use crate::fsio::write_json;
+use crate::manifest::{MANIFEST_FILE, Manifest};
+use crate::parameters::Schema;
+use crate::progress::{Progress, ProgressMode};
+
+/// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
+pub const SUMMARY_FILE: &str = "summary.txt";
+
+/// A stage of the pipeline: inputs and parameters in, one artifact out.
+pub trait Stage {
+    /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default, deny_unknown_fields)]` is expected.
+    type Params: Serialize + DeserializeOwned + JsonSchema + Default;
+    /// Name of stage and binary.
+    const NAME: &'static str;
+    /// What it makes of what, in a sentence.
+    const SUMMARY: &'static str;
+    /// Whether it shows a run and is never cached.
+    const SINK: bool = false;
+
+    /// Inputs by name.
+    fn inputs() -> Vec<(&'static str, Input)> {
+        Vec::new()
+    }
+
+    /// What comes out.
+    fn output() -> Output;
+
+    /// Does the work: reads inputs and writes outputs through `context`.
+    fn run(context: &Context, params: &Self::Params) -> anyhow::Result<()>;
+
+    /// What `describe` prints; `code` is the build's fingerprint.
+    fn describe(version: &str, code: &str) -> Description {
+        Description {
+            name: Self::NAME.to_owned(),
+            version: version.to_owned(),
+            code: code.to_owned(),
+            summary: Self::SUMMARY.to_owned(),
+            parameters: schemars::schema_for!(Self::Params).to_value(),
+            inputs: Self::inputs().into_iter().map(|(name, input)| (name.to_owned(), input)).collect(),
+            output: Self::output(),
+            environment: Vec::new(),
+            sink: Self::SINK,
+        }
+    }
+}
+
+#[derive(Parser)]
+#[command(subcommand_negates_reqs = true, args_conflicts_with_subcommands = true)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Option<Command>,
+    /// JSON file with the parameters; those it leaves out have their defaults
+    #[arg(long, value_name = "FILE")]
+    params: Option<PathBuf>,
+    /// One input, e.g. --input scene=DIR; repeat for more
+    #[arg(long = "input", value_name = "NAME=DIR")]
+    inputs: Vec<String>,
+    /// Folder to make; it must not exist yet and appears only when complete
+    #[arg(long, value_name = "DIR", required = true)]
+    output: Option<PathBuf>,
+    /// Private folder that survives an interruption (checkpoints)
+    #[arg(long, value_name = "DIR")]
+    work: Option<PathBuf>,
+    /// Where to compute: cpu or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Threads to use; the result doesn't depend on it [default: all cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// How to show progress
+    #[arg(long, value_enum, default_value = "plain")]
+    progress: ProgressMode,
+}
+
+#[derive(clap::Subcommand)]
+enum Command {
+    /// Print name, code fingerprint, parameters, inputs and output as JSON
+    Describe,
+    /// Print shell completions
+    Completions {
+        /// For which shell
+        shell: clap_complete::Shell,
+    },
+}
+
+/// What a running stage has at hand.
+pub struct Context {
+    /// Threads to use (rayon's global pool has this size).
+    pub threads: usize,
+    /// Where to compute: `cpu` or `cuda:N`.
+    pub device: String,
+    inputs: BTreeMap<String, GivenInput>,
+    output: PathBuf,
+    work: Option<PathBuf>,
+    progress: ProgressMode,
+    interrupted: Arc<AtomicBool>,
+}
+
+/// An input that was given: a folder, checked against its manifest where it has one.
+#[derive(Debug, Clone)]
+pub struct GivenInput {
+    name: String,
+    folder: PathBuf,
+}
+
+impl GivenInput {
+    /// A folder under an input's name. With a manifest in it or above it (a subtree), its files are checked first.
+    pub fn open(name: &str, folder: &Path) -> anyhow::Result<Self> {
+        if !folder.exists() {
+            return Err(Failure::BadInput(format!("input {name}: {}: no such folder", folder.display())).into());
+        }
+        let absolute = folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
+        if absolute.join(MANIFEST_FILE).is_file() {
+            Manifest::read(&absolute)
+                .and_then(|manifest| manifest.check_contents(&absolute))
+                .bad_input(format!("input {name}"))?;
+        } else if let (Some(parent), Some(subtree)) = (absolute.parent(), absolute.file_name().and_then(|n| n.to_str()))
+            && parent.join(MANIFEST_FILE).is_file()
+        {
+            Manifest::read(parent)
+                .and_then(|manifest| manifest.subtree(subtree).check_contents(&absolute))
+                .bad_input(format!("input {name}"))?;
+        }
+        Ok(Self { name: name.to_owned(), folder: folder.to_path_buf() })
+    }
+
+    /// The folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// A file of the input.
+    pub fn path(&self, file: &str) -> PathBuf {
+        self.folder.join(file)
+    }
+
+    /// A JSON file of the input.
+    pub fn read_json<T: DeserializeOwned>(&self, file: &str) -> anyhow::Result<T> {
+        let path = self.path(file);
+        let place = format!("input {}: {}", self.name, path.display());
+        let bytes = fs::read(&path).bad_input(&place)?;
+        serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_slice(&bytes)).bad_input(&place)
+    }
+}
+
+impl Context {
+    /// An input that must be there.
+    pub fn input(&self, name: &str) -> anyhow::Result<&GivenInput> {
+        self.optional_input(name).ok_or_else(|| Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into())
+    }
+
+    /// An input that may be left out.
+    pub fn optional_input(&self, name: &str) -> Option<&GivenInput> {
+        self.inputs.get(name)
+    }
+
+    /// The path of a file in the output; folders on the way are made.
+    pub fn output_path(&self, file: &str) -> anyhow::Result<PathBuf> {
+        let path = self.output.join(file);
+        if let Some(folder) = path.parent() {
+            fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+        }
+        Ok(path)
+    }
+
+    /// Writes a JSON file of the output.
+    pub fn write_json(&self, file: &str, value: &impl Serialize) -> anyhow::Result<()> {
+        let path = self.output_path(file)?;
+        write_json(&path, value).with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// Leaves a few words on the result, which the runner prints at the end.
+    pub fn write_summary(&self, text: &str) -> anyhow::Result<()> {
+        let path = self.output_path(SUMMARY_FILE)?;
+        fs::write(&path, format!("{}\n", text.trim_end())).with_context(|| format!("cannot write {}", path.display()))
+    }
+
+    /// The folder for checkpoints, where one was given.
+    pub fn work(&self) -> Option<&Path> {
+        self.work.as_deref()
+    }
+
+    /// Starts a progress display.
+    pub fn progress(&self, label: &str, total: u64) -> Progress {
+        Progress::new(label, total, self.progress)
+    }
+
+    /// Says something to the person watching; it also lands in the action's log.
+    pub fn say(&self, text: impl std::fmt::Display) {
+        if self.progress != ProgressMode::None {
+            eprintln!("{text}");
+        }
+    }
+
+    /// Whether a signal asked the stage to stop.
+    pub fn interrupted(&self) -> bool {
+        self.interrupted.load(Ordering::Relaxed)
+    }
+
+    /// Fails with [`Failure::Interrupted`] once a signal asked the stage to stop: for `?` in loops.
+    pub fn check_interrupt(&self) -> anyhow::Result<()> {
+        if self.interrupted() { Err(Failure::Interrupted.into()) } else { Ok(()) }
+    }
+}
+
+/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors to an exit code.
+pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
+    match parse_and_run::<S>(version, code) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{}: {}", S::NAME, one_line(&error));
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+fn parse_and_run<S: Stage>(version: &'static str, code: &str) -> anyhow::Result<()> {
+    let description = S::describe(version, code);
+    let mut command = Arguments::command().name(S::NAME).about(S::SUMMARY).after_help(help_of(&description));
+    if !version.is_empty() {
+        command = command.version(version);
+    }
+    let arguments = match command.clone().try_get_matches() {
+        Ok(matches) => <Arguments as clap::FromArgMatches>::from_arg_matches(&matches)?,
+        // Help and version, too, come this way; clap knows where to print and how to exit.
+        Err(error) => error.exit(),
+    };
+    match arguments.command {
+        Some(Command::Describe) => {
+            println!("{}", serde_json::to_string_pretty(&description)?);
+            Ok(())
+        }
+        Some(Command::Completions { shell }) => {
+            clap_complete::generate(shell, &mut command, S::NAME, &mut std::io::stdout());
+            Ok(())
+        }
+        None => execute::<S>(arguments, &description),
+    }
+}
+
+/// Inputs and parameters of a stage, for `--help`.
+fn help_of(description: &Description) -> String {
+    let mut text = String::new();
+    if !description.inputs.is_empty() {
+        text.push_str("Inputs:\n");
+        for (name, input) in &description.inputs {
+            let note = if input.optional { " (optional)" } else { "" };
+            text.push_str(&format!("  {name:<14} {}{note} [{}]\n", input.summary, input.kinds.join(" or ")));
+        }
+        text.push('\n');
+    }
+    text.push_str("Parameters (JSON, --params; in pipeline.yaml under `parameters:`):\n");
+    let properties = description.parameters.get("properties").and_then(Value::as_object);
+    for (name, property) in properties.into_iter().flatten() {
+        let words = property.get("description").and_then(Value::as_str).unwrap_or_default().replace('\n', " ");
+        let default = property.get("default").map(ToString::to_string).unwrap_or_default();
+        text.push_str(&format!("  {name:<14} {words} [default: {default}]\n"));
+    }
+    text
+}
+
+fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
+    let params: S::Params = read_params(arguments.params.as_deref(), &description.parameters)?;
+    let mut inputs = BTreeMap::new();
+    let mut folders = Vec::new();
+    for text in &arguments.inputs {
+        let (name, folder) =
+            text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
+        if !description.inputs.contains_key(name) {
+            let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
+            return Err(Failure::Usage(format!("--input {name}: no such input; known: {known}")).into());
+        }
+        folders.push((name, Path::new(folder)));
+    }
+    for (name, input) in &description.inputs {
+        if !input.optional && !folders.iter().any(|(given, _)| given == name) {
+            return Err(Failure::Usage(format!("input {name} is missing; give --input {name}=DIR ({})", input.summary)).into());
+        }
+    }
+    let threads = match arguments.threads {
+        Some(0) => return Err(Failure::Usage("--threads 0: give at least 1".to_owned()).into()),
+        Some(n) => n,
+        None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+    };
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
+    for (name, folder) in folders {
+        inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
+    }
+
+    let interrupted = Arc::new(AtomicBool::new(false));
+    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
+        // The second signal ends the process at once.
+        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&interrupted))?;
+        signal_hook::flag::register(signal, Arc::clone(&interrupted))?;
+    }
+
+    let output = arguments.output.expect("clap requires --output");
+    let staging = Staging::new(&output)?;
+    if let Some(work) = &arguments.work {
+        fs::create_dir_all(work).with_context(|| format!("--work {}: cannot be made", work.display()))?;
+    }
+    let context = Context {
+        threads,
+        device: arguments.device,
+        inputs,
+        output: staging.folder.clone(),
+        work: arguments.work,
+        progress: arguments.progress,
+        interrupted,
+    };
+    S::run(&context, &params)?;
+    context.check_interrupt()?;
+    staging.publish(&description.output.kind, &output)
+}
+
+/// The parameters from the file, checked against the schema, or the defaults.
+fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<P> {
+    let place = file.map(|f| f.display().to_string()).unwrap_or_default();
+    let given = match file {
+        None => serde_json::Map::new(),
+        Some(path) => {
+            let bytes = fs::read(path).usage(format!("--params {place}"))?;
+            serde_json::from_slice(&bytes).usage(format!("--params {place}: expected a JSON object"))?
+        }
+    };
+    let schema = Schema::new(schema).map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
+    let resolved = schema.resolve(&given).map_err(|problems| {
+        let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
+        Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
+    })?;
+    serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))
+}
+
+/// The output while it is being made: beside its final place, removed unless published.
+struct Staging {
+    folder: PathBuf,
+}
+
+impl Staging {
+    fn new(output: &Path) -> anyhow::Result<Self> {
+        if output.exists() {
+            return Err(Failure::Usage(format!("--output {}: exists already; name a new folder", output.display())).into());
+        }
+        let name = output.file_name().ok_or_else(|| Failure::Usage(format!("--output {}: not a folder name", output.display())))?;
+        let folder = output.with_file_name(format!(".{}.partial", name.to_string_lossy()));
+        if folder.exists() {
+            fs::remove_dir_all(&folder).with_context(|| format!("cannot clear {}", folder.display()))?;
+        }
+        fs::create_dir_all(&folder).with_context(|| format!("--output {}: cannot write there", output.display()))?;
+        Ok(Self { folder })
+    }
+
+    fn publish(self, kind: &str, output: &Path) -> anyhow::Result<()> {
+        let manifest = Manifest::of_folder(kind, &self.folder).context("cannot hash the output")?;
+        let place = || format!("cannot write {}", output.display());
+        write_json(&self.folder.join(MANIFEST_FILE), &manifest).with_context(place)?;
+        fs::rename(&self.folder, output).with_context(place)
+    }
+}
+
+impl Drop for Staging {
+    fn drop(&mut self) {
+        fs::remove_dir_all(&self.folder).ok();
+    }
+}

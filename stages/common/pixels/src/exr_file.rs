@@ -1,0 +1,259 @@
+use std::fs::File;
+use std::io::{BufReader, BufWriter};
+use std::path::Path;
+
+use exr::block::UncompressedBlock;
+use exr::block::writer::ChunksWriter as _;
+use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, Text};
+use exr::meta::header::Header;
+use exr::meta::BlockDescription;
+use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
+
+use crate::{MAX_PIXELS, PixelError};
+
+/// Precision of an EXR channel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SampleType {
+    /// 16 bits: colour and opacity.
+    Half,
+    /// 32 bits: depth.
+    Float,
+}
+
+/// A channel to write.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channel {
+    /// `R`, `G`, `B`, `A`, `Z`, or a telling name.
+    pub name: &'static str,
+    /// Its precision.
+    pub sample_type: SampleType,
+}
+
+/// What an EXR file holds.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ExrImage {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Name and samples of every channel, sorted by name.
+    pub channels: Vec<(String, Vec<f32>)>,
+}
+
+impl ExrImage {
+    /// The samples of a channel.
+    pub fn channel(&self, name: &str) -> Option<&[f32]> {
+        self.channels.iter().find(|(n, _)| n == name).map(|(_, samples)| samples.as_slice())
+    }
+}
+
+/// Rows compressed together by ZIP16.
+const BAND_ROWS: usize = 16;
+
+/// Writes an EXR file (scan lines, ZIP) whose bytes repeat: increasing line order, compressed in order, one attribute.
+///
+/// `band(first_row, rows, samples)` fills up to 16 rows at a time, `channels` interleaved in the order given, so memory doesn't
+/// grow with the image. `note` says what the colours are. A sample that isn't finite stops the writing.
+pub fn write_exr<E: From<PixelError>>(
+    path: &Path,
+    (width, height): (usize, usize),
+    channels: &[Channel],
+    note: &str,
+    mut band: impl FnMut(usize, usize, &mut [f32]) -> Result<(), E>,
+) -> Result<(), E> {
+    let mut order: Vec<usize> = (0..channels.len()).collect();
+    order.sort_by_key(|&i| channels[i].name);
+    let described = order.iter().map(|&i| {
+        let sample_type = match channels[i].sample_type {
+            SampleType::Half => exr::meta::attribute::SampleType::F16,
+            SampleType::Float => exr::meta::attribute::SampleType::F32,
+        };
+        ChannelDescription { name: Text::from(channels[i].name), sample_type, quantize_linearly: false, sampling: (1, 1).into() }
+    });
+    let list = ChannelList::new(described.collect());
+    // Measured in facts/pipelines.md: the crate's default line order wrote 40 different files of 40.
+    let mut header = Header::new(Text::from("views"), (width, height), list.list).with_encoding(
+        Compression::ZIP16,
+        BlockDescription::ScanLines,
+        LineOrder::Increasing,
+    );
+    // A second custom attribute would land in a hash map, in no fixed order.
+    header.own_attributes.layer_name = None;
+    header.own_attributes.other.insert(Text::from("note"), AttributeValue::Text(Text::from(note)));
+
+    let file = File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let mut failure: Option<E> = None;
+    let mut samples = vec![0.0f32; width * BAND_ROWS * channels.len()];
+    let written = exr::block::write(BufWriter::new(file), [header].into_iter().collect(), true, |meta, writer| {
+        let mut compressor = writer.sequential_blocks_compressor(&meta);
+        for (index, block) in exr::block::enumerate_ordered_header_block_indices(&meta.headers) {
+            let (first, rows) = (block.pixel_position.y(), block.pixel_size.height());
+            let samples = &mut samples[..width * rows * channels.len()];
+            let filled = band(first, rows, samples).and_then(|()| {
+                check_finite(path, channels, width, first, samples)?;
+                Ok(block_bytes(samples, width, channels, &order))
+            });
+            match filled {
+                Ok(data) => compressor.compress_block(index, UncompressedBlock { index: block, data })?,
+                Err(error) => {
+                    failure = Some(error);
+                    return Err(exr::error::Error::Aborted);
+                }
+            }
+        }
+        Ok(())
+    });
+    match (failure, written) {
+        (Some(error), _) => Err(error),
+        (None, Ok(())) => Ok(()),
+        (None, Err(error)) => Err(exr_error(path, error).into()),
+    }
+}
+
+fn check_finite(path: &Path, channels: &[Channel], width: usize, first: usize, samples: &[f32]) -> Result<(), PixelError> {
+    let Some(at) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
+    let pixel = at / channels.len();
+    Err(PixelError::NotFinite {
+        path: path.to_path_buf(),
+        channel: channels[at % channels.len()].name.to_owned(),
+        x: pixel % width,
+        y: first + pixel / width,
+        value: samples[at],
+    })
+}
+
+/// Line by line, channel by channel (sorted by name), native-endian: the form `exr` compresses.
+fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usize]) -> Vec<u8> {
+    let mut data = Vec::with_capacity(samples.len() * 4);
+    for line in samples.chunks_exact(width * channels.len()) {
+        for &channel in order {
+            let line = line.iter().skip(channel).step_by(channels.len());
+            match channels[channel].sample_type {
+                SampleType::Half => {
+                    // Largest finite half; beyond it a conversion would make infinity.
+                    line.for_each(|&v| data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes()));
+                }
+                SampleType::Float => line.for_each(|v| data.extend(v.to_ne_bytes())),
+            }
+        }
+    }
+    data
+}
+
+/// Reads every channel of the first layer as f32.
+pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
+    let open = || File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source });
+    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+    let meta = exr::meta::MetaData::read_from_buffered(BufReader::new(open()?), false).map_err(|e| exr_error(path, e))?;
+    if meta.headers.iter().any(|h| h.layer_size.area() > MAX_PIXELS) {
+        return Err(format("its header asks for more pixels than any view has".to_owned()));
+    }
+    let image = exr::prelude::read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .all_layers()
+        .all_attributes()
+        .non_parallel()
+        .from_buffered(BufReader::new(open()?))
+        .map_err(|e| exr_error(path, e))?;
+    let layer = image.layer_data.into_iter().next().ok_or_else(|| format("it has no layer".to_owned()))?;
+    let (width, height) = (layer.size.width(), layer.size.height());
+    let channels = layer
+        .channel_data
+        .list
+        .into_iter()
+        .map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect()))
+        .collect();
+    Ok(ExrImage { width, height, channels })
+}
+
+fn exr_error(path: &Path, error: exr::error::Error) -> PixelError {
+    match error {
+        exr::error::Error::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
+            PixelError::Io { path: path.to_path_buf(), source }
+        }
+        other => PixelError::Format { path: path.to_path_buf(), reason: format!("not a whole EXR ({other})") },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CHANNELS: [Channel; 3] = [
+        Channel { name: "R", sample_type: SampleType::Half },
+        Channel { name: "A", sample_type: SampleType::Half },
+        Channel { name: "Z", sample_type: SampleType::Float },
+    ];
+
+    fn value(x: usize, y: usize, c: usize) -> f32 {
+        if c == 2 { 2.0 + (x * 7 + y) as f32 / 3.0 } else { (x + y * 3 + c) as f32 / 256.0 }
+    }
+
+    fn write(path: &Path, width: usize, height: usize) {
+        write_exr(path, (width, height), &CHANNELS, "test", |first, rows, samples| -> Result<(), PixelError> {
+            assert_eq!(samples.len(), width * rows * 3);
+            for (i, v) in samples.iter_mut().enumerate() {
+                *v = value(i / 3 % width, first + i / 3 / width, i % 3);
+            }
+            Ok(())
+        })
+        .unwrap();
+    }
+
+    #[test]
+    fn what_is_written_is_read_back() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        for (width, height) in [(1, 1), (5, 40), (33, 16)] {
+            write(&path, width, height);
+            let image = read_exr(&path).unwrap();
+            assert_eq!((image.width, image.height), (width, height));
+            let names: Vec<_> = image.channels.iter().map(|(n, _)| n.as_str()).collect();
+            assert_eq!(names, ["A", "R", "Z"]);
+            for (c, name) in ["R", "A", "Z"].into_iter().enumerate() {
+                for (i, &v) in image.channel(name).unwrap().iter().enumerate() {
+                    let expected = value(i % width, i / width, c);
+                    assert!((v - expected).abs() <= if c == 2 { 0.0 } else { expected * 1e-3 }, "{name} {i}: {v} {expected}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn forty_writes_give_one_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        let hashes: std::collections::BTreeSet<_> = (0..40)
+            .map(|_| {
+                write(&path, 64, 100);
+                blake3::hash(&std::fs::read(&path).unwrap()).to_hex().to_string()
+            })
+            .collect();
+        assert_eq!(hashes.len(), 1);
+    }
+
+    #[test]
+    fn nan_never_reaches_a_file() {
+        let dir = tempfile::tempdir().unwrap();
+        let result = write_exr(&dir.path().join("a.exr"), (4, 4), &CHANNELS, "", |_, _, samples| {
+            samples.fill(0.0);
+            samples[3 * 5 + 2] = f32::NAN;
+            Ok::<(), PixelError>(())
+        });
+        assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel, .. }) if channel == "Z"));
+    }
+
+    #[test]
+    fn a_file_cut_anywhere_is_an_error() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.exr");
+        write(&path, 20, 20);
+        let whole = std::fs::read(&path).unwrap();
+        for end in (0..whole.len()).step_by(37) {
+            std::fs::write(&path, &whole[..end]).unwrap();
+            assert!(read_exr(&path).is_err(), "{end} of {} bytes", whole.len());
+        }
+    }
+}

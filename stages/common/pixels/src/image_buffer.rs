@@ -1,0 +1,93 @@
+/// An 8-bit RGBA image with straight alpha, row by row, row 0 on top.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Rgba8 {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `width · height · 4` bytes.
+    pub data: Vec<u8>,
+}
+
+impl Rgba8 {
+    /// Wraps samples.
+    ///
+    /// # Panics
+    /// When there aren't `width · height · 4` of them.
+    pub fn new(width: usize, height: usize, data: Vec<u8>) -> Self {
+        assert_eq!(data.len(), width * height * 4, "an RGBA image has four samples a pixel");
+        Self { width, height, data }
+    }
+}
+
+/// Floating-point samples, row by row, channels interleaved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Samples a pixel: 1 grey, 3 RGB, 4 RGBA.
+    pub channels: usize,
+    /// `width · height · channels` samples.
+    pub data: Vec<f32>,
+}
+
+impl Picture {
+    /// Wraps samples.
+    ///
+    /// # Panics
+    /// When there aren't `width · height · channels` of them.
+    pub fn new(width: usize, height: usize, channels: usize, data: Vec<f32>) -> Self {
+        assert_eq!(data.len(), width * height * channels, "a picture has `channels` samples a pixel");
+        Self { width, height, channels, data }
+    }
+
+    /// 8-bit samples divided by 255, alpha straight.
+    pub fn from_rgba8(image: &Rgba8) -> Self {
+        Self::new(image.width, image.height, 4, image.data.iter().map(|&v| f32::from(v) / 255.0).collect())
+    }
+
+    /// RGBA with straight alpha over a grey level, in floating point as the paper does: rgb·a + (1-a)·background.
+    ///
+    /// # Panics
+    /// On a picture without alpha.
+    #[must_use]
+    pub fn over(&self, background: f32) -> Self {
+        assert_eq!(self.channels, 4, "only a picture with alpha can lie over something");
+        let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] * p[3] + (1.0 - p[3]) * background);
+        Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())
+    }
+
+    /// RGBA with premultiplied alpha over a grey level: rgb + (1-a)·background.
+    ///
+    /// # Panics
+    /// On a picture without alpha.
+    #[must_use]
+    pub fn premultiplied_over(&self, background: f32) -> Self {
+        assert_eq!(self.channels, 4, "only a picture with alpha can lie over something");
+        let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
+        Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())
+    }
+
+    /// One channel, alone.
+    pub fn channel(&self, channel: usize) -> Vec<f32> {
+        self.data.iter().skip(channel).step_by(self.channels).copied().collect()
+    }
+
+    /// Grey or RGB as opaque 8-bit RGBA.
+    pub fn to_rgba8(&self) -> Rgba8 {
+        let pixel = |p: &[f32]| match p {
+            [r, g, b, a] => [to_u8(*r), to_u8(*g), to_u8(*b), to_u8(*a)],
+            [r, g, b] => [to_u8(*r), to_u8(*g), to_u8(*b), 255],
+            _ => [to_u8(p[0]), to_u8(p[0]), to_u8(p[0]), 255],
+        };
+        Rgba8::new(self.width, self.height, self.data.chunks_exact(self.channels).flat_map(pixel).collect())
+    }
+}
+
+/// The nearest of 256 levels; what lies outside [0, 1] is clamped.
+pub fn to_u8(value: f32) -> u8 {
+    // `as` saturates and sends NaN to 0.
+    (value * 255.0 + 0.5) as u8
+}

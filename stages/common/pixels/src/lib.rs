@@ -1,0 +1,70 @@
+//! Image buffers and what happens to pixels on the way in and out.
+//!
+//! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Picture`]: floating-point samples, channels interleaved.
+//! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
+//! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
+//! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
+//!
+//! Colours are display-encoded sRGB in [0, 1] throughout.
+//!
+//! ```
+//! use pixels::{Filter, Rgba8, resize_pillow};
+//! let image = Rgba8::new(4, 4, vec![200; 64]);
+//! assert_eq!(resize_pillow(&image, 2, 2, Filter::Lanczos).data[0], 200);
+//! ```
+
+mod exr_file;
+mod heat;
+mod image_buffer;
+mod pillow_resample;
+mod png_file;
+mod pool;
+mod srgb;
+
+pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
+pub use heat::{Palette, heat};
+pub use image_buffer::{Picture, Rgba8, to_u8};
+pub use pillow_resample::{Filter, resize_pillow};
+pub use png_file::{PngRows, encode_png, read_png, write_png};
+pub use pool::average_pool;
+pub use srgb::srgb_from_linear;
+
+use std::path::PathBuf;
+
+/// A picture that can't be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum PixelError {
+    /// The file is not there, or reading or writing failed.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is no picture of the kind, is cut short or damaged.
+    #[error("{path}: {reason}; export the picture again")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A sample that isn't finite was about to be written.
+    #[error("{path}: channel {channel} holds {value} at pixel ({x}, {y}); nothing was written")]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// The channel.
+        channel: String,
+        /// Column.
+        x: usize,
+        /// Row.
+        y: usize,
+        /// The sample.
+        value: f32,
+    },
+}
+
+/// More pixels than any view has; a header that says so is damaged or hostile.
+const MAX_PIXELS: usize = 1 << 28;

@@ -1,0 +1,239 @@
+use glam::{DMat3, DVec3};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A pinhole camera's inside, in pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Intrinsics {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// Focal length along x.
+    pub fx: f64,
+    /// Focal length along y.
+    pub fy: f64,
+    /// Principal point, x; the image's left edge is 0.
+    pub cx: f64,
+    /// Principal point, y; the image's top edge is 0.
+    pub cy: f64,
+}
+
+impl Intrinsics {
+    /// A centred camera with square pixels that sees `angle_x` radians from left to right edge.
+    pub fn from_angle_x(width: u32, height: u32, angle_x: f64) -> Self {
+        let focal = 0.5 * f64::from(width) / (0.5 * angle_x).tan();
+        Self { width, height, fx: focal, fy: focal, cx: 0.5 * f64::from(width), cy: 0.5 * f64::from(height) }
+    }
+
+    /// The same camera with another number of pixels on the same sensor. The scale may differ per axis.
+    #[must_use]
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
+    }
+}
+
+/// A camera: intrinsics and pose.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Camera {
+    /// Unique within a list; names the view's files.
+    pub name: String,
+    /// The inside.
+    pub intrinsics: Intrinsics,
+    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
+    pub camera_to_world: [[f64; 4]; 3],
+}
+
+/// A half-line with a direction of unit length.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ray {
+    /// Where it starts: the camera's centre.
+    pub origin: DVec3,
+    /// Unit length.
+    pub direction: DVec3,
+}
+
+impl Ray {
+    /// The point at distance `t`.
+    pub fn at(&self, t: f64) -> DVec3 {
+        self.origin + t * self.direction
+    }
+}
+
+/// A camera that can't be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum CameraError {
+    /// A number that isn't finite.
+    #[error("camera_to_world[{row}][{column}] is {value}; poses must be finite")]
+    NotFinite {
+        /// Row of the pose.
+        row: usize,
+        /// Column of the pose.
+        column: usize,
+        /// The number.
+        value: f64,
+    },
+    /// Focal length or principal point that no camera has.
+    #[error("{name} is {value}; focal lengths must be above 0 and principal points finite")]
+    Intrinsics {
+        /// `fx`, `fy`, `cx` or `cy`.
+        name: &'static str,
+        /// The number.
+        value: f64,
+    },
+    /// An image without pixels.
+    #[error("image size {width}×{height}; both must be at least 1")]
+    Empty {
+        /// Columns.
+        width: u32,
+        /// Rows.
+        height: u32,
+    },
+    /// The left 3×3 part isn't a rotation.
+    #[error("camera_to_world is no rigid motion: R·Rᵀ is off the identity by {error:.3}; remove scale or shear from the pose")]
+    NotRigid {
+        /// Largest deviation of R·Rᵀ from the identity.
+        error: f64,
+    },
+}
+
+impl Camera {
+    /// The rotation R.
+    pub fn rotation(&self) -> DMat3 {
+        let m = &self.camera_to_world;
+        DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [m[0][c], m[1][c], m[2][c]]))
+    }
+
+    /// The camera's centre in world space.
+    pub fn centre(&self) -> DVec3 {
+        let m = &self.camera_to_world;
+        DVec3::new(m[0][3], m[1][3], m[2][3])
+    }
+
+    /// Where it looks: -z of the camera, unit length.
+    pub fn forward(&self) -> DVec3 {
+        -self.rotation().z_axis.normalize()
+    }
+
+    /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j + 0.5) is a pixel's centre.
+    pub fn ray(&self, x: f64, y: f64) -> Ray {
+        let k = &self.intrinsics;
+        let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
+        Ray { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
+    }
+
+    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane.
+    pub fn project(&self, point: DVec3) -> Option<(f64, f64, f64)> {
+        let k = &self.intrinsics;
+        let p = self.rotation().transpose() * (point - self.centre());
+        let depth = -p.z;
+        (depth > 0.0).then(|| (k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth, depth))
+    }
+
+    /// Depth per distance along a ray of this camera: multiply a distance by it to get z-depth.
+    pub fn depth_per_distance(&self, ray: &Ray) -> f64 {
+        ray.direction.dot(self.forward())
+    }
+
+    /// The same camera with another number of pixels.
+    #[must_use]
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        Self { intrinsics: self.intrinsics.resized(width, height), ..self.clone() }
+    }
+
+    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale or shear.
+    pub fn check(&self) -> Result<(), CameraError> {
+        let k = &self.intrinsics;
+        if k.width == 0 || k.height == 0 {
+            return Err(CameraError::Empty { width: k.width, height: k.height });
+        }
+        for (name, value, positive) in [("fx", k.fx, true), ("fy", k.fy, true), ("cx", k.cx, false), ("cy", k.cy, false)] {
+            if !value.is_finite() || (positive && value <= 0.0) {
+                return Err(CameraError::Intrinsics { name, value });
+            }
+        }
+        for (row, values) in self.camera_to_world.iter().enumerate() {
+            for (column, &value) in values.iter().enumerate() {
+                if !value.is_finite() {
+                    return Err(CameraError::NotFinite { row, column, value });
+                }
+            }
+        }
+        let r = self.rotation();
+        let error = (r * r.transpose() - DMat3::IDENTITY).to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+        // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far off.
+        if error > 1e-2 { Err(CameraError::NotRigid { error }) } else { Ok(()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn camera(axis: DVec3, angle: f64, centre: DVec3) -> Camera {
+        let r = DMat3::from_axis_angle(axis.normalize(), angle);
+        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
+        Camera {
+            name: "c".into(),
+            intrinsics: Intrinsics { width: 37, height: 23, fx: 40.0, fy: 44.0, cx: 18.0, cy: 12.5 },
+            camera_to_world: [row(0), row(1), row(2)],
+        }
+    }
+
+    fn unit() -> impl Strategy<Value = f64> {
+        -1.0..1.0f64
+    }
+
+    proptest! {
+        #[test]
+        fn projecting_a_ray_gives_its_pixel_back(
+            a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64, c in (unit(), unit(), unit()),
+            x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64,
+        ) {
+            let camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
+            camera.check().unwrap();
+            let ray = camera.ray(x, y);
+            prop_assert!((ray.direction.length() - 1.0).abs() < 1e-12);
+            let (px, py, depth) = camera.project(ray.at(t)).unwrap();
+            prop_assert!((px - x).abs() < 1e-8 && (py - y).abs() < 1e-8);
+            prop_assert!((depth - t * camera.depth_per_distance(&ray)).abs() < 1e-9 * t.max(1.0));
+            prop_assert!(camera.project(ray.at(-t)).is_none());
+        }
+
+        /// A half-pixel shift would show here: the s×s pixels of a finer image have their mean at the coarse pixel's centre.
+        #[test]
+        fn resizing_keeps_pixel_footprints(i in 0u32..37, j in 0u32..23, s in 1u32..6) {
+            let coarse = camera(DVec3::Z, 0.3, DVec3::ONE);
+            let fine = coarse.resized(37 * s, 23 * s);
+            for (corner_x, corner_y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let (x, y) = (f64::from(i + corner_x), f64::from(j + corner_y));
+                let difference = coarse.ray(x, y).direction - fine.ray(x * f64::from(s), y * f64::from(s)).direction;
+                prop_assert!(difference.length() < 1e-12);
+            }
+            let offsets: f64 = (0..s).map(|a| (f64::from(i * s + a) + 0.5) / f64::from(s)).sum();
+            prop_assert!((offsets / f64::from(s) - (f64::from(i) + 0.5)).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn impossible_cameras_are_refused() {
+        let good = camera(DVec3::Y, 0.5, DVec3::ZERO);
+        let mut bad = good.clone();
+        bad.camera_to_world[1][2] = f64::NAN;
+        assert!(matches!(bad.check(), Err(CameraError::NotFinite { row: 1, column: 2, .. })));
+        let mut bad = good.clone();
+        bad.intrinsics.fx = 0.0;
+        assert!(matches!(bad.check(), Err(CameraError::Intrinsics { name: "fx", .. })));
+        let mut bad = good.clone();
+        bad.camera_to_world[0][0] *= 1.1;
+        bad.camera_to_world[0][1] += 0.2;
+        assert!(matches!(bad.check(), Err(CameraError::NotRigid { .. })));
+        let mut bad = good;
+        bad.intrinsics.height = 0;
+        assert!(matches!(bad.check(), Err(CameraError::Empty { .. })));
+    }
+}

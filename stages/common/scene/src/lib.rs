@@ -1,0 +1,29 @@
+//! Cameras, poses, rays and bounds, and `views.json`, the list of views that stages exchange.
+//!
+//! # Conventions
+//!
+//! Written here once, and into every `views.json` ([`Conventions`]):
+//!
+//! * **Camera**: OpenGL axes, x right, y up, looking along -z. `camera_to_world` is the 3×4 matrix `[R | t]`, row by row.
+//! * **Pixels**: pixel (i, j) is column i of row j, row 0 on top, and covers the square [i, i+1) × [j, j+1): its **centre** is
+//!   (i + 0.5, j + 0.5). The principal point of a centred camera is (width/2, height/2). So resizing an image from W to W'
+//!   multiplies `fx` and `cx` by W'/W and nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
+//! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is camera-space z-depth in scene units,
+//!   -z of the point in camera space: what EXR channel `Z` holds.
+//! * **Colours**: display-encoded sRGB in [0, 1], as the paper trains and scores.
+//!
+//! ```
+//! use scene::{Camera, Intrinsics};
+//! let intrinsics = Intrinsics::from_angle_x(200, 200, 0.69);
+//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
+//! let ray = camera.ray(100.0, 100.0);
+//! assert_eq!(ray.direction, glam::DVec3::NEG_Z);
+//! let (x, y, depth) = camera.project(ray.at(3.0)).unwrap();
+//! assert_eq!((x, y, depth), (100.0, 100.0, 3.0));
+//! ```
+
+mod camera;
+mod views;
+
+pub use camera::{Camera, CameraError, Intrinsics, Ray};
+pub use views::{Background, Bounds, Conventions, VIEWS_FILE, View, Views, ViewsError};

@@ -1,0 +1,217 @@
+use std::collections::BTreeSet;
+
+use artifact::relative_path;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::camera::{Camera, CameraError};
+
+/// Name of the file in every folder of views.
+pub const VIEWS_FILE: &str = "views.json";
+
+/// `views.json`: cameras, and the files that belong to them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Views {
+    /// How to read the numbers; constant.
+    pub conventions: Conventions,
+    /// What lies behind the scene.
+    pub background: Background,
+    /// Where the scene is.
+    pub bounds: Bounds,
+    /// Visual hull on a 128³ grid over the bounds (safetensors, tensor `hull`, u8, x fastest), where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub hull: Option<String>,
+    /// The views, in the data set's order.
+    pub views: Vec<View>,
+}
+
+/// A camera and its files, as paths inside the folder of `views.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct View {
+    /// Where it was taken from; its intrinsics have the image's size.
+    pub camera: Camera,
+    /// The picture: PNG (RGBA with straight alpha, or RGB) or EXR.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image: Option<String>,
+    /// Depth: EXR, channel `Z`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub depth: Option<String>,
+    /// The same view at low resolution, to look at beside the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub low_resolution: Option<String>,
+}
+
+impl View {
+    /// A camera without files.
+    pub fn camera_only(camera: Camera) -> Self {
+        Self { camera, image: None, depth: None, low_resolution: None }
+    }
+}
+
+/// The conventions in words, for whoever reads `views.json` without this crate.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Conventions {
+    /// Camera axes and matrix.
+    pub camera: String,
+    /// Where pixels lie.
+    pub pixels: String,
+    /// What depth means.
+    pub depth: String,
+    /// What colours mean.
+    pub colour: String,
+}
+
+impl Default for Conventions {
+    fn default() -> Self {
+        Self {
+            camera: "OpenGL: x right, y up, looking along -z; camera_to_world = [R | t] row by row".into(),
+            pixels: "pixel (i, j), row 0 on top, has its centre at (i + 0.5, j + 0.5)".into(),
+            depth: "camera-space z-depth in scene units".into(),
+            colour: "display-encoded sRGB; PNG alpha is straight, to be composited on the background in floating point; EXR is composited or, with background alpha, premultiplied".into(),
+        }
+    }
+}
+
+/// What lies behind the scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Background {
+    /// White, as in the paper.
+    White,
+    /// Black.
+    Black,
+    /// Kept open: alpha is data, colours are premultiplied.
+    Alpha,
+}
+
+impl Background {
+    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white.
+    pub fn shown(self) -> f32 {
+        if self == Self::Black { 0.0 } else { 1.0 }
+    }
+}
+
+/// An axis-aligned box around the scene, and the range of distances along rays at which it lies.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Bounds {
+    /// Smallest corner.
+    pub min: [f64; 3],
+    /// Largest corner.
+    pub max: [f64; 3],
+    /// Distance before which there is nothing.
+    pub near: f64,
+    /// Distance behind which there is nothing.
+    pub far: f64,
+}
+
+/// A `views.json` that can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewsError {
+    /// No view at all.
+    #[error("{VIEWS_FILE}: it lists no views")]
+    Empty,
+    /// A camera that can't be.
+    #[error("{VIEWS_FILE}: view {name:?}: {source}")]
+    Camera {
+        /// The view.
+        name: String,
+        /// What is wrong.
+        source: CameraError,
+    },
+    /// Two views of one name, or a name that is no file name.
+    #[error("{VIEWS_FILE}: view name {0:?} is used twice or can't name a file")]
+    Name(String),
+    /// A path out of the folder.
+    #[error("{VIEWS_FILE}: {0}")]
+    Path(String),
+    /// A box without inside.
+    #[error("{VIEWS_FILE}: bounds {0:?} have no inside")]
+    Bounds(Bounds),
+}
+
+impl Views {
+    /// Views without files.
+    pub fn new(background: Background, bounds: Bounds, views: Vec<View>) -> Self {
+        Self { conventions: Conventions::default(), background, bounds, hull: None, views }
+    }
+
+    /// Reads and checks the `views.json` of an input.
+    pub fn read(input: &artifact::GivenInput) -> anyhow::Result<Self> {
+        use artifact::FailureExt as _;
+        let views: Self = input.read_json(VIEWS_FILE)?;
+        views.check().bad_input(input.folder().display())?;
+        Ok(views)
+    }
+
+    /// Refuses what can't be: no views, impossible cameras, names or paths that leave the folder, an empty box.
+    pub fn check(&self) -> Result<(), ViewsError> {
+        if self.views.is_empty() {
+            return Err(ViewsError::Empty);
+        }
+        let b = &self.bounds;
+        let finite = b.min.iter().chain(&b.max).chain([&b.near, &b.far]).all(|x| x.is_finite());
+        if !finite || (0..3).any(|i| b.min[i] >= b.max[i]) || b.near < 0.0 || b.far <= b.near {
+            return Err(ViewsError::Bounds(*b));
+        }
+        let mut names = BTreeSet::new();
+        for view in &self.views {
+            let name = &view.camera.name;
+            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1);
+            if !plain || !names.insert(name) {
+                return Err(ViewsError::Name(name.clone()));
+            }
+            view.camera.check().map_err(|source| ViewsError::Camera { name: name.clone(), source })?;
+            for path in [&view.image, &view.depth, &view.low_resolution].into_iter().flatten() {
+                relative_path(path).map_err(ViewsError::Path)?;
+            }
+        }
+        self.hull.iter().try_for_each(|path| relative_path(path).map(|_| ()).map_err(ViewsError::Path))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Intrinsics;
+
+    fn views() -> Views {
+        let camera = Camera {
+            name: "r_0".into(),
+            intrinsics: Intrinsics::from_angle_x(8, 6, 0.7),
+            camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
+        };
+        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 2., far: 6. };
+        Views::new(Background::White, bounds, vec![View::camera_only(camera)])
+    }
+
+    #[test]
+    fn json_round_trip() {
+        let views = views();
+        views.check().unwrap();
+        let text = serde_json::to_string(&views).unwrap();
+        assert_eq!(serde_json::from_str::<Views>(&text).unwrap(), views);
+    }
+
+    #[test]
+    fn hostile_lists_are_refused() {
+        let mut v = views();
+        v.views.push(v.views[0].clone());
+        assert!(matches!(v.check(), Err(ViewsError::Name(_))));
+        let mut v = views();
+        v.views[0].image = Some("../../etc/passwd".into());
+        assert!(matches!(v.check(), Err(ViewsError::Path(_))));
+        let mut v = views();
+        v.views[0].camera.name = "../x".into();
+        assert!(matches!(v.check(), Err(ViewsError::Name(_))));
+        let mut v = views();
+        v.bounds.max[1] = -1.0;
+        assert!(matches!(v.check(), Err(ViewsError::Bounds(_))));
+        let mut v = views();
+        v.views.clear();
+        assert!(matches!(v.check(), Err(ViewsError::Empty)));
+    }
+}

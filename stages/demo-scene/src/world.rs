@@ -1,0 +1,276 @@
+use glam::{DMat3, DVec3};
+
+use crate::material::Material;
+
+/// A shape in its own space.
+#[derive(Clone, Copy, Debug)]
+enum Shape {
+    /// Ball of a radius.
+    Ball(f64),
+    /// Box of half sides.
+    Block(DVec3),
+    /// Upright cylinder: radius, half height.
+    Drum(f64, f64),
+    /// Rod between two points, of a radius, with round ends.
+    Rod(DVec3, DVec3, f64),
+}
+
+/// A shape with a place and a look.
+#[derive(Clone, Copy, Debug)]
+struct Thing {
+    shape: Shape,
+    centre: DVec3,
+    /// World to the thing's own axes.
+    to_local: DMat3,
+    material: Material,
+}
+
+/// Things behind one bounding ball, so that most rays pass them at the cost of one test.
+#[derive(Clone, Debug)]
+struct Group {
+    centre: DVec3,
+    radius: f64,
+    things: Vec<Thing>,
+}
+
+/// Where a ray meets a surface.
+pub(crate) struct Hit {
+    /// Distance along the ray.
+    pub(crate) t: f64,
+    /// Unit normal in world space.
+    pub(crate) normal: DVec3,
+    /// Point in the thing's own space, about 1 in size: what textures use.
+    pub(crate) local: DVec3,
+    /// Normal in the thing's own space.
+    pub(crate) local_normal: DVec3,
+    pub(crate) material: Material,
+}
+
+/// The scene: things on a round base, inside a ball of radius 1.35 around the origin.
+#[derive(Clone, Debug)]
+pub struct World {
+    groups: Vec<Group>,
+    pub(crate) seed: u32,
+}
+
+/// Top of the base.
+const FLOOR: f64 = -0.5;
+
+impl World {
+    /// The scene of a seed: the seed turns the arrangement, moves things between places and changes textures.
+    pub fn new(seed: u32) -> Self {
+        let turn = f64::from(seed % 360) * 2.4;
+        let place = |slot: u32, distance: f64| {
+            let angle = turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * std::f64::consts::TAU / 5.0;
+            DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), FLOOR)
+        };
+        let thing = |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
+        let mut groups = vec![group(vec![thing(Shape::Drum(1.1, 0.06), DVec3::new(0.0, 0.0, FLOOR - 0.06), Material::Tiles)])];
+
+        let crate_half = 0.26;
+        let spin = 0.5 + turn;
+        let to_local =
+            DMat3::from_cols(DVec3::new(libm::cos(spin), -libm::sin(spin), 0.0), DVec3::new(libm::sin(spin), libm::cos(spin), 0.0), DVec3::Z);
+        let centre = place(0, 0.62) + DVec3::Z * crate_half;
+        groups.push(group(vec![Thing { shape: Shape::Block(DVec3::splat(crate_half)), centre, to_local, material: Material::Crate }]));
+
+        groups.push(group(vec![thing(Shape::Ball(0.3), place(1, 0.62) + DVec3::Z * 0.3, Material::Ball)]));
+
+        // A cage of rods around a striped ball.
+        let foot = place(2, 0.64);
+        let mut cage = vec![thing(Shape::Ball(0.17), foot + DVec3::Z * 0.36, Material::Stripes)];
+        let on_circle = |k: usize, n: usize, radius: f64| {
+            let angle = k as f64 / n as f64 * std::f64::consts::TAU;
+            DVec3::new(radius * libm::cos(angle), radius * libm::sin(angle), 0.0)
+        };
+        for k in 0..12 {
+            let p = on_circle(k, 12, 0.27);
+            cage.push(thing(Shape::Rod(p, p + DVec3::Z * 0.7, 0.011), foot, Material::Rod));
+        }
+        for height in [0.02, 0.36, 0.7] {
+            for k in 0..20 {
+                let (a, b) = (on_circle(k, 20, 0.27), on_circle(k + 1, 20, 0.27));
+                cage.push(thing(Shape::Rod(a + DVec3::Z * height, b + DVec3::Z * height, 0.013), foot, Material::Rod));
+            }
+        }
+        groups.push(group(cage));
+
+        // A copper spring, in pieces short enough for tight bounding balls.
+        let foot = place(3, 0.60);
+        let turns = 5.0;
+        let pieces = 80;
+        let point = |k: usize| {
+            let share = k as f64 / f64::from(pieces);
+            let angle = share * turns * std::f64::consts::TAU;
+            let radius = 0.20 - 0.08 * share;
+            DVec3::new(radius * libm::cos(angle), radius * libm::sin(angle), 0.02 + 0.95 * share)
+        };
+        let rods: Vec<Thing> =
+            (0..pieces as usize).map(|k| thing(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper)).collect();
+        groups.extend(rods.chunks(16).map(|piece| group(piece.to_vec())));
+
+        // A sign on a thin post.
+        let foot = place(4, 0.66);
+        let facing = libm::atan2(foot.y, foot.x) + std::f64::consts::FRAC_PI_2;
+        let to_local = DMat3::from_cols(
+            DVec3::new(libm::cos(facing), -libm::sin(facing), 0.0),
+            DVec3::new(libm::sin(facing), libm::cos(facing), 0.0),
+            DVec3::Z,
+        );
+        groups.push(group(vec![
+            thing(Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014), foot, Material::Rod),
+            Thing { shape: Shape::Block(DVec3::new(0.27, 0.010, 0.19)), centre: foot + DVec3::Z * 0.62, to_local, material: Material::Sign },
+        ]));
+        Self { groups, seed }
+    }
+
+    /// The first surface along a ray, beyond a tiny distance.
+    pub(crate) fn first_hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
+        let mut best: Option<(f64, &Thing, DVec3)> = None;
+        for group in &self.groups {
+            if !group.may_meet(origin, direction) {
+                continue;
+            }
+            for thing in &group.things {
+                let o = thing.to_local * (origin - thing.centre);
+                let d = thing.to_local * direction;
+                if let Some((t, normal)) = thing.shape.intersect(o, d)
+                    && best.as_ref().is_none_or(|(nearest, ..)| t < *nearest)
+                {
+                    best = Some((t, thing, normal));
+                }
+            }
+        }
+        best.map(|(t, thing, local_normal)| {
+            let size = thing.shape.half_size();
+            Hit {
+                t,
+                normal: thing.to_local.transpose() * local_normal,
+                local: thing.to_local * (origin + t * direction - thing.centre) / size,
+                local_normal,
+                material: thing.material,
+            }
+        })
+    }
+}
+
+fn group(things: Vec<Thing>) -> Group {
+    let spheres: Vec<(DVec3, f64)> = things.iter().map(|t| { let (c, r) = t.shape.bounding_ball(); (t.centre + t.to_local.transpose() * c, r) }).collect();
+    let centre = spheres.iter().map(|(c, _)| *c).sum::<DVec3>() / spheres.len() as f64;
+    let radius = spheres.iter().map(|(c, r)| (*c - centre).length() + r).fold(0.0, f64::max);
+    Group { centre, radius, things }
+}
+
+impl Group {
+    fn may_meet(&self, origin: DVec3, direction: DVec3) -> bool {
+        let to = self.centre - origin;
+        let along = to.dot(direction);
+        let beside = to.length_squared() - along * along;
+        let r2 = self.radius * self.radius;
+        beside < r2 && (along > 0.0 || to.length_squared() < r2)
+    }
+}
+
+/// Surfaces nearer than this are the one the ray starts on.
+const EPSILON: f64 = 1e-6;
+
+fn quadratic(a: f64, b: f64, c: f64) -> Option<(f64, f64)> {
+    // a t² + 2 b t + c = 0
+    let under = b * b - a * c;
+    (under >= 0.0 && a > 0.0).then(|| ((-b - under.sqrt()) / a, (-b + under.sqrt()) / a))
+}
+
+impl Shape {
+    fn half_size(self) -> DVec3 {
+        match self {
+            Self::Ball(r) => DVec3::splat(r),
+            Self::Block(half) => half,
+            Self::Drum(r, _) => DVec3::splat(r),
+            Self::Rod(..) => DVec3::ONE,
+        }
+    }
+
+    fn bounding_ball(self) -> (DVec3, f64) {
+        match self {
+            Self::Ball(r) => (DVec3::ZERO, r),
+            Self::Block(half) => (DVec3::ZERO, half.length()),
+            Self::Drum(r, h) => (DVec3::ZERO, (r * r + h * h).sqrt()),
+            Self::Rod(a, b, r) => (0.5 * (a + b), 0.5 * (b - a).length() + r),
+        }
+    }
+
+    /// Distance and normal of the first surface, in the shape's own space.
+    fn intersect(self, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+        match self {
+            Self::Ball(r) => {
+                let (near, far) = quadratic(d.length_squared(), o.dot(d), o.length_squared() - r * r)?;
+                let t = if near > EPSILON { near } else { far };
+                (t > EPSILON).then(|| (t, (o + t * d) / r))
+            }
+            Self::Block(half) => {
+                let inverse = d.recip();
+                let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
+                let (low, high) = (a.min(b), a.max(b));
+                let (near, far) = (low.max_element(), high.min_element());
+                let t = if near > EPSILON { near } else { far };
+                if near > far || t <= EPSILON {
+                    return None;
+                }
+                let p = (o + t * d) / half;
+                let axis = if p.x.abs() >= p.y.abs().max(p.z.abs()) { DVec3::X } else if p.y.abs() >= p.z.abs() { DVec3::Y } else { DVec3::Z };
+                Some((t, axis * p.dot(axis).signum()))
+            }
+            Self::Drum(r, h) => {
+                let mut best: Option<(f64, DVec3)> = None;
+                let mut offer = |t: f64, normal: DVec3| {
+                    if t > EPSILON && best.is_none_or(|(nearest, _)| t < nearest) {
+                        best = Some((t, normal));
+                    }
+                };
+                let roots = quadratic(d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y, o.x * o.x + o.y * o.y - r * r);
+                for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
+                    let p = o + t * d;
+                    if p.z.abs() <= h {
+                        offer(t, DVec3::new(p.x / r, p.y / r, 0.0));
+                    }
+                }
+                for side in [-1.0, 1.0] {
+                    let t = (side * h - o.z) / d.z;
+                    let p = o + t * d;
+                    if t.is_finite() && p.x * p.x + p.y * p.y <= r * r {
+                        offer(t, DVec3::Z * side);
+                    }
+                }
+                best
+            }
+            Self::Rod(a, b, r) => {
+                let axis = b - a;
+                let (length2, od) = (axis.length_squared(), o - a);
+                let (along_d, along_o) = (axis.dot(d), axis.dot(od));
+                let mut best: Option<(f64, DVec3)> = None;
+                let mut offer = |t: f64, normal: DVec3| {
+                    if t > EPSILON && best.is_none_or(|(nearest, _)| t < nearest) {
+                        best = Some((t, normal));
+                    }
+                };
+                let roots = quadratic(
+                    length2 * d.length_squared() - along_d * along_d,
+                    length2 * od.dot(d) - along_o * along_d,
+                    length2 * (od.length_squared() - r * r) - along_o * along_o,
+                );
+                for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
+                    let share = (along_o + t * along_d) / length2;
+                    if (0.0..=1.0).contains(&share) {
+                        offer(t, (od + t * d - share * axis) / r);
+                    }
+                }
+                for end in [a, b] {
+                    if let Some((t, normal)) = Self::Ball(r).intersect(o - end, d) {
+                        offer(t, normal);
+                    }
+                }
+                best
+            }
+        }
+    }
+}
