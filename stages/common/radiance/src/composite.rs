@@ -1,0 +1,106 @@
+//! Volume rendering in optical depth: T = e^(-Σ τ) and w = T·(1 - e^(-τ)), so that no product of (1-α) can round to 0.
+
+use crate::math::{exp, one_minus_exp_neg};
+use crate::simd::kernel;
+
+kernel! {
+    /// Optical depth τ of each sample: density e^raw times the step.
+    pub(crate) fn optical_depths<L>(raw: &[f32], step: f32, tau: &mut [f32]) {
+        for (tau, &raw) in tau.iter_mut().zip(raw) {
+            *tau = exp(raw.min(MAX_RAW)) * step;
+        }
+    }
+}
+
+/// Density stops growing here (e^15): a step is opaque long before.
+pub(crate) const MAX_RAW: f32 = 15.0;
+
+kernel! {
+    /// Transmittance before each sample and its weight, from the optical depth before it and its own.
+    pub(crate) fn weights<L>(before: &[f32], tau: &[f32], transmittance: &mut [f32], weight: &mut [f32]) {
+        for i in 0..before.len().min(tau.len()).min(transmittance.len()).min(weight.len()) {
+            let t = exp(-before[i]);
+            transmittance[i] = t;
+            weight[i] = t * one_minus_exp_neg(tau[i]);
+        }
+    }
+}
+
+/// Gradient of a loss by each sample's optical depth, along one ray from back to front.
+///
+/// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) - T_end·(g·b).
+pub(crate) fn optical_depth_gradients(shade: &[f32], transmittance: &[f32], weight: &[f32], behind: f32, gradient: &mut [f32]) {
+    let mut suffix = behind;
+    for i in (0..shade.len()).rev() {
+        gradient[i] = (transmittance[i] - weight[i]).mul_add(shade[i], -suffix);
+        suffix = weight[i].mul_add(shade[i], suffix);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn composite(tau: &[f32]) -> (Vec<f32>, Vec<f32>, f32) {
+        let mut before = vec![0.0; tau.len()];
+        let mut sum = 0.0f32;
+        for (b, t) in before.iter_mut().zip(tau) {
+            *b = sum;
+            sum += t;
+        }
+        let (mut transmittance, mut weight) = (before.clone(), before.clone());
+        weights(&before, tau, &mut transmittance, &mut weight);
+        (transmittance, weight, exp(-sum))
+    }
+
+    proptest! {
+        /// From nothing to far beyond opaque.
+        #[test]
+        fn weights_are_a_partition(exponents in prop::collection::vec(-40.0f32..16.0, 1..200)) {
+            let tau: Vec<f32> = exponents.iter().map(|e| e.exp2()).collect();
+            let (transmittance, weight, end) = composite(&tau);
+            prop_assert!(weight.iter().all(|w| *w >= 0.0 && w.is_finite()));
+            prop_assert!(transmittance.is_sorted_by(|a, b| a >= b));
+            let total: f64 = weight.iter().map(|&w| f64::from(w)).sum::<f64>() + f64::from(end);
+            prop_assert!((total - 1.0).abs() < 2e-5, "{total}");
+        }
+
+        #[test]
+        fn gradients_equal_f64_differences(
+            samples in prop::collection::vec((-8.0f32..3.0, -1.0f32..1.0), 1..40), behind in -1.0f32..1.0,
+        ) {
+            let tau: Vec<f32> = samples.iter().map(|(e, _)| e.exp2()).collect();
+            let shade: Vec<f32> = samples.iter().map(|(_, s)| *s).collect();
+            let (transmittance, weight, end) = composite(&tau);
+            let mut gradient = vec![0.0; tau.len()];
+            optical_depth_gradients(&shade, &transmittance, &weight, end * behind, &mut gradient);
+            let loss = |tau: &[f64]| {
+                let (mut od, mut sum) = (0.0f64, 0.0f64);
+                for (t, s) in tau.iter().zip(&shade) {
+                    sum += (-od).exp() * -(-t).exp_m1() * f64::from(*s);
+                    od += t;
+                }
+                sum + (-od).exp() * f64::from(behind)
+            };
+            for i in 0..tau.len() {
+                let mut wide: Vec<f64> = tau.iter().map(|&t| f64::from(t)).collect();
+                let h = 1e-5;
+                wide[i] += h;
+                let up = loss(&wide);
+                wide[i] -= 2.0 * h;
+                let numeric = (up - loss(&wide)) / (2.0 * h);
+                prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}", gradient[i]);
+            }
+        }
+    }
+
+    #[test]
+    fn overflowing_density_is_opaque() {
+        let mut tau = vec![0.0; 3];
+        optical_depths(&[f32::MAX, f32::NEG_INFINITY, 400.0], 0.003, &mut tau);
+        let (_, weight, end) = composite(&tau);
+        assert_eq!((weight[0], end), (1.0, exp(-87.0)));
+        assert!(tau.iter().all(|t| t.is_finite()));
+    }
+}

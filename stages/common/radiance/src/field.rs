@@ -1,0 +1,280 @@
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::chunk::Chunk;
+use crate::grid::{FEATURES, Level, levels};
+use crate::mlp::Layer;
+use crate::occupancy::{GRID, Occupancy};
+use crate::random::Draws;
+use crate::space::{Ray, Space};
+use crate::spherical::BASIS;
+
+/// What a field is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Architecture {
+    /// Levels of the grid.
+    pub levels: u32,
+    /// Cells along an axis of the coarsest level.
+    pub coarsest: u32,
+    /// Cells along an axis of the finest level.
+    pub finest: u32,
+    /// Base-2 logarithm of the most entries a level may have; finer levels are hashed.
+    pub log2_entries: u32,
+    /// Width of the hidden layers.
+    pub hidden: u32,
+    /// Samples along the diagonal of the unit cube.
+    pub steps: u32,
+}
+
+impl Default for Architecture {
+    fn default() -> Self {
+        Self { levels: 8, coarsest: 16, finest: 256, log2_entries: 17, hidden: 32, steps: 512 }
+    }
+}
+
+impl Architecture {
+    /// Says which number can't be.
+    pub fn check(&self) -> Result<(), String> {
+        let ranges = [
+            ("levels", self.levels, 1, 16),
+            ("coarsest", self.coarsest, 2, 512),
+            ("finest", self.finest, self.coarsest, 4096),
+            ("log2_entries", self.log2_entries, 8, 22),
+            ("hidden", self.hidden, 16, 128),
+            ("steps", self.steps, 16, 8192),
+        ];
+        ranges.into_iter().try_for_each(|(name, value, low, high)| {
+            if (low..=high).contains(&value) { Ok(()) } else { Err(format!("{name} = {value} is not in {low}..={high}")) }
+        })
+    }
+}
+
+/// A radiance field: density and view-dependent colour of every point of a box.
+#[derive(Clone, Debug)]
+pub struct Field {
+    /// What it is made of.
+    pub architecture: Architecture,
+    /// Where it lies.
+    pub space: Space,
+    pub(crate) levels: Vec<Level>,
+    pub(crate) layers: Layers,
+    pub(crate) grid: Vec<f32>,
+    pub(crate) network: Vec<f32>,
+    pub(crate) occupancy: Occupancy,
+}
+
+/// The five layers of the two networks: features → 16 (density, 15 for colour); those and direction → colour.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Layers {
+    pub(crate) density: [Layer; 2],
+    pub(crate) colour: [Layer; 3],
+}
+
+/// Outputs of the density network: raw density and what the colour network gets.
+pub(crate) const DENSITY_OUTPUTS: usize = 16;
+/// Inputs of the colour network.
+pub(crate) const COLOUR_INPUTS: usize = DENSITY_OUTPUTS - 1 + BASIS;
+
+impl Layers {
+    fn new(features: usize, hidden: usize) -> Self {
+        let mut offset = 0;
+        let mut layer = |inputs, outputs| {
+            let layer = Layer { inputs, outputs, offset };
+            offset += inputs * outputs;
+            layer
+        };
+        Self {
+            density: [layer(features, hidden), layer(hidden, DENSITY_OUTPUTS)],
+            colour: [layer(COLOUR_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
+        }
+    }
+
+    pub(crate) fn all(&self) -> [Layer; 5] {
+        let ([a, b], [c, d, e]) = (self.density, self.colour);
+        [a, b, c, d, e]
+    }
+
+    fn len(&self) -> usize {
+        self.colour[2].range().end
+    }
+}
+
+/// What a ray sees.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Pixel {
+    /// Colour over the ray's background.
+    pub colour: [f32; 3],
+    /// Colour of the scene alone, weighted by opacity (premultiplied).
+    pub premultiplied: [f32; 3],
+    /// Share of the ray that is stopped.
+    pub opacity: f32,
+    /// Expected distance where it is stopped, in scene units; the far end where nothing stops it.
+    pub depth: f32,
+    /// Distance at which half of the ray is stopped; the far end where it never is.
+    pub median_depth: f32,
+}
+
+/// A field that can't be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum FieldError {
+    /// The file can't be opened.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file isn't a field.
+    #[error("{path}: {reason}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// Rays in one chunk: enough samples to fill the vectors, few enough to stay in the cache.
+pub(crate) const CHUNK_RAYS: usize = 64;
+
+impl Field {
+    /// A field before training: faint fog, drawn from a seed.
+    pub fn new(architecture: Architecture, space: Space, seed: u64) -> Self {
+        let mut field = Self::empty(architecture, space);
+        for (i, value) in field.grid.iter_mut().enumerate() {
+            *value = 2e-4 * (crate::random::uniform(seed, 1, i as u64) - 0.5);
+        }
+        let mut draws = Draws::new(seed, 2, 0);
+        for layer in field.layers.all() {
+            // He et al. 2015, uniform.
+            let bound = (6.0 / layer.inputs as f32).sqrt();
+            for value in &mut field.network[layer.range()] {
+                *value = bound * (2.0 * draws.uniform() - 1.0);
+            }
+        }
+        field
+    }
+
+    fn empty(architecture: Architecture, space: Space) -> Self {
+        let levels = levels(architecture.levels as usize, architecture.coarsest, architecture.finest, architecture.log2_entries);
+        let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
+        let grid = vec![0.0; levels.last().map_or(0, |l| l.range().end)];
+        // Whole vectors, for the optimiser.
+        let network = vec![0.0; layers.len().next_multiple_of(crate::simd::LANES)];
+        Self { architecture, space, levels, layers, grid, network, occupancy: Occupancy::full() }
+    }
+
+    /// Distance between samples, in cube sides.
+    pub(crate) fn step(&self) -> f32 {
+        3.0f32.sqrt() / self.architecture.steps as f32
+    }
+
+    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number of threads.
+    pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
+        rays.par_chunks(CHUNK_RAYS)
+            .map_init(Chunk::default, |chunk, rays| {
+                let clipped: Vec<_> = rays.iter().map(|r| self.space.clip(r)).collect();
+                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
+                let side = self.space.side() as f32;
+                let pixel = |(i, ray): (usize, &Ray)| {
+                    let sum = &chunk.sums[i];
+                    let far = if clipped[i].leave > clipped[i].enter { clipped[i].leave * side } else { self.space.far as f32 };
+                    let opacity = 1.0 - sum.transmittance;
+                    Pixel {
+                        colour: std::array::from_fn(|c| sum.transmittance.mul_add(ray.background[c], sum.colour[c])),
+                        premultiplied: sum.colour,
+                        opacity,
+                        depth: if sum.weight > 1e-4 { (sum.distance / sum.weight) * side } else { far },
+                        median_depth: sum.median.map_or(far, |t| t * side),
+                    }
+                };
+                rays.iter().enumerate().map(pixel).collect::<Vec<_>>()
+            })
+            .flatten_iter()
+            .collect()
+    }
+
+    /// Share of the cells that may hold something.
+    pub fn occupied(&self) -> f64 {
+        self.occupancy.cells().count() as f64 / (GRID * GRID * GRID) as f64
+    }
+
+    /// Whether every parameter is finite.
+    pub fn is_finite(&self) -> bool {
+        self.grid.iter().chain(&self.network).all(|x| x.is_finite())
+    }
+
+    /// Writes `field.safetensors`: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest). No metadata, so bytes repeat.
+    pub fn write(&self, path: &Path) -> Result<(), FieldError> {
+        let occupancy = self.occupancy.to_bytes();
+        write_tensors(path, &[("grid", Tensor::F32(&self.grid)), ("network", Tensor::F32(&self.network)), ("occupancy", Tensor::U8(&occupancy))])
+    }
+
+    /// Reads what [`Field::write`] wrote; sizes must fit the architecture and numbers be finite.
+    pub fn read(path: &Path, architecture: Architecture, space: Space) -> Result<Self, FieldError> {
+        let format = |reason: String| FieldError::Format { path: path.to_path_buf(), reason };
+        architecture.check().map_err(format)?;
+        if !space.is_valid() {
+            return Err(format(format!("the box {space:?} has no inside")));
+        }
+        let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
+        let mut field = Self::empty(architecture, space);
+        read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
+        read_f32(&tensors, "network", &mut field.network).map_err(format)?;
+        let occupancy = read_u8(&tensors, "occupancy", GRID * GRID * GRID).map_err(format)?;
+        field.occupancy.set(|cell| occupancy[cell] != 0);
+        if !field.is_finite() {
+            return Err(format("a parameter is not finite".to_owned()));
+        }
+        Ok(field)
+    }
+}
+
+/// A tensor to write.
+pub(crate) enum Tensor<'a> {
+    F32(&'a [f32]),
+    U8(&'a [u8]),
+}
+
+pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
+    let bytes: Vec<(String, Dtype, usize, Vec<u8>)> = tensors
+        .iter()
+        .map(|(name, tensor)| match tensor {
+            Tensor::F32(v) => ((*name).to_owned(), Dtype::F32, v.len(), v.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Tensor::U8(v) => ((*name).to_owned(), Dtype::U8, v.len(), v.to_vec()),
+        })
+        .collect();
+    let views = bytes.iter().map(|(name, dtype, len, data)| {
+        (name.as_str(), TensorView::new(*dtype, vec![*len], data).expect("the length is that of the data"))
+    });
+    let io = |source| FieldError::Io { path: path.to_path_buf(), source };
+    let whole = safetensors::serialize(views, None).map_err(|e| io(std::io::Error::other(e.to_string())))?;
+    std::fs::write(path, whole).map_err(io)
+}
+
+pub(crate) fn read_f32(tensors: &SafeTensors<'_>, name: &str, into: &mut [f32]) -> Result<(), String> {
+    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+    let (data, rest) = tensor.data().as_chunks::<4>();
+    if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
+        return Err(format!("tensor {name}: {:?} {:?} where {} f32 are expected", tensor.dtype(), tensor.shape(), into.len()));
+    }
+    for (value, bytes) in into.iter_mut().zip(data) {
+        *value = f32::from_le_bytes(*bytes);
+    }
+    Ok(())
+}
+
+pub(crate) fn read_u8(tensors: &SafeTensors<'_>, name: &str, len: usize) -> Result<Vec<u8>, String> {
+    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+    if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
+        return Err(format!("tensor {name}: {:?} {:?} where {len} u8 are expected", tensor.dtype(), tensor.shape()));
+    }
+    Ok(tensor.data().to_vec())
+}

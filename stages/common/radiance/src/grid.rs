@@ -1,0 +1,205 @@
+//! The multi-resolution grid: levels of growing resolution, four features a vertex, trilinear interpolation.
+//!
+//! A level whose vertices fit its table is stored densely; a finer one is hashed (Müller et al. 2022, "Instant neural graphics
+//! primitives", eq. 4), and collisions are left to the networks.
+
+use crate::simd::{LANES, kernel};
+
+/// Features a vertex.
+pub(crate) const FEATURES: usize = 4;
+
+/// One level.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Level {
+    /// Cells along each axis.
+    pub(crate) resolution: u32,
+    /// Entries in its table.
+    pub(crate) entries: usize,
+    /// Whether vertices are hashed; then `entries` is a power of two.
+    pub(crate) hashed: bool,
+    /// First float of its table.
+    pub(crate) offset: usize,
+}
+
+impl Level {
+    pub(crate) fn range(&self) -> std::ops::Range<usize> {
+        self.offset..self.offset + self.entries * FEATURES
+    }
+}
+
+/// Levels from `coarsest` to `finest` cells in equal ratios, at most 2^`log2_entries` entries each.
+pub(crate) fn levels(count: usize, coarsest: u32, finest: u32, log2_entries: u32) -> Vec<Level> {
+    let ratio = (f64::from(finest) / f64::from(coarsest)).powf(1.0 / (count.max(2) - 1) as f64);
+    let mut offset = 0;
+    (0..count)
+        .map(|i| {
+            let resolution = (f64::from(coarsest) * ratio.powi(i as i32)).round() as u32;
+            let vertices = (u64::from(resolution) + 1).pow(3);
+            let hashed = vertices > 1 << log2_entries;
+            // Whole cache lines a level.
+            let entries = if hashed { 1usize << log2_entries } else { (vertices as usize).next_multiple_of(LANES) };
+            let level = Level { resolution, entries, hashed, offset };
+            offset += entries * FEATURES;
+            level
+        })
+        .collect()
+}
+
+/// Indices and weights of the eight corners around sixteen positions in the unit cube.
+struct Corners {
+    index: [[u32; LANES]; 8],
+    weight: [[f32; LANES]; 8],
+}
+
+#[inline(always)]
+fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
+    let resolution = level.resolution as f32;
+    let last = level.resolution as i32 - 1;
+    let mut cell = [[0u32; LANES]; 3];
+    let mut fraction = [[0.0f32; LANES]; 3];
+    for axis in 0..3 {
+        for l in 0..LANES {
+            let at = p[axis][l].max(0.0).min(1.0) * resolution;
+            let c = (at as i32).min(last);
+            cell[axis][l] = c as u32;
+            fraction[axis][l] = at - c as f32;
+        }
+    }
+    let side = level.resolution + 1;
+    let mask = level.entries as u32 - 1;
+    for (corner, (index, weight)) in out.index.iter_mut().zip(&mut out.weight).enumerate() {
+        let (dx, dy, dz) = (corner as u32 & 1, corner as u32 >> 1 & 1, corner as u32 >> 2);
+        for l in 0..LANES {
+            let (x, y, z) = (cell[0][l] + dx, cell[1][l] + dy, cell[2][l] + dz);
+            index[l] = if level.hashed {
+                (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & mask
+            } else {
+                x + side * (y + side * z)
+            };
+            let share = |f: f32, d: u32| if d == 1 { f } else { 1.0 - f };
+            weight[l] = share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
+        }
+    }
+}
+
+impl Corners {
+    #[inline(always)]
+    fn new() -> Self {
+        Self { index: [[0; LANES]; 8], weight: [[0.0; LANES]; 8] }
+    }
+}
+
+kernel! {
+    /// Interpolated features of `n` positions (three rows, unit cube): four rows of `n`.
+    pub(crate) fn encode<L>(level: &Level, table: &[f32], positions: &[f32], features: &mut [f32], n: usize) {
+        let (table, _) = table.as_chunks::<FEATURES>();
+        let mut around = Corners::new();
+        let mut s = 0;
+        while s < n {
+            let p = [0, 1, 2].map(|axis| -> &[f32; LANES] { positions[axis * n + s..][..LANES].try_into().expect("whole vectors") });
+            corners(level, p, &mut around);
+            let mut block = [[0.0f32; LANES]; FEATURES];
+            for l in 0..LANES {
+                let mut sum = [0.0f32; FEATURES];
+                for c in 0..8 {
+                    let entry = &table[around.index[c][l] as usize];
+                    let w = around.weight[c][l];
+                    for k in 0..FEATURES {
+                        sum[k] = entry[k].mul_add(w, sum[k]);
+                    }
+                }
+                for k in 0..FEATURES {
+                    block[k][l] = sum[k];
+                }
+            }
+            for k in 0..FEATURES {
+                features[k * n + s..][..LANES].copy_from_slice(&block[k]);
+            }
+            s += LANES;
+        }
+    }
+}
+
+kernel! {
+    /// Adds each sample's feature gradient to the eight entries it came from, in sample order.
+    pub(crate) fn scatter<L>(level: &Level, gradient: &mut [f32], positions: &[[f32; 3]], feature_gradients: &[[f32; FEATURES]]) {
+        let (gradient, _) = gradient.as_chunks_mut::<FEATURES>();
+        let mut around = Corners::new();
+        for (positions, gradients) in positions.chunks(LANES).zip(feature_gradients.chunks(LANES)) {
+            let mut p = [[0.0f32; LANES]; 3];
+            for (l, position) in positions.iter().enumerate() {
+                for axis in 0..3 {
+                    p[axis][l] = position[axis];
+                }
+            }
+            corners(level, [&p[0], &p[1], &p[2]], &mut around);
+            for (l, d) in gradients.iter().enumerate() {
+                for c in 0..8 {
+                    let entry = &mut gradient[around.index[c][l] as usize];
+                    let w = around.weight[c][l];
+                    for k in 0..FEATURES {
+                        entry[k] = d[k].mul_add(w, entry[k]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::uniform;
+
+    fn positions(n: usize) -> Vec<[f32; 3]> {
+        let mut p: Vec<[f32; 3]> = (0..n as u64).map(|i| [0, 1, 2].map(|a| uniform(5, a, i))).collect();
+        // Corners, faces and just outside.
+        p[0] = [0.0; 3];
+        p[1] = [1.0; 3];
+        p[2] = [1.0, 0.5, 0.0];
+        p[3] = [-0.1, 1.2, 0.3];
+        p
+    }
+
+    fn rows(p: &[[f32; 3]]) -> Vec<f32> {
+        (0..3).flat_map(|axis| p.iter().map(move |q| q[axis])).collect()
+    }
+
+    #[test]
+    fn a_linear_function_is_interpolated_exactly() {
+        let level = levels(1, 16, 16, 17)[0];
+        let mut table = vec![0.0; level.entries * FEATURES];
+        for z in 0..17 {
+            for y in 0..17 {
+                for x in 0..17 {
+                    table[(x + 17 * (y + 17 * z)) * FEATURES] = (x + 2 * y + 3 * z) as f32 / 16.0;
+                }
+            }
+        }
+        let p = positions(32);
+        let mut out = vec![0.0; FEATURES * 32];
+        encode(&level, &table, &rows(&p), &mut out, 32);
+        for (q, value) in p.iter().zip(&out) {
+            let c = q.map(|v| v.clamp(0.0, 1.0));
+            assert!((value - (c[0] + 2.0 * c[1] + 3.0 * c[2])).abs() < 1e-5, "{q:?} {value}");
+        }
+    }
+
+    /// Scattering is the adjoint of encoding: <encode(t), d> = <t, scatter(d)>.
+    #[test]
+    fn scatter_is_the_adjoint_of_encode() {
+        for level in levels(4, 8, 128, 10) {
+            let n = 48;
+            let table: Vec<f32> = (0..level.entries * FEATURES).map(|i| uniform(1, 0, i as u64) - 0.5).collect();
+            let d: Vec<[f32; 4]> = (0..n as u64).map(|i| [0, 1, 2, 3].map(|k| uniform(2, k, i) - 0.5)).collect();
+            let p = positions(n);
+            let mut out = vec![0.0; FEATURES * n];
+            encode(&level, &table, &rows(&p), &mut out, n);
+            let mut gradient = vec![0.0; table.len()];
+            scatter(&level, &mut gradient, &p, &d);
+            let left: f64 = (0..n).flat_map(|s| (0..4).map(move |k| (s, k))).map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k])).sum();
+            let right: f64 = table.iter().zip(&gradient).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
+            assert!((left - right).abs() < 1e-5 * left.abs().max(1.0), "{left} {right} {level:?}");
+        }
+    }
+}

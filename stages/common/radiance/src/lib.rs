@@ -1,0 +1,43 @@
+//! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No autograd, no torch.
+//!
+//! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
+//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
+//! * [`Architecture`], [`Space`]: what a field is made of and where it lies.
+//!
+//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, colour
+//! and back in chunks that stay in the cache; what falls on the grid is kept and added level by level, in sample order. So
+//! sums have one order, and results are equal bits at any thread count. Kernels work on 16 logical lanes whatever the machine
+//! has, and multiply-adds are fused everywhere, so AVX-512, AVX2 and portable code give equal bits, too.
+//!
+//! Units: rays and depths are in scene units; inside, the scene's box is scaled to the unit cube. Colours are display-encoded sRGB.
+//!
+//! ```
+//! use radiance::{Architecture, Field, Ray, Space};
+//! let space = Space::new([-1.0; 3], [1.0; 3], 2.0, 6.0);
+//! let field = Field::new(Architecture::default(), space, 7);
+//! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
+//! let pixel = field.render(&[ray])[0];
+//! assert!(pixel.opacity > 0.0 && pixel.depth > 2.0 && pixel.depth < 6.0);
+//! ```
+
+mod adam;
+mod chunk;
+mod composite;
+mod field;
+mod field_file;
+mod grid;
+mod math;
+mod mlp;
+mod occupancy;
+mod random;
+mod simd;
+mod space;
+mod spherical;
+mod trainer;
+
+pub use field::{Architecture, Field, FieldError, Pixel};
+pub use field_file::{FieldFile, FieldKind, FIELD_FILE};
+pub use random::{Draws, uniform};
+pub use simd::{Family, set_family};
+pub use space::{Ray, Space};
+pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions};

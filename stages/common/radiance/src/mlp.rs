@@ -1,0 +1,255 @@
+//! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16); weights are stored input by
+//! input (`w[i·outputs + j]`). There are no biases: the first spherical harmonic is a constant input already.
+
+use crate::simd::{LANES, Lanes, kernel};
+
+#[inline(always)]
+fn row<L: Lanes>(from: &[f32], at: usize) -> L {
+    L::load(from[at..at + LANES].try_into().expect("a row has whole vectors"))
+}
+
+#[inline(always)]
+fn put<L: Lanes>(value: L, to: &mut [f32], at: usize) {
+    value.store((&mut to[at..at + LANES]).try_into().expect("a row has whole vectors"));
+}
+
+/// What happens to a sum before it is stored.
+#[derive(Clone, Copy)]
+pub(crate) enum After<'a> {
+    /// Nothing.
+    Linear,
+    /// max(0, ·).
+    Relu,
+    /// 0 where the gate (same shape as the output) isn't above 0: ReLU's derivative.
+    Gate(&'a [f32]),
+}
+
+/// TO outputs of TV vectors of samples, all in registers. The sum over inputs has one order, whatever the tile.
+#[inline(always)]
+fn tile<L: Lanes, const TO: usize, const TV: usize>(w: &[f32], x: &[f32], y: &mut [f32], (inputs, outputs, n): (usize, usize, usize), s: usize, j: usize, after: After<'_>) {
+    let mut acc = [[L::splat(0.0); TV]; TO];
+    for i in 0..inputs {
+        let xs: [L; TV] = std::array::from_fn(|v| row(x, i * n + s + v * LANES));
+        let ws: &[f32; TO] = w[i * outputs + j..i * outputs + j + TO].try_into().expect("a tile of weights");
+        for o in 0..TO {
+            let b = L::splat(ws[o]);
+            for v in 0..TV {
+                acc[o][v] = xs[v].mul_add(b, acc[o][v]);
+            }
+        }
+    }
+    for o in 0..TO {
+        for v in 0..TV {
+            let at = (j + o) * n + s + v * LANES;
+            let sum = match after {
+                After::Linear => acc[o][v],
+                After::Relu => acc[o][v].positive(),
+                After::Gate(gate) => acc[o][v].where_positive(row(gate, at)),
+            };
+            put(sum, y, at);
+        }
+    }
+}
+
+#[inline(always)]
+fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(w: &[f32], x: &[f32], y: &mut [f32], shape: (usize, usize, usize), s: usize, after: After<'_>) {
+    let outputs = shape.1;
+    let mut j = 0;
+    while j + TO <= outputs {
+        tile::<L, TO, TV>(w, x, y, shape, s, j, after);
+        j += TO;
+    }
+    while j < outputs {
+        tile::<L, 1, TV>(w, x, y, shape, s, j, after);
+        j += 1;
+    }
+}
+
+kernel! {
+    /// y = after(wᵀ·x): `inputs` rows of `n` samples to `outputs` rows. With the transposed weights it is the backward pass.
+    pub(crate) fn multiply<L>(w: &[f32], x: &[f32], y: &mut [f32], inputs: usize, outputs: usize, n: usize, after: After<'_>) {
+        let shape = (inputs, outputs, n);
+        let mut s = 0;
+        if L::WIDE {
+            while s + 2 * LANES <= n {
+                all_outputs::<L, 8, 2>(w, x, y, shape, s, after);
+                s += 2 * LANES;
+            }
+            if s < n {
+                all_outputs::<L, 16, 1>(w, x, y, shape, s, after);
+            }
+        } else {
+            while s < n {
+                all_outputs::<L, 4, 1>(w, x, y, shape, s, after);
+                s += LANES;
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(x: &[f32], dy: &[f32], lanes: &mut [f32], (outputs, n): (usize, usize), i: usize, j: usize) {
+    let mut acc = [[L::splat(0.0); TJ]; TI];
+    let mut s = 0;
+    while s < n {
+        let xs: [L; TI] = std::array::from_fn(|k| row(x, (i + k) * n + s));
+        for l in 0..TJ {
+            let d: L = row(dy, (j + l) * n + s);
+            for k in 0..TI {
+                acc[k][l] = xs[k].mul_add(d, acc[k][l]);
+            }
+        }
+        s += LANES;
+    }
+    for k in 0..TI {
+        for l in 0..TJ {
+            let at = ((i + k) * outputs + j + l) * LANES;
+            put(row::<L>(lanes, at).add(acc[k][l]), lanes, at);
+        }
+    }
+}
+
+#[inline(always)]
+fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(x: &[f32], dy: &[f32], lanes: &mut [f32], shape: (usize, usize), i: usize) {
+    let mut j = 0;
+    while j + TJ <= shape.0 {
+        outer_tile::<L, TI, TJ>(x, dy, lanes, shape, i, j);
+        j += TJ;
+    }
+    while j < shape.0 {
+        outer_tile::<L, TI, 1>(x, dy, lanes, shape, i, j);
+        j += 1;
+    }
+}
+
+kernel! {
+    /// Adds x·dyᵀ, the gradient of the weights, to 16 partial sums a weight (`lanes[(i·outputs + j)·16..]`).
+    pub(crate) fn add_outer<L>(x: &[f32], dy: &[f32], lanes: &mut [f32], inputs: usize, outputs: usize, n: usize) {
+        let shape = (outputs, n);
+        let mut i = 0;
+        if L::WIDE {
+            while i + 4 <= inputs {
+                outer_row::<L, 4, 4>(x, dy, lanes, shape, i);
+                i += 4;
+            }
+        } else {
+            while i + 2 <= inputs {
+                outer_row::<L, 2, 2>(x, dy, lanes, shape, i);
+                i += 2;
+            }
+        }
+        while i < inputs {
+            outer_row::<L, 1, 1>(x, dy, lanes, shape, i);
+            i += 1;
+        }
+    }
+}
+
+/// Sums the 16 partial sums of each weight, in a fixed order, adds them to `sums`, and clears them.
+pub(crate) fn drain_lanes(lanes: &mut [f32], sums: &mut [f32]) {
+    for (lanes, sum) in lanes.as_chunks_mut::<LANES>().0.iter_mut().zip(sums) {
+        let mut width = LANES / 2;
+        while width > 0 {
+            for k in 0..width {
+                lanes[k] += lanes[k + width];
+            }
+            width /= 2;
+        }
+        *sum += lanes[0];
+        lanes.fill(0.0);
+    }
+}
+
+/// Shape of one layer and where its weights lie.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Layer {
+    pub(crate) inputs: usize,
+    pub(crate) outputs: usize,
+    pub(crate) offset: usize,
+}
+
+impl Layer {
+    pub(crate) fn range(self) -> std::ops::Range<usize> {
+        self.offset..self.offset + self.inputs * self.outputs
+    }
+
+    /// The layer's weights, output by output.
+    pub(crate) fn transpose(self, weights: &[f32], to: &mut [f32]) {
+        let (w, t) = (&weights[self.range()], &mut to[self.range()]);
+        for i in 0..self.inputs {
+            for j in 0..self.outputs {
+                t[j * self.inputs + i] = w[i * self.outputs + j];
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::uniform;
+    use crate::simd::{Family, set_family};
+
+    fn numbers(seed: u64, len: usize) -> Vec<f32> {
+        (0..len).map(|i| 2.0 * uniform(seed, 0, i as u64) - 1.0).collect()
+    }
+
+    /// Shapes that use every remainder of the tiling.
+    const SHAPES: [(usize, usize, usize); 5] = [(32, 32, 64), (24, 16, 48), (32, 3, 16), (3, 5, 80), (7, 9, 16)];
+
+    #[test]
+    fn products_agree_with_f64() {
+        for (inputs, outputs, n) in SHAPES {
+            let (w, x, gate) = (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(3, outputs * n));
+            let mut y = vec![0.0; outputs * n];
+            for after in [After::Linear, After::Relu, After::Gate(&gate)] {
+                multiply(&w, &x, &mut y, inputs, outputs, n, after);
+                for j in 0..outputs {
+                    for s in 0..n {
+                        let sum: f64 = (0..inputs).map(|i| f64::from(w[i * outputs + j]) * f64::from(x[i * n + s])).sum();
+                        let expected = match after {
+                            After::Linear => sum,
+                            After::Relu => sum.max(0.0),
+                            After::Gate(gate) => if gate[j * n + s] > 0.0 { sum } else { 0.0 },
+                        };
+                        assert!((f64::from(y[j * n + s]) - expected).abs() < 1e-5);
+                    }
+                }
+            }
+            let dy = numbers(4, outputs * n);
+            let mut lanes = vec![0.0; inputs * outputs * LANES];
+            let mut sums = vec![1.0; inputs * outputs];
+            add_outer(&x, &dy, &mut lanes, inputs, outputs, n);
+            drain_lanes(&mut lanes, &mut sums);
+            for i in 0..inputs {
+                for j in 0..outputs {
+                    let sum: f64 = (0..n).map(|s| f64::from(x[i * n + s]) * f64::from(dy[j * n + s])).sum();
+                    assert!((f64::from(sums[i * outputs + j]) - 1.0 - sum).abs() < 1e-5);
+                }
+            }
+            assert!(lanes.iter().all(|&v| v == 0.0));
+        }
+    }
+
+    #[test]
+    fn all_families_give_equal_bits() {
+        let outcome = || -> Vec<u32> {
+            let mut bits = Vec::new();
+            for (inputs, outputs, n) in SHAPES {
+                let (w, x, dy) = (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
+                let mut y = vec![0.0; outputs * n];
+                multiply(&w, &x, &mut y, inputs, outputs, n, After::Relu);
+                let mut lanes = vec![0.0; inputs * outputs * LANES];
+                add_outer(&x, &dy, &mut lanes, inputs, outputs, n);
+                bits.extend(y.iter().chain(&lanes).map(|v| v.to_bits()));
+            }
+            bits
+        };
+        let best = outcome();
+        for family in [Family::Avx512, Family::Avx2, Family::Portable] {
+            set_family(family);
+            assert_eq!(outcome(), best, "{family:?}");
+        }
+        [Family::Portable, Family::Avx2, Family::Avx512].into_iter().for_each(set_family);
+    }
+}

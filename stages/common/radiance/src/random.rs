@@ -1,0 +1,38 @@
+/// Scrambles a counter (splitmix64): every draw is a function of what it is for, so any thread may make it at any time.
+fn scramble(mut x: u64) -> u64 {
+    x = x.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    x ^ (x >> 31)
+}
+
+/// A number in [0, 1) that depends on a seed, a purpose and a counter alone.
+pub fn uniform(seed: u64, purpose: u64, counter: u64) -> f32 {
+    Draws::new(seed, purpose, counter).uniform()
+}
+
+/// A sequence of draws that depends on a seed, a purpose and a counter alone.
+#[derive(Clone, Debug)]
+pub struct Draws(u64);
+
+impl Draws {
+    /// Starts the sequence.
+    pub fn new(seed: u64, purpose: u64, counter: u64) -> Self {
+        Self(scramble(scramble(seed ^ purpose.wrapping_mul(0xD1B5_4A32_D192_ED03)) ^ counter))
+    }
+
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        scramble(self.0)
+    }
+
+    /// In [0, 1).
+    pub fn uniform(&mut self) -> f32 {
+        (self.next() >> 40) as f32 / (1u64 << 24) as f32
+    }
+
+    /// In 0..bound.
+    pub fn below(&mut self, bound: u64) -> u64 {
+        ((u128::from(self.next()) * u128::from(bound)) >> 64) as u64
+    }
+}

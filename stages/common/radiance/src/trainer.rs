@@ -1,0 +1,443 @@
+use std::path::Path;
+use std::sync::Mutex;
+
+use rayon::prelude::*;
+use safetensors::SafeTensors;
+
+use crate::adam::{AdamStep, adam};
+use crate::chunk::{Chunk, FeatureGradients, densities};
+use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
+use crate::grid::scatter;
+use crate::mlp::drain_lanes;
+use crate::occupancy::GRID;
+use crate::random::{Draws, uniform};
+use crate::simd::LANES;
+use crate::space::Ray;
+
+/// Where a trainer's rays come from and how their colours are judged. Rays come in groups that are judged together: the s×s
+/// sub-rays of an LR pixel.
+pub trait Supervision: Sync {
+    /// Rays in a group.
+    fn rays_per_group(&self) -> usize;
+    /// Casts the rays of a group. `group` counts from 0 over the whole training: draw from it alone.
+    fn cast(&self, group: u64, rays: &mut [Ray]);
+    /// The group's loss, given its rays' colours; writes the loss's gradient by each colour.
+    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
+}
+
+/// How to train.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrainingOptions {
+    /// Rays in all.
+    pub rays: u64,
+    /// Most rays in a step.
+    pub batch: usize,
+    /// Samples a step aims at; while space is still full of fog, steps have fewer rays.
+    pub samples: usize,
+    /// Learning rate at its highest.
+    pub rate: f64,
+    /// Learning rate at the end, as a share of the highest.
+    pub final_rate: f64,
+    /// Steps of linear warm-up.
+    pub warm_up: u64,
+    /// Weight decay of the grid's entries.
+    pub grid_decay: f32,
+    /// Weight decay of the networks.
+    pub network_decay: f32,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+}
+
+/// What a step did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepReport {
+    /// Mean loss of the groups.
+    pub loss: f64,
+    /// Rays cast.
+    pub rays: usize,
+    /// Samples marched.
+    pub samples: usize,
+    /// Whether the step was thrown away, because something in it wasn't finite.
+    pub skipped: bool,
+}
+
+/// A training that can't go on.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainingError {
+    /// Numbers went wrong twice within a hundred steps.
+    #[error("step {step}: {tensor} is not finite, for the second time within 100 steps; lower the rate")]
+    NotFinite {
+        /// The step.
+        step: u64,
+        /// What wasn't finite.
+        tensor: &'static str,
+    },
+}
+
+/// Shards of a step: fixed, so that sums have one order at any thread count.
+const SHARDS: usize = 32;
+/// Steps between looks at the occupancy.
+const OCCUPANCY_EVERY: u64 = 16;
+/// Until this step every cell is looked at.
+const OCCUPANCY_WARM_UP: u64 = 256;
+
+/// Trains a [`Field`] by Adam.
+pub struct Trainer {
+    field: Field,
+    options: TrainingOptions,
+    first: Moments,
+    second: Moments,
+    gradients: Moments,
+    transposed: Vec<f32>,
+    /// Cells that may be occupied at all.
+    hull: Option<Vec<bool>>,
+    step: u64,
+    groups: u64,
+    samples_per_ray: f64,
+    rate_scale: f64,
+    last_fault: Option<u64>,
+    shards: Vec<Shard>,
+    workers: Mutex<Vec<Worker>>,
+}
+
+/// One number a parameter.
+struct Moments {
+    grid: Vec<f32>,
+    network: Vec<f32>,
+}
+
+/// What a shard leaves for the sums.
+#[derive(Default)]
+struct Shard {
+    features: FeatureGradients,
+    network: Vec<f32>,
+    loss: f64,
+    samples: usize,
+}
+
+/// Buffers of one thread.
+#[derive(Default)]
+struct Worker {
+    chunk: Chunk,
+    lanes: Vec<f32>,
+    rays: Vec<Ray>,
+    clipped: Vec<crate::space::UnitRay>,
+    offsets: Vec<f32>,
+    backgrounds: Vec<[f32; 3]>,
+    colours: Vec<[f32; 3]>,
+    gradients: Vec<[f32; 3]>,
+}
+
+impl Trainer {
+    /// Starts from a field.
+    pub fn new(field: Field, options: TrainingOptions) -> Self {
+        let zeros = || Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] };
+        let full = f64::from(field.architecture.steps) * 0.6;
+        Self {
+            first: zeros(),
+            second: zeros(),
+            gradients: zeros(),
+            transposed: vec![0.0; field.network.len()],
+            hull: None,
+            step: 0,
+            groups: 0,
+            samples_per_ray: full,
+            rate_scale: 1.0,
+            last_fault: None,
+            shards: (0..SHARDS).map(|_| Shard::default()).collect(),
+            workers: Mutex::new(Vec::new()),
+            field,
+            options,
+        }
+    }
+
+    /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
+    pub fn limit_to_hull(&mut self, hull: &[u8]) {
+        let space = self.field.space;
+        let side = space.side();
+        // The occupancy grid covers the cube of the longest side, the hull the box.
+        let covered = |axis: usize, cell: usize| {
+            let scale = side / (space.max[axis] - space.min[axis]);
+            let low = (cell as f64 * scale) as usize;
+            let high = ((cell + 1) as f64 * scale).ceil() as usize;
+            low.min(GRID)..high.min(GRID)
+        };
+        let kept = |cell: usize| {
+            let (x, y, z) = (cell % GRID, cell / GRID % GRID, cell / (GRID * GRID));
+            covered(2, z).any(|k| covered(1, y).any(|j| covered(0, x).any(|i| hull[i + GRID * (j + GRID * k)] != 0)))
+        };
+        let mask: Vec<bool> = (0..GRID * GRID * GRID).into_par_iter().map(kept).collect();
+        self.field.occupancy.set(|cell| mask[cell]);
+        self.hull = Some(mask);
+    }
+
+    /// The field as it is now.
+    pub fn field(&self) -> &Field {
+        &self.field
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Rays cast so far, with groups of a size.
+    pub fn rays_done(&self, rays_per_group: usize) -> u64 {
+        self.groups * rays_per_group as u64
+    }
+
+    /// Takes a step; `None` once all rays are spent.
+    pub fn step(&mut self, supervision: &impl Supervision) -> Result<Option<StepReport>, TrainingError> {
+        let group = supervision.rays_per_group();
+        let left = self.options.rays.saturating_sub(self.rays_done(group)) as usize / group;
+        if left == 0 {
+            return Ok(None);
+        }
+        let wanted = (self.options.samples as f64 / self.samples_per_ray.max(0.1)) as usize;
+        let groups = (wanted.clamp(256, self.options.batch.max(256)) / group).max(1).min(left);
+        if self.step > 0 && self.step.is_multiple_of(OCCUPANCY_EVERY) {
+            self.update_occupancy();
+        }
+        for layer in self.field.layers.all() {
+            layer.transpose(&self.field.network, &mut self.transposed);
+        }
+
+        let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
+        let first_group = self.groups;
+        self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
+            let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
+            let mut worker = lock(workers).pop().unwrap_or_default();
+            shard.run(&mut worker, field, transposed, supervision, options.seed, first_group, range, groups);
+            lock(workers).push(worker);
+        });
+
+        let samples: usize = self.shards.iter().map(|s| s.samples).sum();
+        let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / groups as f64;
+        for shard in &self.shards {
+            for (sum, g) in self.gradients.network.iter_mut().zip(&shard.network) {
+                *sum += g;
+            }
+        }
+        self.groups += groups as u64;
+        self.samples_per_ray = samples as f64 / (groups * group) as f64;
+        let fault = self.fault(loss);
+        if let Some(tensor) = fault {
+            self.gradients.network.fill(0.0);
+            let again = self.last_fault.is_some_and(|before| self.step - before < 100);
+            if again {
+                return Err(TrainingError::NotFinite { step: self.step, tensor });
+            }
+            self.last_fault = Some(self.step);
+            self.rate_scale *= 0.5;
+        } else {
+            self.apply(group);
+        }
+        self.step += 1;
+        Ok(Some(StepReport { loss, rays: groups * group, samples, skipped: fault.is_some() }))
+    }
+
+    /// What isn't finite, before anything has been changed by it.
+    fn fault(&self, loss: f64) -> Option<&'static str> {
+        let finite = |sum: f32| sum.is_finite();
+        if !loss.is_finite() {
+            Some("the loss")
+        } else if !finite(self.gradients.network.iter().sum()) {
+            Some("the networks' gradient")
+        } else if !self.shards.par_iter().all(|s| s.features.levels.iter().flatten().flatten().all(|g| g.is_finite())) {
+            Some("the grid's gradient")
+        } else {
+            None
+        }
+    }
+
+    fn apply(&mut self, group: usize) {
+        let options = &self.options;
+        let progress = (self.groups * group as u64) as f64 / options.rays.max(1) as f64;
+        let warm = ((self.step + 1) as f64 / options.warm_up.max(1) as f64).min(1.0);
+        let rate = options.rate * self.rate_scale * warm * options.final_rate.powf(progress.min(1.0));
+        let grid_step = AdamStep::new(self.step + 1, rate, options.grid_decay);
+        let network_step = AdamStep::new(self.step + 1, rate, options.network_decay);
+        adam(&network_step, &mut self.field.network, &mut self.gradients.network, &mut self.first.network, &mut self.second.network);
+
+        let shards = &self.shards;
+        let mut work = Vec::with_capacity(self.field.levels.len());
+        let mut grids = (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
+        for (i, level) in self.field.levels.iter().enumerate() {
+            let len = level.entries * crate::grid::FEATURES;
+            let (w, rest_w) = grids.0.split_at_mut(len);
+            let (g, rest_g) = grids.1.split_at_mut(len);
+            let (m, rest_m) = grids.2.split_at_mut(len);
+            let (v, rest_v) = grids.3.split_at_mut(len);
+            grids = (rest_w, rest_g, rest_m, rest_v);
+            work.push((i, level, w, g, m, v));
+        }
+        // The finest levels cost most: begin with them.
+        work.into_par_iter().rev().with_max_len(1).for_each(|(i, level, w, g, m, v)| {
+            for shard in shards {
+                if let Some(gradients) = shard.features.levels.get(i) {
+                    scatter(level, g, &shard.features.positions, gradients);
+                }
+            }
+            adam(&grid_step, w, g, m, v);
+        });
+    }
+
+    /// Looks at the density of cells and decides anew which may hold something.
+    fn update_occupancy(&mut self) {
+        const DECAY: f32 = 0.95;
+        let (field, seed, step) = (&self.field, self.options.seed, self.step);
+        let look_everywhere = step <= OCCUPANCY_WARM_UP;
+        let turn = (step / OCCUPANCY_EVERY) as usize % 16;
+        let occupancy = &field.occupancy;
+        let hull = self.hull.as_deref();
+        let mut density = occupancy.density.clone();
+        density.par_chunks_mut(GRID * GRID).enumerate().for_each(|(z, slab)| {
+            let mut chunk = Chunk::default();
+            let mut positions = vec![0.0; 3 * 1024];
+            let wanted: Vec<usize> = (0..GRID * GRID)
+                .filter(|i| {
+                    let cell = z * GRID * GRID + i;
+                    let allowed = hull.is_none_or(|h| h[cell]);
+                    allowed && (look_everywhere || occupancy.is_occupied(cell) || (i + z) % 16 == turn)
+                })
+                .collect();
+            for cells in wanted.chunks(1024) {
+                let n = cells.len().next_multiple_of(LANES);
+                for (k, &i) in cells.iter().enumerate() {
+                    let mut draws = Draws::new(seed, 3, step * (GRID * GRID * GRID) as u64 + (z * GRID * GRID + i) as u64);
+                    for (axis, corner) in [i % GRID, i / GRID, z].into_iter().enumerate() {
+                        positions[axis * n + k] = (corner as f32 + draws.uniform()) / GRID as f32;
+                    }
+                }
+                let found = densities(&mut chunk, field, &positions[..3 * n], n);
+                for (&i, &d) in cells.iter().zip(found) {
+                    slab[i] = (slab[i] * DECAY).max(d);
+                }
+            }
+        });
+        let cells = self.hull.as_ref().map_or(density.len(), |h| h.iter().filter(|k| **k).count()).max(1);
+        let mean = (density.iter().map(|&d| f64::from(d)).sum::<f64>() / cells as f64) as f32;
+        // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
+        let threshold = mean.min(0.01 / self.field.step());
+        self.field.occupancy.density = density;
+        let occupied: Vec<bool> = self.field.occupancy.density.iter().enumerate().map(|(i, &d)| d >= threshold && hull.is_none_or(|h| h[i])).collect();
+        self.field.occupancy.set(|cell| occupied[cell]);
+    }
+
+    /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.
+    pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
+        let counters: Vec<u8> = [
+            self.step,
+            self.groups,
+            self.samples_per_ray.to_bits(),
+            self.rate_scale.to_bits(),
+            self.last_fault.map_or(u64::MAX, |s| s),
+        ]
+        .iter()
+        .flat_map(|v| v.to_le_bytes())
+        .collect();
+        let occupied = self.field.occupancy.to_bytes();
+        write_tensors(path, &[
+            ("counters", Tensor::U8(&counters)),
+            ("density", Tensor::F32(&self.field.occupancy.density)),
+            ("first.grid", Tensor::F32(&self.first.grid)),
+            ("first.network", Tensor::F32(&self.first.network)),
+            ("grid", Tensor::F32(&self.field.grid)),
+            ("network", Tensor::F32(&self.field.network)),
+            ("occupied", Tensor::U8(&occupied)),
+            ("second.grid", Tensor::F32(&self.second.grid)),
+            ("second.network", Tensor::F32(&self.second.network)),
+        ])
+    }
+
+    /// The step a checkpoint was written at.
+    pub fn checkpoint_step(path: &Path) -> Result<u64, FieldError> {
+        read_counters(path, |_, counters| Ok(counters[0]))
+    }
+
+    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
+        read_counters(path, |tensors, counters| {
+            let field = &mut self.field;
+            for (name, into) in [
+                ("density", &mut field.occupancy.density),
+                ("first.grid", &mut self.first.grid),
+                ("first.network", &mut self.first.network),
+                ("grid", &mut field.grid),
+                ("network", &mut field.network),
+                ("second.grid", &mut self.second.grid),
+                ("second.network", &mut self.second.network),
+            ] {
+                read_f32(tensors, name, into)?;
+            }
+            let occupied = read_u8(tensors, "occupied", GRID * GRID * GRID)?;
+            field.occupancy.set(|cell| occupied[cell] != 0);
+            (self.step, self.groups) = (counters[0], counters[1]);
+            (self.samples_per_ray, self.rate_scale) = (f64::from_bits(counters[2]), f64::from_bits(counters[3]));
+            self.last_fault = (counters[4] != u64::MAX).then_some(counters[4]);
+            Ok(())
+        })
+    }
+}
+
+/// Opens a checkpoint and reads its five counters.
+fn read_counters<T>(path: &Path, then: impl FnOnce(&SafeTensors<'_>, &[u64]) -> Result<T, String>) -> Result<T, FieldError> {
+    let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+    let read = || {
+        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
+        let counters = read_u8(&tensors, "counters", 40)?;
+        let counters: Vec<u64> = counters.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect();
+        then(&tensors, &counters)
+    };
+    read().map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}
+
+impl Shard {
+    #[allow(clippy::too_many_arguments, reason = "what a shard reads of the trainer, which is borrowed elsewhere")]
+    fn run(&mut self, worker: &mut Worker, field: &Field, transposed: &[f32], supervision: &impl Supervision, seed: u64, first_group: u64, range: std::ops::Range<usize>, groups: usize) {
+        let group = supervision.rays_per_group();
+        self.features.positions.clear();
+        self.features.levels.iter_mut().for_each(Vec::clear);
+        self.network.resize(field.network.len(), 0.0);
+        self.network.fill(0.0);
+        (self.loss, self.samples) = (0.0, 0);
+        worker.lanes.resize(field.network.len() * LANES, 0.0);
+        let chunk_groups = (CHUNK_RAYS / group).max(1);
+        let scale = 1.0 / groups as f32;
+        let mut next = range.start;
+        while next < range.end {
+            let here = next..(next + chunk_groups).min(range.end);
+            let rays = here.len() * group;
+            worker.rays.resize(rays, Ray::default());
+            worker.colours.resize(rays, [0.0; 3]);
+            worker.gradients.resize(rays, [0.0; 3]);
+            for (k, g) in here.clone().enumerate() {
+                supervision.cast(first_group + g as u64, &mut worker.rays[k * group..(k + 1) * group]);
+            }
+            worker.clipped.clear();
+            worker.clipped.extend(worker.rays.iter().map(|r| field.space.clip(r)));
+            worker.backgrounds.clear();
+            worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
+            let first_ray = (first_group + here.start as u64) * group as u64;
+            worker.offsets.clear();
+            worker.offsets.extend((0..rays as u64).map(|r| uniform(seed, 4, first_ray + r)));
+            worker.chunk.forward(field, &worker.clipped, &worker.offsets);
+            self.samples += worker.chunk.samples();
+            for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
+                *colour = std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
+            }
+            for (k, g) in here.clone().enumerate() {
+                let part = k * group..(k + 1) * group;
+                self.loss += supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
+            }
+            worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
+            worker.chunk.backward(field, transposed, &worker.gradients, &worker.backgrounds, &mut worker.lanes, &mut self.features);
+            next = here.end;
+        }
+        drain_lanes(&mut worker.lanes, &mut self.network);
+    }
+}

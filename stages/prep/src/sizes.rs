@@ -1,0 +1,103 @@
+/// LR and HR size, (width, height).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sizes {
+    /// Size of the LR images.
+    pub lr: (u32, u32),
+    /// Size of the HR images.
+    pub hr: (u32, u32),
+}
+
+impl Sizes {
+    /// Whether the HR size is a whole multiple of the LR size on both axes.
+    pub fn is_integer(&self) -> bool {
+        self.hr.0.is_multiple_of(self.lr.0) && self.hr.1.is_multiple_of(self.lr.1)
+    }
+}
+
+/// Sizes that can't be.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum SizeError {
+    /// All three given, and they contradict each other.
+    #[error("lr = {lr}, hr = {hr} and scale = {scale} contradict each other; give two of them")]
+    Contradiction {
+        /// LR width.
+        lr: u32,
+        /// HR width.
+        hr: u32,
+        /// Scale.
+        scale: f64,
+    },
+    /// An image would have to be enlarged.
+    #[error("{name} = {asked} pixels wide is larger than {larger} = {limit}; choose a smaller {name}")]
+    TooLarge {
+        /// Which size.
+        name: &'static str,
+        /// Its width.
+        asked: u32,
+        /// What it must not exceed.
+        larger: &'static str,
+        /// That width.
+        limit: u32,
+    },
+    /// Nothing would be left.
+    #[error("scale = {scale} leaves no pixel of {hr}; choose a smaller scale")]
+    Nothing {
+        /// Scale.
+        scale: f64,
+        /// HR width.
+        hr: u32,
+    },
+}
+
+/// LR and HR size from what is given of `lr`, `hr` and `scale`. Widths are given; heights follow the data's aspect.
+pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option<f64>) -> Result<Sizes, SizeError> {
+    let times = |w: u32, s: f64| (f64::from(w) * s).round() as u32;
+    let (lr, hr) = match (lr, hr, scale) {
+        (Some(lr), Some(hr), Some(scale)) if times(lr, scale) != hr => return Err(SizeError::Contradiction { lr, hr, scale }),
+        (Some(lr), Some(hr), _) => (lr, hr),
+        (Some(lr), None, scale) => (lr, times(lr, scale.unwrap_or(2.0))),
+        (None, hr, scale) => {
+            let hr = hr.unwrap_or(native.0);
+            (times(hr, 1.0 / scale.unwrap_or(2.0)), hr)
+        }
+    };
+    if lr == 0 {
+        return Err(SizeError::Nothing { scale: scale.unwrap_or(2.0), hr });
+    }
+    if hr > native.0 {
+        let name = if lr > native.0 { "lr" } else { "hr" };
+        let asked = if lr > native.0 { lr } else { hr };
+        return Err(SizeError::TooLarge { name, asked, larger: "the data's images", limit: native.0 });
+    }
+    if lr > hr {
+        return Err(SizeError::TooLarge { name: "lr", asked: lr, larger: "hr", limit: hr });
+    }
+    let height = |w: u32| ((f64::from(native.1) * f64::from(w) / f64::from(native.0)).round() as u32).max(1);
+    Ok(Sizes { lr: (lr, height(lr)), hr: (hr, height(hr)) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn any_two_of_three() {
+        let expected = Sizes { lr: (100, 100), hr: (200, 200) };
+        let native = (800, 800);
+        for (lr, hr, scale) in [(Some(100), Some(200), None), (Some(100), None, Some(2.0)), (None, Some(200), Some(2.0)), (Some(100), None, None), (Some(100), Some(200), Some(2.0))] {
+            assert_eq!(sizes(native, lr, hr, scale), Ok(expected));
+        }
+        assert_eq!(sizes(native, None, None, None), Ok(Sizes { lr: (400, 400), hr: native }));
+        assert_eq!(sizes((504, 378), None, None, Some(4.0)), Ok(Sizes { lr: (126, 95), hr: (504, 378) }));
+        assert!(!sizes((504, 378), None, None, Some(4.0)).unwrap().is_integer());
+    }
+
+    #[test]
+    fn enlarging_and_contradictions_are_refused() {
+        assert!(matches!(sizes((800, 800), Some(900), None, Some(1.0)), Err(SizeError::TooLarge { name: "lr", asked: 900, .. })));
+        assert!(matches!(sizes((800, 800), Some(500), None, Some(2.0)), Err(SizeError::TooLarge { name: "hr", asked: 1000, .. })));
+        assert!(matches!(sizes((800, 800), Some(500), Some(400), None), Err(SizeError::TooLarge { larger: "hr", .. })));
+        assert!(matches!(sizes((800, 800), Some(100), Some(300), Some(2.0)), Err(SizeError::Contradiction { .. })));
+        assert!(matches!(sizes((4, 4), None, None, Some(16.0)), Err(SizeError::Nothing { .. })));
+    }
+}

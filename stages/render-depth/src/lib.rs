@@ -1,0 +1,180 @@
+//! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
+//!
+//! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
+//! written sixteen at a time, so memory doesn't grow with the image.
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
+use pixels::{Channel, PixelError, PngRows, SampleType, to_u8, write_exr};
+use radiance::{FIELD_FILE, Field, FieldFile, Ray};
+use scene::{Background, Camera, VIEWS_FILE, View, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Parameters of `render-depth`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Width of the views; heights follow the cameras' aspect. Without it: the cameras' own size.
+    #[schemars(range(min = 1, max = 65536))]
+    pub size: Option<u32>,
+    /// Which depth goes into `Z`.
+    pub depth: Depth,
+    /// Writes the distance along the ray, too, as channel `distance`.
+    pub ray_distance: bool,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { size: None, depth: Depth::Expected, ray_distance: false }
+    }
+}
+
+/// Kinds of depth.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Depth {
+    /// Mean of where light is stopped, weighted by how much of it is.
+    Expected,
+    /// Where half of the light is stopped; the far end where less ever is.
+    Median,
+}
+
+/// The stage.
+pub struct RenderDepth;
+
+impl Stage for RenderDepth {
+    type Params = Params;
+    const NAME: &'static str = "render-depth";
+    const SUMMARY: &'static str = "Renders colour, opacity and depth of a field for a list of cameras.";
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        let cameras = ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
+        vec![
+            ("field", Input::required(&["field"], "a trained field")),
+            ("cameras", Input::required(&cameras, "folder with views.json: the cameras to render")),
+        ]
+    }
+
+    fn output() -> Output {
+        Output::kind("views")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        let input = context.input("field")?;
+        let file: FieldFile = input.read_json(FIELD_FILE)?;
+        let field = Field::read(&input.path("field.safetensors"), file.architecture, file.space).bad_input("field")?;
+        let cameras = Views::read(context.input("cameras")?)?;
+        let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
+        let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
+        let progress = context.progress("rendering", rows);
+        let mut views = Vec::with_capacity(resized.len());
+        for camera in resized {
+            let job = Job { context, params, field: &field, background: file.background, camera: &camera };
+            job.render(&progress)?;
+            let image = format!("images/{}.exr", camera.name);
+            views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
+        }
+        let count = views.len();
+        context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(file.background, cameras.bounds, views) })?;
+        context.write_summary(&format!("{count} views, {:.1} M pixels", pixels_of(&cameras, params.size) as f64 / 1e6))
+    }
+}
+
+fn resize(camera: &Camera, width: Option<u32>) -> Camera {
+    let k = camera.intrinsics;
+    match width {
+        Some(width) => {
+            let height = (f64::from(k.height) * f64::from(width) / f64::from(k.width)).round().max(1.0);
+            camera.resized(width, height as u32)
+        }
+        None => camera.clone(),
+    }
+}
+
+fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
+    let size = |v: &View| resize(&v.camera, width).intrinsics;
+    cameras.views.iter().map(|v| u64::from(size(v).width) * u64::from(size(v).height)).sum()
+}
+
+/// One view.
+struct Job<'a> {
+    context: &'a Context,
+    params: &'a Params,
+    field: &'a Field,
+    background: Background,
+    camera: &'a Camera,
+}
+
+impl Job<'_> {
+    fn render(&self, progress: &artifact::Progress) -> anyhow::Result<()> {
+        let k = self.camera.intrinsics;
+        let (width, height) = (k.width as usize, k.height as usize);
+        let half = |name| Channel { name, sample_type: SampleType::Half };
+        let single = |name| Channel { name, sample_type: SampleType::Float };
+        let mut channels = vec![half("R"), half("G"), half("B"), half("A"), single("Z")];
+        if self.params.ray_distance {
+            channels.push(single("distance"));
+        }
+        let note = match self.background {
+            Background::Alpha => "display-encoded sRGB, premultiplied; Z: camera-space z-depth",
+            Background::White => "display-encoded sRGB over white; Z: camera-space z-depth",
+            Background::Black => "display-encoded sRGB over black; Z: camera-space z-depth",
+        };
+        let exr = self.context.output_path(&format!("images/{}.exr", self.camera.name))?;
+        let mut png = PngRows::create(&self.context.output_path(&format!("previews/{}.png", self.camera.name))?, width, height)?;
+        write_exr(&exr, (width, height), &channels, note, |first, rows, samples| -> Result<(), Stopped> {
+            self.context.check_interrupt().map_err(Stopped::Other)?;
+            let bytes = self.band(first, rows, samples, channels.len());
+            png.write(&bytes)?;
+            progress.add(rows as u64);
+            Ok(())
+        })
+        .map_err(|stopped| match stopped {
+            Stopped::Pixels(error @ PixelError::NotFinite { .. }) => Failure::Numerical(error.to_string()).into(),
+            Stopped::Pixels(error) => error.into(),
+            Stopped::Other(error) => error,
+        })?;
+        png.finish().context("cannot write the preview")
+    }
+
+    /// Renders some rows into EXR samples; returns the preview's bytes.
+    fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> Vec<u8> {
+        let width = self.camera.intrinsics.width as usize;
+        let background = [self.background.shown(); 3];
+        let (rays, to_z): (Vec<Ray>, Vec<f32>) = (0..rows * width)
+            .map(|i| {
+                let ray = self.camera.ray((i % width) as f64 + 0.5, (first + i / width) as f64 + 0.5);
+                let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
+                (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
+            })
+            .unzip();
+        let pixels = self.field.render(&rays);
+        for ((pixel, to_z), sample) in pixels.iter().zip(to_z).zip(samples.chunks_exact_mut(channels)) {
+            let colour = if self.background == Background::Alpha { pixel.premultiplied } else { pixel.colour };
+            sample[..3].copy_from_slice(&colour);
+            sample[3] = pixel.opacity;
+            let distance = match self.params.depth {
+                Depth::Expected => pixel.depth,
+                Depth::Median => pixel.median_depth,
+            };
+            sample[4] = distance * to_z;
+            if let Some(last) = sample.get_mut(5) {
+                *last = distance;
+            }
+        }
+        pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect()
+    }
+}
+
+/// Why writing a view ended early.
+enum Stopped {
+    Pixels(PixelError),
+    Other(anyhow::Error),
+}
+
+impl From<PixelError> for Stopped {
+    fn from(error: PixelError) -> Self {
+        Self::Pixels(error)
+    }
+}

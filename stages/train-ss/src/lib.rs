@@ -1,0 +1,268 @@
+//! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section "Supersampling").
+//!
+//! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
+//! * [`Average`]: the paper's supervision: the mean of s×s sub-rays is compared with the LR pixel (its eq. 4).
+//! * `checkpoint`: what makes a killed run end in the same bytes.
+
+mod average;
+mod checkpoint;
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
+use pixels::{Picture, read_exr, read_png};
+use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Space, Trainer, TrainingError, TrainingOptions};
+use scene::Views;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+pub use average::Average;
+use checkpoint::Checkpoints;
+
+/// Parameters of `train-ss`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Which field.
+    pub field: FieldKind,
+    /// Sub-rays along each side of an LR pixel; 1 is plain NeRF.
+    #[schemars(range(min = 1, max = 16))]
+    pub supersample: u32,
+    /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
+    pub jitter: bool,
+    /// Rays to train with, sub-rays counted each.
+    #[schemars(range(min = 1))]
+    pub rays: u64,
+    /// Most rays in a step.
+    #[schemars(range(min = 1, max = 1_048_576))]
+    pub batch: u32,
+    /// Samples a step aims at while space is full of fog and rays are expensive.
+    #[schemars(range(min = 1024, max = 16_777_216))]
+    pub samples: u32,
+    /// Highest learning rate.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub rate: f64,
+    /// Learning rate at the end, as a share of the highest; it falls exponentially.
+    #[schemars(range(min = 1e-6, max = 1.0))]
+    pub final_rate: f64,
+    /// Weight decay of the grid.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub grid_decay: f64,
+    /// Weight decay of the networks.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub network_decay: f64,
+    /// Levels of the grid.
+    #[schemars(range(min = 1, max = 16))]
+    pub levels: u32,
+    /// Cells along an axis of the coarsest level.
+    #[schemars(range(min = 2, max = 512))]
+    pub coarsest: u32,
+    /// Cells along an axis of the finest level.
+    #[schemars(range(min = 2, max = 4096))]
+    pub finest: u32,
+    /// Base-2 logarithm of the most entries in a level.
+    #[schemars(range(min = 8, max = 22))]
+    pub log2_entries: u32,
+    /// Width of the networks' hidden layers.
+    #[schemars(range(min = 16, max = 128))]
+    pub hidden: u32,
+    /// Samples along the diagonal of the scene's cube.
+    #[schemars(range(min = 16, max = 8192))]
+    pub steps: u32,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        let grid = Architecture::default();
+        Self {
+            field: FieldKind::Grid,
+            supersample: 2,
+            jitter: false,
+            rays: 30_000_000,
+            batch: 16_384,
+            samples: 131_072,
+            rate: 1e-2,
+            final_rate: 0.02,
+            grid_decay: 0.0,
+            network_decay: 1e-6,
+            levels: grid.levels,
+            coarsest: grid.coarsest,
+            finest: grid.finest,
+            log2_entries: grid.log2_entries,
+            hidden: grid.hidden,
+            steps: grid.steps,
+            seed: 0,
+        }
+    }
+}
+
+impl Params {
+    fn architecture(&self) -> Architecture {
+        Architecture {
+            levels: self.levels,
+            coarsest: self.coarsest,
+            finest: self.finest,
+            log2_entries: self.log2_entries,
+            hidden: self.hidden,
+            steps: self.steps,
+        }
+    }
+
+    fn options(&self) -> TrainingOptions {
+        TrainingOptions {
+            rays: self.rays,
+            batch: self.batch as usize,
+            samples: self.samples as usize,
+            rate: self.rate,
+            final_rate: self.final_rate,
+            warm_up: 100,
+            grid_decay: self.grid_decay as f32,
+            network_decay: self.network_decay as f32,
+            seed: self.seed,
+        }
+    }
+}
+
+/// `training.json`: how the training went.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingLog {
+    /// Steps taken.
+    pub steps: u64,
+    /// Rays cast.
+    pub rays: u64,
+    /// Mean samples a ray over the whole training.
+    pub samples_per_ray: f64,
+    /// PSNR of training pixels against rays, about a hundred points.
+    pub curve: Vec<CurvePoint>,
+}
+
+/// A point of the training curve.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct CurvePoint {
+    /// Rays cast until here.
+    pub rays: u64,
+    /// PSNR over the training pixels since the last point.
+    pub psnr: f64,
+}
+
+/// The stage.
+pub struct TrainSs;
+
+impl Stage for TrainSs {
+    type Params = Params;
+    const NAME: &'static str = "train-ss";
+    const SUMMARY: &'static str = "Trains a radiance field from LR images by supersampling.";
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![("scene", Input::required(&["scene/train"], "LR images with cameras and bounds"))]
+    }
+
+    fn output() -> Output {
+        Output::kind("field")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        if params.coarsest > params.finest {
+            let message = format!("parameter coarsest: {} is above finest = {}", params.coarsest, params.finest);
+            return Err(Failure::Usage(message).into());
+        }
+        let input = context.input("scene")?;
+        let views = Views::read(input)?;
+        let pictures = read_pictures(input, &views)?;
+        let b = views.bounds;
+        let space = Space::new(b.min, b.max, b.near, b.far);
+        let supervision = Average::new(&views, pictures, params.supersample, params.jitter, params.seed);
+        let mut trainer = Trainer::new(Field::new(params.architecture(), space, params.seed), params.options());
+        if let Some(hull) = &views.hull {
+            trainer.limit_to_hull(&read_hull(&input.path(hull))?);
+        }
+        let log = train(context, params, &mut trainer, &supervision)?;
+        if !trainer.field().is_finite() {
+            return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", trainer.steps())).into());
+        }
+        trainer.field().write(&context.output_path("field.safetensors")?).context("cannot write the field")?;
+        let file = FieldFile { field: params.field, architecture: params.architecture(), space, background: views.background };
+        context.write_json(FIELD_FILE, &file)?;
+        context.write_json("training.json", &log)?;
+        let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
+        context.write_summary(&format!(
+            "supersample {}: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
+            params.supersample, log.rays as f64 / 1e6, log.steps, log.samples_per_ray
+        ))
+    }
+}
+
+/// LR pictures as the supervision wants them: over the background, or RGBA premultiplied where it is open.
+fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Picture>> {
+    let read = |view: &scene::View| -> anyhow::Result<Picture> {
+        let name = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name));
+        let path = input.path(name.bad_input("scene")?);
+        let straight = if path.extension().is_some_and(|e| e == "exr") {
+            let image = read_exr(&path).bad_input("scene")?;
+            let channels = ["R", "G", "B", "A"].map(|c| image.channel(c));
+            let [Some(r), Some(g), Some(b), Some(a)] = channels else {
+                return Err(Failure::BadInput(format!("{}: channels R, G, B, A are expected", path.display())).into());
+            };
+            let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
+            Picture::new(image.width, image.height, 4, data)
+        } else {
+            Picture::from_rgba8(&read_png(&path).bad_input("scene")?)
+        };
+        let k = view.camera.intrinsics;
+        if (straight.width, straight.height) != (k.width as usize, k.height as usize) {
+            let message = format!("{}: {}×{} pixels where its camera has {}×{}", path.display(), straight.width, straight.height, k.width, k.height);
+            return Err(Failure::BadInput(message).into());
+        }
+        if views.background == scene::Background::Alpha {
+            let premultiplied = straight.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
+            return Ok(Picture::new(straight.width, straight.height, 4, premultiplied));
+        }
+        Ok(straight.over(views.background.shown()))
+    };
+    views.views.iter().map(read).collect()
+}
+
+fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {
+    let bytes = std::fs::read(path).bad_input(path.display())?;
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).bad_input(path.display())?;
+    let hull = tensors.tensor("hull").bad_input(path.display())?;
+    if hull.data().len() != 128 * 128 * 128 {
+        return Err(Failure::BadInput(format!("{}: a hull of 128³ cells is expected", path.display())).into());
+    }
+    Ok(hull.data().to_vec())
+}
+
+/// Trains to the end, with checkpoints, progress and a curve.
+fn train(context: &Context, params: &Params, trainer: &mut Trainer, supervision: &Average) -> anyhow::Result<TrainingLog> {
+    use radiance::Supervision as _;
+    let group = supervision.rays_per_group();
+    let total = params.rays / group as u64 * group as u64;
+    if total == 0 {
+        let message = format!("parameter rays: {} is less than the {group} of one pixel", params.rays);
+        return Err(Failure::Usage(message).into());
+    }
+    let mut checkpoints = Checkpoints::new(context.work());
+    let mut curve = checkpoints.resume(trainer, |text| context.say(text));
+    let progress = context.progress("training", total);
+    loop {
+        if context.interrupted() {
+            checkpoints.write(trainer, &curve).context("cannot write the checkpoint")?;
+            return Err(Failure::Interrupted.into());
+        }
+        let report = trainer.step(supervision).map_err(|e| match e {
+            TrainingError::NotFinite { .. } => anyhow::Error::from(Failure::Numerical(e.to_string())),
+        })?;
+        let Some(report) = report else { break };
+        if report.skipped {
+            context.say(format!("step {}: something wasn't finite; the step was thrown away and the rate halved", trainer.steps()));
+        }
+        let rays = trainer.rays_done(group);
+        curve.add(&report, rays, total);
+        progress.set(rays, &curve.note());
+        checkpoints.write_when_due(trainer, &curve).context("cannot write the checkpoint")?;
+    }
+    Ok(curve.finish(trainer.steps(), trainer.rays_done(group)))
+}
