@@ -79,7 +79,8 @@ kernel! {
 
 /// Density of positions (three rows of n): for the occupancy grid.
 pub(crate) fn densities<'a>(chunk: &'a mut Chunk, field: &Field, positions: &[f32], n: usize) -> &'a [f32] {
-    chunk.density_network(field, Some(positions), n);
+    fit(&mut chunk.positions, 3 * n).copy_from_slice(positions);
+    chunk.density_network(field, n);
     let raw = &chunk.density[..n];
     let density = fit(&mut chunk.tau, n);
     optical_depths(raw, 1.0, density);
@@ -87,8 +88,12 @@ pub(crate) fn densities<'a>(chunk: &'a mut Chunk, field: &Field, positions: &[f3
 }
 
 impl Chunk {
-    fn density_network(&mut self, field: &Field, positions: Option<&[f32]>, n: usize) {
-        let positions = positions.unwrap_or(&self.positions[..3 * n]);
+    /// Features, hidden layer and density of the positions in `self.positions` (three rows of n).
+    fn density_network(&mut self, field: &Field, n: usize) {
+        if n == 0 {
+            return;
+        }
+        let positions = &self.positions[..3 * n];
         let features = fit(&mut self.features, field.levels.len() * FEATURES * n);
         for (level, rows) in field.levels.iter().zip(features.chunks_exact_mut(FEATURES * n)) {
             encode(level, &field.grid[level.range()], positions, rows, n);
@@ -124,7 +129,7 @@ impl Chunk {
             }
             row[count..].fill(0.0);
         }
-        self.density_network(field, None, n);
+        self.density_network(field, n);
         let tau = fit(&mut self.tau, n);
         optical_depths(&self.density[..n], step, tau);
         let before = fit(&mut self.before, n);

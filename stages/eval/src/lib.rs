@@ -1,0 +1,316 @@
+//! `eval`: scores views against ground truth, and says by which conventions.
+//!
+//! * [`psnr`]: of the mean squared error over all samples; predictions clamped to [0, 1].
+//! * [`ssim`]: Gaussian window, reflected at the border or valid pixels only.
+//! * `lpips`: SqueezeNet, where its weights are given and the build has libtorch.
+//! * [`depth_error`]: where the truth has depth.
+//!
+//! Means over views are means of per-view values. Open backgrounds are scored on white.
+
+mod depth;
+#[cfg(feature = "torch")]
+mod lpips;
+mod ssim;
+
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use pixels::{Palette, Picture, Rgba8, heat, read_exr, read_png, write_png};
+use rayon::prelude::*;
+use scene::{Background, View, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+pub use depth::{DepthError, depth_error};
+#[cfg(feature = "torch")]
+pub use lpips::Lpips;
+pub use ssim::{Border, ssim};
+
+/// Parameters of `eval`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// What SSIM's window does at the border.
+    pub ssim_border: Border,
+    /// The absolute error that error maps show in their brightest colour.
+    #[schemars(range(min = 0.001, max = 1.0))]
+    pub error_range: f64,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { ssim_border: Border::Reflect, error_range: 0.25 }
+    }
+}
+
+/// `metrics.json`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Metrics {
+    /// How the figures were made, in words.
+    pub conventions: MetricConventions,
+    /// Means of the per-view values.
+    pub mean: Scores,
+    /// Every view.
+    pub views: Vec<ViewScores>,
+}
+
+/// The conventions behind the figures.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct MetricConventions {
+    /// What was behind the scene.
+    pub background: String,
+    /// How PSNR was made.
+    pub psnr: String,
+    /// How SSIM was made.
+    pub ssim: String,
+    /// How LPIPS was made, or why it is missing.
+    pub lpips: String,
+    /// How depth was scored.
+    pub depth: String,
+    /// What the error maps show.
+    pub error_maps: String,
+}
+
+/// Scores of a view, or their means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Scores {
+    /// Peak signal-to-noise ratio in dB; higher is better.
+    pub psnr: f64,
+    /// Structural similarity; higher is better.
+    pub ssim: f64,
+    /// Learned perceptual distance; lower is better.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
+    /// Depth errors, where there is true depth.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth: Option<DepthError>,
+}
+
+/// One view's scores.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ViewScores {
+    /// The view.
+    pub name: String,
+    /// Its scores.
+    pub scores: Scores,
+    /// Its error map.
+    pub error_map: String,
+}
+
+/// The stage.
+pub struct Eval;
+
+impl Stage for Eval {
+    type Params = Params;
+    const NAME: &'static str = "eval";
+    const SUMMARY: &'static str = "Scores views against ground truth and draws error maps.";
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![
+            ("views", Input::required(&["views"], "rendered views")),
+            ("truth", Input::required(&["scene/truth"], "ground truth, views of the same names")),
+            ("weights", Input::optional(&["weights"], "folder with squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, for LPIPS")),
+        ]
+    }
+
+    fn output() -> Output {
+        Output::kind("metrics")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        let (views_in, truth_in) = (context.input("views")?, context.input("truth")?);
+        let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
+        let perceptual = Perceptual::new(context.optional_input("weights"))?;
+        let progress = context.progress("scoring", truth.views.len() as u64);
+        let scored = truth
+            .views
+            .par_iter()
+            .map(|true_view| -> anyhow::Result<ViewScores> {
+                context.check_interrupt()?;
+                let name = &true_view.camera.name;
+                let view = views.views.iter().find(|v| v.camera.name == *name);
+                let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
+                let expected = read_view(truth_in, true_view, truth.background)?;
+                let found = read_view(views_in, view, views.background)?;
+                let size = |p: &Picture| format!("{}×{}", p.width, p.height);
+                if size(&expected) != size(&found) {
+                    let message = format!("view {name}: rendered at {} where the truth has {}; set size in render-depth", size(&found), size(&expected));
+                    return Err(Failure::BadInput(message).into());
+                }
+                let error_map = format!("errors/{name}.png");
+                write_png(&context.output_path(&error_map)?, &draw_error(&found, &expected, params.error_range as f32))?;
+                let scores = Scores {
+                    psnr: psnr(&found, &expected),
+                    ssim: ssim(&found, &expected, params.ssim_border),
+                    lpips: perceptual.distance(&found, &expected)?,
+                    depth: score_depth((views_in, view), (truth_in, true_view))?,
+                };
+                progress.add(1);
+                Ok(ViewScores { name: name.clone(), scores, error_map })
+            })
+            .collect::<anyhow::Result<Vec<_>>>()?;
+        let mean = mean_of(&scored);
+        let metrics = Metrics { conventions: conventions(params, truth.background, &perceptual), mean, views: scored };
+        context.write_json("metrics.json", &metrics)?;
+        context.write_summary(&summary(&metrics, &perceptual))
+    }
+}
+
+/// Peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all samples. Predictions are clamped to [0, 1] by
+/// [`read_view`]; equal pictures, which have no PSNR, count as 100 dB.
+pub fn psnr(found: &Picture, expected: &Picture) -> f64 {
+    let sum: f64 = found.data.iter().zip(&expected.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
+    (-10.0 * (sum / found.data.len() as f64).log10()).min(100.0)
+}
+
+/// A view's picture over its background, clamped to [0, 1].
+fn read_view(input: &GivenInput, view: &View, background: Background) -> anyhow::Result<Picture> {
+    let place = format!("view {}", view.camera.name);
+    let name = view.image.as_ref().with_context(|| "it has no image").bad_input(&place)?;
+    let path = input.path(name);
+    let mut picture = if path.extension().is_some_and(|e| e == "exr") {
+        let image = read_exr(&path).bad_input(&place)?;
+        let channel = |c: &str| image.channel(c).with_context(|| format!("{}: no channel {c}", path.display())).bad_input(&place);
+        let (r, g, b, a) = (channel("R")?, channel("G")?, channel("B")?, channel("A")?);
+        let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
+        let rgba = Picture::new(image.width, image.height, 4, data);
+        if background == Background::Alpha {
+            rgba.premultiplied_over(background.shown())
+        } else {
+            Picture::new(rgba.width, rgba.height, 3, rgba.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect())
+        }
+    } else {
+        Picture::from_rgba8(&read_png(&path).bad_input(&place)?).over(background.shown())
+    };
+    picture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+    Ok(picture)
+}
+
+/// Mean absolute error of the three channels as a colour.
+fn draw_error(found: &Picture, expected: &Picture, range: f32) -> Rgba8 {
+    let pixel = |(a, b): (&[f32], &[f32])| {
+        let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
+        let [r, g, b] = heat(Palette::Error, error / range);
+        [r, g, b, 255]
+    };
+    let data = found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).flat_map(pixel).collect();
+    Rgba8::new(found.width, found.height, data)
+}
+
+fn score_depth((views_in, view): (&GivenInput, &View), (truth_in, truth): (&GivenInput, &View)) -> anyhow::Result<Option<DepthError>> {
+    let (Some(found), Some(expected)) = (&view.depth, &truth.depth) else { return Ok(None) };
+    let read = |path: &Path| read_exr(path).bad_input(format!("view {}", view.camera.name));
+    let (found, expected) = (read(&views_in.path(found))?, read(&truth_in.path(expected))?);
+    let error = depth_error(&found, &expected).context("depth needs channels Z and A of one size");
+    error.map(Some).bad_input(format!("view {}", view.camera.name))
+}
+
+fn mean_of(views: &[ViewScores]) -> Scores {
+    let mean = |value: &dyn Fn(&Scores) -> Option<f64>| {
+        let values: Vec<f64> = views.iter().filter_map(|v| value(&v.scores)).collect();
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    };
+    let depth = |value: &dyn Fn(&DepthError) -> f64| mean(&|s| s.depth.as_ref().map(value));
+    Scores {
+        psnr: mean(&|s| Some(s.psnr)).unwrap_or_default(),
+        ssim: mean(&|s| Some(s.ssim)).unwrap_or_default(),
+        lpips: mean(&|s| s.lpips),
+        depth: depth(&|d| d.mean_absolute).map(|mean_absolute| DepthError {
+            mean_absolute,
+            median_absolute: depth(&|d| d.median_absolute).unwrap_or_default(),
+            missed: depth(&|d| d.missed).unwrap_or_default(),
+        }),
+    }
+}
+
+fn conventions(params: &Params, background: Background, perceptual: &Perceptual) -> MetricConventions {
+    let on = if background == Background::Black { "black" } else { "white" };
+    let border = match params.ssim_border {
+        Border::Reflect => "borders reflected",
+        Border::Valid => "pixels whose window is whole",
+    };
+    MetricConventions {
+        background: on.to_owned(),
+        psnr: "-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in half precision, clamped; mean of per-view values".to_owned(),
+        ssim: format!("Gaussian 11×11, σ 1.5, {border}, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels"),
+        lpips: perceptual.convention(),
+        depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
+        error_maps: format!("mean absolute error of R, G, B; brightest at {}", params.error_range),
+    }
+}
+
+fn summary(metrics: &Metrics, perceptual: &Perceptual) -> String {
+    let mean = &metrics.mean;
+    let lpips = mean.lpips.map_or_else(|| perceptual.missing().to_owned(), |v| format!("{v:.4}"));
+    let depth = mean.depth.map(|d| format!(" · depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute));
+    format!("PSNR {:.2} dB · SSIM {:.4} · LPIPS {lpips}{} · {} views", mean.psnr, mean.ssim, depth.unwrap_or_default(), metrics.views.len())
+}
+
+/// LPIPS, or the reason why there is none.
+enum Perceptual {
+    /// Networks that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
+    #[cfg(feature = "torch")]
+    Given {
+        folder: std::path::PathBuf,
+        free: std::sync::Mutex<Vec<Lpips>>,
+    },
+    Missing,
+}
+
+impl Perceptual {
+    #[cfg(feature = "torch")]
+    fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self::Missing) };
+        let first = Lpips::read(folder).bad_input("weights")?;
+        Ok(Self::Given { folder: folder.to_path_buf(), free: std::sync::Mutex::new(vec![first]) })
+    }
+
+    #[cfg(not(feature = "torch"))]
+    fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+        if weights.is_some() {
+            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
+            return Err(Failure::Usage(message.to_owned()).into());
+        }
+        Ok(Self::Missing)
+    }
+
+    #[cfg(feature = "torch")]
+    fn distance(&self, found: &Picture, expected: &Picture) -> anyhow::Result<Option<f64>> {
+        let Self::Given { folder, free } = self else { return Ok(None) };
+        let pool = || free.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let waiting = pool().pop();
+        let lpips = match waiting {
+            Some(lpips) => lpips,
+            None => Lpips::read(folder).bad_input("weights")?,
+        };
+        let distance = lpips.distance(found, expected)?;
+        pool().push(lpips);
+        Ok(Some(distance))
+    }
+
+    #[cfg(not(feature = "torch"))]
+    #[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
+    fn distance(&self, _: &Picture, _: &Picture) -> anyhow::Result<Option<f64>> {
+        Ok(None)
+    }
+
+    fn missing(&self) -> &'static str {
+        "weights not given"
+    }
+
+    fn convention(&self) -> String {
+        match self {
+            #[cfg(feature = "torch")]
+            Self::Given { .. } => "v0.1, SqueezeNet 1.1, inputs in [-1, 1]".to_owned(),
+            Self::Missing => format!(
+                "{}: -i eval.weights=FOLDER with squeezenet1_1.safetensors (torchvision) and lpips_linear_squeeze_v0.1.safetensors (richzhang/PerceptualSimilarity)",
+                self.missing()
+            ),
+        }
+    }
+}

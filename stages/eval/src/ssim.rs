@@ -1,0 +1,69 @@
+use pixels::Picture;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// What the window does at the border.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Border {
+    /// The picture is mirrored without repeating its edge, as PyTorch pads: every pixel counts.
+    Reflect,
+    /// Only pixels whose window lies inside count: scikit-image's scalar.
+    Valid,
+}
+
+const RADIUS: usize = 5;
+
+/// Mean structural similarity (Wang et al. 2004): Gaussian window of 11×11 with σ 1.5, data range 1, in f64; mean over the
+/// channels. A picture narrower than the window is reflected as often as it takes.
+pub fn ssim(a: &Picture, b: &Picture, border: Border) -> f64 {
+    let channel = |c: usize| {
+        let plane = |p: &Picture| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
+        of_planes(&plane(a), &plane(b), a.width, a.height, border)
+    };
+    (0..a.channels).map(channel).sum::<f64>() / a.channels as f64
+}
+
+fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize, border: Border) -> f64 {
+    let product = |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
+    let blurred = |plane: &[f64]| blur(plane, width, height);
+    let (mx, my) = (blurred(x), blurred(y));
+    let (xx, yy, xy) = (blurred(&product(x, x)), blurred(&product(y, y)), blurred(&product(x, y)));
+    let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
+    let at = |i: usize| {
+        let (vx, vy, cov) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
+        ((2.0 * mx[i] * my[i] + c1) * (2.0 * cov + c2)) / ((mx[i] * mx[i] + my[i] * my[i] + c1) * (vx + vy + c2))
+    };
+    // Pictures with no whole window have no valid pixel; all count then.
+    let margin = if border == Border::Valid && width > 2 * RADIUS && height > 2 * RADIUS { RADIUS } else { 0 };
+    let inside = (margin..height - margin).flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
+    let count = (width - 2 * margin) * (height - 2 * margin);
+    inside.map(at).sum::<f64>() / count as f64
+}
+
+/// Gaussian blur, reflected at the border.
+fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
+    let raw: Vec<f64> = (0..=2 * RADIUS).map(|k| (-((k as f64 - RADIUS as f64).powi(2)) / (2.0 * 1.5 * 1.5)).exp()).collect();
+    let sum: f64 = raw.iter().sum();
+    let taps: Vec<f64> = raw.iter().map(|w| w / sum).collect();
+    let along = |plane: &[f64], stride: usize, length: usize| -> Vec<f64> {
+        (0..plane.len())
+            .map(|i| {
+                let at = i / stride % length;
+                let line = i - at * stride;
+                taps.iter().enumerate().map(|(k, w)| w * plane[line + stride * reflected(at + k, length)]).sum()
+            })
+            .collect()
+    };
+    along(&along(plane, 1, width), width, height)
+}
+
+/// Index `shifted - RADIUS` mirrored into 0..length without repeating the ends.
+fn reflected(shifted: usize, length: usize) -> usize {
+    if length == 1 {
+        return 0;
+    }
+    let period = 2 * (length - 1);
+    let at = (shifted + period * RADIUS - RADIUS) % period;
+    at.min(period - at)
+}

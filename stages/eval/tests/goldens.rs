@@ -1,0 +1,63 @@
+//! SSIM against scikit-image and PyTorch, LPIPS against its published example.
+
+#![allow(missing_docs, reason = "a test")]
+#[path = "../../common/pixels/tests/pattern.rs"]
+#[allow(unreachable_pub, reason = "shared with pixels' tests")]
+mod pattern;
+
+use eval::{Border, ssim};
+use pixels::Picture;
+
+/// f64 in the goldens, f32 in a picture: the blend is rounded here, which costs about 1e-8.
+fn pictures(width: usize, height: usize, seed: u32) -> (Picture, Picture) {
+    let bytes = |seed| -> Vec<f64> { pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect() };
+    let (a, other) = (bytes(seed), bytes(seed + 100));
+    let b = a.iter().zip(&other).map(|(a, o)| (0.7 * a + 0.3 * o) as f32).collect();
+    (Picture::new(width, height, 3, a.iter().map(|&v| v as f32).collect()), Picture::new(width, height, 3, b))
+}
+
+#[test]
+fn ssim_equals_scikit_image_and_pytorch() {
+    let list: serde_json::Value = serde_json::from_str(include_str!("goldens/ssim.json")).unwrap();
+    for case in list["cases"].as_array().unwrap() {
+        let number = |key: &str| case[key].as_u64().unwrap() as usize;
+        let (a, b) = pictures(number("width"), number("height"), number("seed") as u32);
+        for (border, key) in [(Border::Valid, "valid"), (Border::Reflect, "reflect")] {
+            let (ours, theirs) = (ssim(&a, &b, border), case[key].as_f64().unwrap());
+            assert!((ours - theirs).abs() < 1e-6, "{key}: {ours} {theirs} {case}");
+        }
+        assert!((ssim(&a, &a, Border::Reflect) - 1.0).abs() < 1e-12);
+    }
+}
+
+#[test]
+fn one_pixel_and_narrow_pictures_have_an_ssim() {
+    for (width, height) in [(1, 1), (2, 7), (4, 30)] {
+        let (a, b) = pictures(width, height, 5);
+        for border in [Border::Valid, Border::Reflect] {
+            assert!(ssim(&a, &b, border).is_finite());
+        }
+    }
+}
+
+#[cfg(feature = "torch")]
+#[test]
+fn lpips_gives_the_published_distances() {
+    let data = std::env::var("NERF_SR_DATA").map_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into(), std::path::PathBuf::from);
+    let weights = data.join("weights");
+    if !weights.is_dir() {
+        eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", weights.display());
+        return;
+    }
+    let lpips = eval::Lpips::read(&weights).unwrap();
+    let read = |name: &str| {
+        let image = Picture::from_rgba8(&pixels::read_png(&weights.join(name)).unwrap());
+        image.over(1.0)
+    };
+    let reference = read("ex_ref.png");
+    for (name, expected) in [("ex_p0.png", 0.7112), ("ex_p1.png", 0.1479)] {
+        let distance = lpips.distance(&reference, &read(name)).unwrap();
+        assert!((distance - expected).abs() < 0.002, "{name}: {distance}");
+    }
+    assert!(lpips.distance(&reference, &reference).unwrap().abs() < 1e-6);
+}

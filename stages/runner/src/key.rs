@@ -1,0 +1,87 @@
+//! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are what `why` says. So an
+//! explanation can't drift from the key.
+
+use artifact::Record;
+use serde_json::{Map, Value, json};
+
+use crate::plan::Node;
+
+/// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host, the block's name.
+pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
+    let description = &node.program.description;
+    let mut parts = Map::new();
+    parts.insert("key version".to_owned(), json!(1));
+    parts.insert("stage".to_owned(), json!(description.name));
+    parts.insert("code".to_owned(), json!(description.code));
+    // cuda:0 and cuda:1 are the same kind of device.
+    parts.insert("device".to_owned(), json!(device.split(':').next().unwrap_or(device)));
+    for (name, value) in node.parameters.as_object().into_iter().flatten() {
+        parts.insert(format!("parameter {name}"), value.clone());
+    }
+    for (name, hash) in inputs {
+        parts.insert(format!("input {name}"), json!(hash));
+    }
+    for name in &description.environment {
+        parts.insert(format!("environment {name}"), json!(std::env::var(name).ok()));
+    }
+    parts
+}
+
+/// What differs between a key and the nearest earlier one of the same block, in words; `None` when there is no earlier one.
+pub(crate) fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
+    let differences = |record: &Record| -> Vec<String> {
+        let names: std::collections::BTreeSet<&String> = parts.keys().chain(record.key_parts.keys()).collect();
+        names
+            .into_iter()
+            .filter(|name| parts.get(*name) != record.key_parts.get(*name))
+            .map(|name| describe_change(name, record.key_parts.get(name), parts.get(name)))
+            .collect()
+    };
+    let nearest = records
+        .iter()
+        .filter(|r| r.stage == stage)
+        .map(|r| (differences(r), std::cmp::Reverse(r.started_unix)))
+        .min_by_key(|(changes, newest)| (changes.len(), *newest));
+    nearest.map(|(changes, _)| changes)
+}
+
+fn describe_change(name: &str, before: Option<&Value>, now: Option<&Value>) -> String {
+    let show = |value: Option<&Value>| match value {
+        None => "absent".to_owned(),
+        Some(Value::String(hash)) if hash.len() == 64 => hash[..10].to_owned(),
+        Some(value) => value.to_string(),
+    };
+    format!("{name}: {} → {}", show(before), show(now))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(stage: &str, started_unix: u64, parts: Value) -> Record {
+        Record {
+            stage: stage.to_owned(),
+            point: String::new(),
+            key_parts: parts.as_object().unwrap().clone(),
+            output: String::new(),
+            started_unix,
+            seconds: 0.0,
+            threads: 1,
+            host: String::new(),
+        }
+    }
+
+    #[test]
+    fn the_nearest_earlier_run_explains() {
+        let records = [
+            record("prep", 1, json!({"code": "a", "parameter kernel": "box"})),
+            record("prep", 9, json!({"code": "z", "parameter kernel": "avg"})),
+            record("eval", 9, json!({"code": "a", "parameter kernel": "lanczos"})),
+        ];
+        let now = json!({"code": "a", "parameter kernel": "lanczos"});
+        let changes = explain(now.as_object().unwrap(), "prep", &records).unwrap();
+        assert_eq!(changes, [r#"parameter kernel: "box" → "lanczos""#]);
+        assert_eq!(explain(now.as_object().unwrap(), "other", &records), None);
+        assert!(explain(now.as_object().unwrap(), "eval", &records).unwrap().is_empty());
+    }
+}

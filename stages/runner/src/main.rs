@@ -1,0 +1,5 @@
+//! `nerf-sr`: runs pipeline.yaml.
+
+fn main() -> std::process::ExitCode {
+    runner::main()
+}
