@@ -1,6 +1,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
+use std::sync::Arc;
 
 use artifact::{Record, Schema, Store};
 use serde_json::{Map, Value};
@@ -27,7 +27,7 @@ pub struct Node {
     /// All parameters, defaults filled in.
     pub parameters: Value,
     pub(crate) inputs: Vec<NodeInput>,
-    pub(crate) program: Rc<StageProgram>,
+    pub(crate) program: Arc<StageProgram>,
 }
 
 /// Where an input comes from.
@@ -48,7 +48,7 @@ pub(crate) enum From {
 /// A stage that shows a run.
 pub(crate) struct Sink {
     pub(crate) stage: String,
-    pub(crate) program: Rc<StageProgram>,
+    pub(crate) program: Arc<StageProgram>,
     pub(crate) parameters: Value,
     pub(crate) shows: Vec<usize>,
 }
@@ -123,8 +123,8 @@ impl Node {
 impl Plan {
     /// Checks the whole file, then expands what is asked for.
     pub(crate) fn new(pipeline: &Pipeline, store: &Store, request: &Request) -> Result<Self, PlanError> {
-        let programs: BTreeMap<String, Rc<StageProgram>> =
-            describe_all(pipeline, store)?.into_iter().map(|(name, program)| (name, Rc::new(program))).collect();
+        let programs: BTreeMap<String, Arc<StageProgram>> =
+            describe_all(pipeline, store)?.into_iter().map(|(name, program)| (name, Arc::new(program))).collect();
         let order = check(pipeline, &programs)?;
         let axes = axes(pipeline, &programs, request)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
@@ -182,7 +182,7 @@ fn as_path(text: &str) -> Option<&Path> {
 }
 
 /// Checks every block against its stage's description and every input against what it names; returns an order that works.
-fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Rc<StageProgram>>) -> Result<Vec<String>, PipelineError> {
+fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>) -> Result<Vec<String>, PipelineError> {
     for name in &pipeline.default {
         if !pipeline.stages.contains_key(name) {
             return Err(pipeline.error(name, None, "named in `default`, but there is no such stage"));
@@ -267,7 +267,7 @@ fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
 }
 
 /// What the command line sets, each with its stage.
-fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Rc<StageProgram>>, request: &Request) -> Result<Vec<Axis>, PlanError> {
+fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, request: &Request) -> Result<Vec<Axis>, PlanError> {
     let mut axes: Vec<Axis> = Vec::new();
     let parameters = request.parameters.iter().map(|text| ("-p", text, true));
     let inputs = request.inputs.iter().map(|text| ("-i", text, false));
@@ -309,7 +309,7 @@ fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Rc<StageProgram>>, requ
 /// The expansion of stages to nodes.
 struct Expansion<'a> {
     pipeline: &'a Pipeline,
-    programs: &'a BTreeMap<String, Rc<StageProgram>>,
+    programs: &'a BTreeMap<String, Arc<StageProgram>>,
     axes: &'a [Axis],
     nodes: Vec<Node>,
     /// The nodes of each stage, with the value (by number) of every axis that reaches them.
@@ -327,7 +327,7 @@ impl Expansion<'_> {
         }
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
-            let program = Rc::clone(&self.programs[stage]);
+            let program = Arc::clone(&self.programs[stage]);
             if program.description.sink {
                 let shows = needs(self.pipeline, stage).flat_map(|s| self.of_stage[&s].iter().map(|(_, node)| *node).collect::<Vec<_>>()).collect();
                 let parameters = self.resolve(stage, &BTreeMap::new())?;
@@ -345,7 +345,7 @@ impl Expansion<'_> {
         self.pipeline.stages[stage].inputs.iter().filter(|(i, _)| !replaced(i)).map(|(i, s)| (i.clone(), s.clone())).collect()
     }
 
-    fn add_stage(&mut self, stage: &str, program: &Rc<StageProgram>) -> Result<(), PlanError> {
+    fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         let inputs = self.block_inputs(stage);
         // The axes that reach the stage: its own and its parents'.
         let mut reach: BTreeSet<usize> = (0..self.axes.len()).filter(|&a| self.axes[a].stage == stage).collect();
@@ -380,7 +380,7 @@ impl Expansion<'_> {
             let swept = point.iter().filter(|(axis, _)| self.axes[**axis].values.len() > 1);
             let label = swept.map(|(a, v)| format!("{}={}", self.axes[*a].label, self.axes[*a].values[*v])).collect::<Vec<_>>().join(", ");
             let parameters = self.resolve(stage, &point)?;
-            self.nodes.push(Node { stage: stage.to_owned(), point: label, parameters, inputs: sources, program: Rc::clone(program) });
+            self.nodes.push(Node { stage: stage.to_owned(), point: label, parameters, inputs: sources, program: Arc::clone(program) });
             self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len() - 1));
         }
         Ok(())

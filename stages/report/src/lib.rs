@@ -1,0 +1,59 @@
+//! `report`: the record of a run as one self-contained HTML page: no file beside it, no network.
+//!
+//! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it shows times and hashes.
+//!
+//! * `tables`: scores of every point of a sweep, stages with parameters, hashes and times.
+//! * `pictures`: LR input, render, truth, error and depth side by side.
+
+mod page;
+mod pictures;
+mod record;
+
+use artifact::{Context, Failure, Input, Output, Stage};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+pub use record::{Run, RunNode};
+
+/// Parameters of `report`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Views to show, spread evenly over the test views.
+    #[schemars(range(min = 1, max = 100))]
+    pub views: u32,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { views: 4 }
+    }
+}
+
+/// The stage.
+pub struct Report;
+
+impl Stage for Report {
+    type Params = Params;
+    const NAME: &'static str = "report";
+    const SUMMARY: &'static str = "Writes the record of a run as one self-contained HTML page.";
+    const SINK: bool = true;
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![("run", Input::required(&["run"], "folder with run.json, the record of a run"))]
+    }
+
+    fn output() -> Output {
+        Output::kind("page")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        let run: Run = context.input("run")?.read_json("run.json")?;
+        if run.nodes.iter().any(|n| n.inputs.values().filter_map(|i| i.node).any(|i| i >= run.nodes.len())) {
+            return Err(Failure::BadInput("run.json: an input names a node that isn't listed".to_owned()).into());
+        }
+        let html = page::page(&run, params.views as usize)?;
+        std::fs::write(context.output_path("index.html")?, html.into_string())?;
+        Ok(())
+    }
+}

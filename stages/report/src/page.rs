@@ -1,0 +1,179 @@
+use std::path::Path;
+
+use anyhow::Context as _;
+use maud::{DOCTYPE, Markup, PreEscaped, html};
+use serde_json::Value;
+
+use crate::pictures::{colour, data_uri, depth, read_views, uri_of};
+use crate::record::{Run, RunNode};
+
+const STYLE: &str = "
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
+table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .3rem .7rem; text-align: left; border-bottom: 1px solid #ddd }
+td.n { text-align: right; font-variant-numeric: tabular-nums } th { font-weight: 600 } .best { font-weight: 700 }
+.row { display: flex; gap: 6px; flex-wrap: wrap; margin: .4rem 0 1.2rem } figure { margin: 0; flex: 1 1 180px; max-width: 300px }
+figure img { width: 100%; border: 1px solid #ddd; display: block } img.lr, img.px { image-rendering: pixelated }
+figcaption { font-size: .82rem; color: #555 } code { font-size: .85em } details { margin: .3rem 0 } small { color: #666 }
+";
+
+/// What a metrics node was scored on.
+struct Point<'a> {
+    node: &'a RunNode,
+    metrics: Value,
+    index: usize,
+}
+
+pub(crate) fn page(run: &Run, views: usize) -> anyhow::Result<Markup> {
+    let mut points = Vec::new();
+    for (index, node) in run.nodes.iter().enumerate().filter(|(_, n)| n.kind == "metrics") {
+        let path = node.folder.join("metrics.json");
+        let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
+        points.push(Point { node, metrics: serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?, index });
+    }
+    let galleries = points.iter().map(|p| gallery(run, p, views)).collect::<anyhow::Result<Vec<_>>>()?;
+    Ok(html! {
+        (DOCTYPE)
+        html lang="en" {
+            head {
+                meta charset="utf-8";
+                meta name="viewport" content="width=device-width, initial-scale=1";
+                title { "nerf-sr report" }
+                style { (PreEscaped(STYLE)) }
+            }
+            body {
+                h1 { "nerf-sr report" }
+                (scores(run, &points))
+                @for (point, gallery) in points.iter().zip(&galleries) {
+                    h2 { "Views" @if !point.node.point.is_empty() { " · " (point.node.point) } }
+                    (gallery)
+                }
+                (stages(run))
+            }
+        }
+    })
+}
+
+/// A table of means, one row a point, the best figure of each column in bold.
+fn scores(run: &Run, points: &[Point<'_>]) -> Markup {
+    let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
+    let columns: [(&str, &str, usize, bool); 6] = [
+        ("PSNR ↑ dB", "psnr", 2, true),
+        ("SSIM ↑", "ssim", 4, true),
+        ("LPIPS ↓", "lpips", 4, false),
+        ("depth error ↓ mean", "depth/mean_absolute", 4, false),
+        ("median", "depth/median_absolute", 4, false),
+        ("missed", "depth/missed", 4, false),
+    ];
+    let best = |path: &str, up: bool| {
+        let values = points.iter().filter_map(|p| mean(p, path));
+        if up { values.fold(f64::NEG_INFINITY, f64::max) } else { values.fold(f64::INFINITY, f64::min) }
+    };
+    html! {
+        table id="scores" {
+            thead { tr { th { "point" } @for (name, ..) in columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
+            tbody {
+                @for point in points {
+                    tr {
+                        td { @if point.node.point.is_empty() { "default" } @else { (point.node.point) } }
+                        @for (_, path, digits, up) in columns {
+                            @match mean(point, path) {
+                                Some(value) => td class=(if points.len() > 1 && value == best(path, up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
+                                None if path == "lpips" => td { "weights not given" },
+                                None => td { "–" },
+                            }
+                        }
+                        td class="n" { (point.metrics["views"].as_array().map_or(0, Vec::len)) }
+                        td class="n" { (time_of(run, point, "field")) }
+                        td class="n" { (time_of(run, point, "views")) }
+                    }
+                }
+            }
+        }
+        @if let Some(point) = points.first() {
+            details { summary { "How these figures were made" }
+                ul { @for (name, text) in point.metrics["conventions"].as_object().into_iter().flatten() { li { b { (name) } ": " (text.as_str().unwrap_or_default()) } } }
+            }
+        }
+    }
+}
+
+/// Time of the ancestors of a kind.
+fn time_of(run: &Run, point: &Point<'_>, kind: &str) -> String {
+    let seconds: f64 = run.ancestors(point.index).into_iter().map(|i| &run.nodes[i]).filter(|n| n.kind == kind).map(|n| n.seconds).sum();
+    if seconds < 90.0 { format!("{seconds:.1} s") } else { format!("{:.1} min", seconds / 60.0) }
+}
+
+/// LR input, render, truth, error, depth of some views.
+fn gallery(run: &Run, point: &Point<'_>, count: usize) -> anyhow::Result<Markup> {
+    let folder = |input: &str| point.node.inputs.get(input).map(|s| run.folder_of(s));
+    let (Some(rendered), Some(truth)) = (folder("views"), folder("truth")) else {
+        return Ok(html! { p { "These metrics have no inputs `views` and `truth` to show." } });
+    };
+    let (views, truths) = (read_views(&rendered)?, read_views(&truth)?);
+    let all = point.metrics["views"].as_array().cloned().unwrap_or_default();
+    let shown = count.min(all.len());
+    let mut rows = Vec::new();
+    for k in 0..shown {
+        let scores = &all[k * all.len() / shown];
+        let name = scores["name"].as_str().unwrap_or_default();
+        let find = |list: &scene::Views| list.views.iter().find(|v| v.camera.name == name).cloned();
+        let (Some(view), Some(true_view)) = (find(&views), find(&truths)) else { continue };
+        let figure = |class: &str, uri: Option<String>, caption: String| {
+            html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }
+        };
+        let picture = |folder: &Path, file: &Option<String>, background| -> anyhow::Result<Option<(String, usize)>> {
+            let image = file.as_ref().map(|f| colour(folder, f, background)).transpose()?;
+            Ok(image.map(|i| (uri_of(&i), i.width)))
+        };
+        let low = picture(&truth, &true_view.low_resolution, truths.background)?;
+        let found = picture(&rendered, &view.image, views.background)?;
+        let expected = picture(&truth, &true_view.image, truths.background)?;
+        let error = scores["error_map"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
+        let depth = depth(&rendered, &view)?;
+        let caption = |what: &str, found: &Option<(String, usize)>| found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default();
+        let number = |key: &str, digits: usize| scores["scores"][key].as_f64().map(|v| format!("{v:.digits$}")).unwrap_or_else(|| "–".to_owned());
+        rows.push(html! {
+            h3 { "View " (name) " " small { "PSNR " (number("psnr", 2)) " dB · SSIM " (number("ssim", 4)) } }
+            div class="row" {
+                (figure("lr", low.clone().map(|l| l.0), caption("LR", &low)))
+                (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
+                (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
+                (figure("px", error.map(|b| data_uri(&b)), "error".to_owned()))
+                (figure("px", depth.map(|d| uri_of(&d)), "depth (warm is near)".to_owned()))
+            }
+        });
+    }
+    Ok(html! { @for row in rows { (row) } })
+}
+
+/// Every node with parameters, hashes and times.
+fn stages(run: &Run) -> Markup {
+    let source = |input: &crate::record::Source| match (input.node, &input.subtree) {
+        (Some(i), Some(folder)) => format!("{}/{folder}", run.nodes[i].stage),
+        (Some(i), None) => run.nodes[i].stage.clone(),
+        (None, _) => input.folder.as_ref().map(|f| f.display().to_string()).unwrap_or_default(),
+    };
+    html! {
+        h2 { "What was run" }
+        table id="stages" {
+            thead { tr { th { "stage" } th { "point" } th { "artifact" } th { "key" } th { "time" } th { "threads" } th { "parameters and inputs" } } }
+            tbody {
+                @for node in &run.nodes {
+                    tr {
+                        td { (node.stage) }
+                        td { (node.point) }
+                        td { code title=(node.output) { (node.output.get(..10).unwrap_or_default()) } }
+                        td { code title=(node.key) { (node.key.get(..10).unwrap_or_default()) } }
+                        td class="n" { (format!("{:.1} s", node.seconds)) }
+                        td class="n" { (node.threads) }
+                        td { details { summary { (node.parameters.len()) " parameters, " (node.inputs.len()) " inputs" }
+                            @for (name, value) in &node.parameters { div { code { (name) ": " (value.to_string()) } } }
+                            @for (name, input) in &node.inputs { div { code { (name) " ← " (source(input)) } } }
+                        } }
+                    }
+                }
+            }
+        }
+    }
+}

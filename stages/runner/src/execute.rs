@@ -1,0 +1,252 @@
+//! Runs a plan: nodes whose parents are done, some at once, each under its key's lock.
+
+use std::collections::BTreeSet;
+use std::io::IsTerminal as _;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, mpsc};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use artifact::{Event, Record, Store, eta, hash_json};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+
+use crate::key;
+use crate::plan::{From, Node, Plan, PlanError, input_hashes};
+use crate::process::{Call, StageFailure, Watcher};
+
+/// How to run.
+pub(crate) struct Options {
+    /// Stages at once.
+    pub(crate) jobs: usize,
+    /// Threads of all stages together.
+    pub(crate) threads: usize,
+    pub(crate) device: String,
+    /// Whether to go on with what doesn't need a failed stage.
+    pub(crate) keep_going: bool,
+}
+
+/// What came of a run.
+pub(crate) struct Outcome {
+    /// Each node's record, where it is done.
+    pub(crate) records: Vec<Option<Record>>,
+    /// Nodes that ran.
+    pub(crate) ran: BTreeSet<usize>,
+    /// Nodes that failed, and how.
+    pub(crate) failures: Vec<(usize, StageFailure)>,
+    /// Nodes left out because of these.
+    pub(crate) skipped: Vec<usize>,
+}
+
+enum Progress {
+    Pending,
+    Running,
+    Over,
+}
+
+/// What a worker reports: the node, its record and whether it had to run.
+type Report = (usize, Result<(Record, bool), StageFailure>);
+
+pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBool) -> Outcome {
+    let count = plan.nodes.len();
+    let mut outcome = Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() };
+    let mut progress: Vec<Progress> = (0..count).map(|_| Progress::Pending).collect();
+    let display = Display::new();
+    let (sender, reports) = mpsc::channel::<Report>();
+    std::thread::scope(|scope| {
+        let mut running = 0;
+        loop {
+            let give_up = stop.load(Ordering::Relaxed) || (!options.keep_going && !outcome.failures.is_empty());
+            let ready: Vec<usize> = (0..count)
+                .filter(|&i| matches!(progress[i], Progress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some()))
+                .collect();
+            let places = if give_up { 0 } else { options.jobs.saturating_sub(running) };
+            let starting = &ready[..ready.len().min(places)];
+            // Stages that run side by side share the cores; one alone has them all.
+            let together = (running + starting.len()).clamp(1, options.jobs);
+            for &index in starting {
+                progress[index] = Progress::Running;
+                running += 1;
+                let parents: Vec<Option<String>> = outcome.records.iter().map(|r| r.as_ref().map(|r| r.output.clone())).collect();
+                let (sender, display) = (sender.clone(), &display);
+                let threads = (options.threads / together).max(1);
+                scope.spawn(move || {
+                    let job = Job { plan, node: &plan.nodes[index], store, options, threads, display, stop };
+                    // The receiver lives as long as the scope.
+                    sender.send((index, job.run(&parents))).ok();
+                });
+            }
+            if running == 0 {
+                break;
+            }
+            let Ok((index, result)) = reports.recv() else { break };
+            running -= 1;
+            progress[index] = Progress::Over;
+            match result {
+                Ok((record, ran)) => {
+                    outcome.records[index] = Some(record);
+                    if ran {
+                        outcome.ran.insert(index);
+                    }
+                }
+                Err(failure) => {
+                    display.line(&format!("{}: failed: {}", plan.nodes[index].label(), failure.message));
+                    outcome.failures.push((index, failure));
+                }
+            }
+        }
+    });
+    outcome.skipped = (0..count).filter(|&i| matches!(progress[i], Progress::Pending)).collect();
+    outcome
+}
+
+/// One node's work.
+struct Job<'a> {
+    plan: &'a Plan,
+    node: &'a Node,
+    store: &'a Store,
+    options: &'a Options,
+    threads: usize,
+    display: &'a Display,
+    stop: &'a AtomicBool,
+}
+
+impl Job<'_> {
+    /// Finds the record or makes it. `parents` are the outputs of the plan's nodes.
+    fn run(&self, parents: &[Option<String>]) -> Result<(Record, bool), StageFailure> {
+        let fail = |message: String| StageFailure { code: 1, message };
+        let output_of = |index: usize| parents[index].clone().expect("a node runs after its parents");
+        let hashes = input_hashes(self.node, self.store, output_of).map_err(|e| match e {
+            PlanError::Source(message) => StageFailure { code: 3, message },
+            other => fail(other.to_string()),
+        })?;
+        let key_parts = key::parts(self.node, &hashes, &self.options.device);
+        let key = hash_json(&key_parts);
+        if let Some(record) = self.store.hit(&key) {
+            return Ok((record, false));
+        }
+        let _lock = self.store.lock(&key).map_err(|e| fail(e.to_string()))?;
+        // Another runner may have made it while this one waited.
+        if let Some(record) = self.store.hit(&key) {
+            return Ok((record, false));
+        }
+        let attempt = self.store.begin(&key, &self.node.parameters).map_err(|e| fail(e.to_string()))?;
+        let inputs: Vec<(String, PathBuf)> = self.node.inputs.iter().map(|input| {
+            let folder = match &input.from {
+                From::Node { index, subtree } => {
+                    let object = self.store.object(&output_of(*index));
+                    subtree.as_ref().map_or(object.clone(), |s| object.join(s))
+                }
+                From::Folder(folder) => folder.clone(),
+            };
+            (input.name.clone(), folder)
+        }).collect();
+        let call = Call {
+            program: &self.node.program,
+            params: &attempt.params,
+            inputs: &inputs,
+            output: &attempt.output,
+            work: Some(&attempt.work),
+            device: &self.options.device,
+            threads: self.threads,
+        };
+        let label = self.node.label();
+        let view = self.display.start(&label);
+        let started = Instant::now();
+        let started_unix = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
+        let result = call.run(&attempt.log, &view, self.stop);
+        view.end();
+        result?;
+        let record = Record {
+            stage: self.node.stage.clone(),
+            point: self.node.point.clone(),
+            key_parts,
+            output: String::new(),
+            started_unix,
+            seconds: (started.elapsed().as_secs_f64() * 1e3).round() / 1e3,
+            threads: self.threads,
+            host: std::fs::read_to_string("/proc/sys/kernel/hostname").map(|h| h.trim().to_owned()).unwrap_or_default(),
+        };
+        let kind = &self.node.program.description.output.kind;
+        let record = self.store.publish(&attempt, kind, record).map_err(|e| fail(e.to_string()))?;
+        debug_assert!(self.plan.nodes.iter().any(|n| n.stage == record.stage));
+        self.display.line(&format!("{label}: done in {} → {}", seconds(record.seconds), &record.output[..10]));
+        Ok((record, true))
+    }
+}
+
+/// A time as people say it.
+pub(crate) fn seconds(s: f64) -> String {
+    if s < 90.0 { format!("{s:.1} s") } else { format!("{:.1} min", s / 60.0) }
+}
+
+/// Bars on a terminal, lines elsewhere.
+pub(crate) struct Display {
+    bars: Option<MultiProgress>,
+}
+
+impl Display {
+    pub(crate) fn new() -> Self {
+        Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
+    }
+
+    fn line(&self, text: &str) {
+        match &self.bars {
+            // The terminal may have gone; the run goes on.
+            Some(bars) => bars.println(text).unwrap_or_default(),
+            None => eprintln!("{text}"),
+        }
+    }
+
+    pub(crate) fn start(&self, label: &str) -> StageView<'_> {
+        let bar = self.bars.as_ref().map(|bars| {
+            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg} · {eta} left").expect("the template is constant");
+            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned()))
+        });
+        if bar.is_none() {
+            self.line(&format!("{label}: running"));
+        }
+        StageView { display: self, label: label.to_owned(), bar, started: Instant::now(), shown: Mutex::new(Instant::now()) }
+    }
+}
+
+/// One running stage on the display.
+pub(crate) struct StageView<'a> {
+    display: &'a Display,
+    label: String,
+    bar: Option<ProgressBar>,
+    started: Instant,
+    shown: Mutex<Instant>,
+}
+
+impl StageView<'_> {
+    pub(crate) fn end(&self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Watcher for StageView<'_> {
+    fn progress(&self, event: &Event) {
+        let Event::Progress { label, done, total, note } = event;
+        match &self.bar {
+            Some(bar) => {
+                bar.set_length(*total);
+                bar.set_position(*done);
+                bar.set_message(format!("{label} {note}"));
+            }
+            None => {
+                let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                if shown.elapsed() > Duration::from_secs(15) {
+                    *shown = Instant::now();
+                    let left = eta(self.started.elapsed(), *done, *total);
+                    self.display.line(&format!("{}: {label} {}% {note} · {left} left", self.label, done * 100 / total.max(&1)));
+                }
+            }
+        }
+    }
+
+    fn said(&self, line: &str) {
+        self.display.line(&format!("{}: {line}", self.label));
+    }
+}

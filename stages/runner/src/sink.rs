@@ -1,0 +1,148 @@
+//! Sinks show a run: they get its record and write a folder beside pipeline.yaml. They are never cached, but a sink that has
+//! shown this very record already isn't called again.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+use artifact::{Store, hash_json, write_json};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use crate::execute::{Display, Options, Outcome};
+use crate::plan::{From, Plan, Sink};
+use crate::process::{Call, StageFailure};
+
+/// `run.json`: what a sink is told of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RunRecord {
+    /// Every node that what is shown was made of, in an order in which parents come first.
+    pub nodes: Vec<RunNode>,
+}
+
+/// One finished node of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RunNode {
+    /// Name of the stage's block.
+    pub stage: String,
+    /// The sweep's point; empty without a sweep.
+    pub point: String,
+    /// Kind of its artifact.
+    pub kind: String,
+    /// The action's key.
+    pub key: String,
+    /// The artifact's identity.
+    pub output: String,
+    /// The artifact's folder.
+    pub folder: PathBuf,
+    /// All parameters.
+    pub parameters: Value,
+    /// Inputs by name: another node of this list with a folder of its artifact, or a folder outside the store.
+    pub inputs: Map<String, Value>,
+    /// When it started, seconds since 1970.
+    pub started_unix: u64,
+    /// How long it took.
+    pub seconds: f64,
+    /// Threads it had.
+    pub threads: usize,
+}
+
+/// The record of the nodes that a sink shows and all they were made of.
+fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<RunRecord> {
+    let mut wanted: BTreeSet<usize> = sink.shows.iter().copied().collect();
+    for index in (0..plan.nodes.len()).rev() {
+        if wanted.contains(&index) {
+            wanted.extend(plan.nodes[index].parents());
+        }
+    }
+    let position = |index: usize| wanted.iter().position(|&i| i == index);
+    let nodes = wanted.iter().map(|&index| {
+        let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
+        let inputs = node.inputs.iter().map(|input| {
+            let from = match &input.from {
+                From::Node { index, subtree } => json!({"node": position(*index), "subtree": subtree}),
+                From::Folder(folder) => json!({"folder": folder}),
+            };
+            (input.name.clone(), from)
+        });
+        Some(RunNode {
+            stage: node.stage.clone(),
+            point: node.point.clone(),
+            kind: node.program.description.output.kind.clone(),
+            key: record.key(),
+            output: record.output.clone(),
+            folder: store.object(&record.output),
+            parameters: node.parameters.clone(),
+            inputs: inputs.collect(),
+            started_unix: record.started_unix,
+            seconds: record.seconds,
+            threads: record.threads,
+        })
+    });
+    Some(RunRecord { nodes: nodes.collect::<Option<Vec<_>>>()? })
+}
+
+/// What became of a sink.
+pub(crate) enum Shown {
+    /// It ran and wrote this folder.
+    Written(PathBuf),
+    /// The folder shows this record already.
+    UpToDate(PathBuf),
+    /// Something it shows isn't there.
+    Missing,
+}
+
+/// Calls a sink; it writes `out/STAGE`.
+pub(crate) fn show(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store, out: &Path, options: &Options, stop: &AtomicBool) -> Result<Shown, StageFailure> {
+    let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
+    let Some(record) = record(plan, sink, outcome, store) else { return Ok(Shown::Missing) };
+    let target = out.join(&sink.stage);
+    let identity = hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}));
+    let mark = target.join(".shows");
+    if std::fs::read_to_string(&mark).is_ok_and(|shown| shown == identity) {
+        return Ok(Shown::UpToDate(target));
+    }
+    let scratch = store.root().join("sinks").join(&sink.stage);
+    // A sink's leftovers have no value.
+    std::fs::remove_dir_all(&scratch).ok();
+    let (run, params, output) = (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
+    std::fs::create_dir_all(&run)
+        .and_then(|()| write_json(&run.join("run.json"), &record))
+        .and_then(|()| write_json(&params, &sink.parameters))
+        .map_err(|e| fail(&scratch, &e))?;
+    let display = Display::new();
+    let view = display.start(&sink.stage);
+    let inputs = [("run".to_owned(), run)];
+    let call = Call { program: &sink.program, params: &params, inputs: &inputs, output: &output, work: None, device: &options.device, threads: options.threads };
+    let result = call.run(&scratch.join("log"), &view, stop);
+    view.end();
+    result?;
+    std::fs::write(output.join(".shows"), identity).map_err(|e| fail(&output, &e))?;
+    std::fs::create_dir_all(out).map_err(|e| fail(out, &e))?;
+    if target.exists() {
+        std::fs::remove_dir_all(&target).map_err(|e| fail(&target, &e))?;
+    }
+    move_folder(&output, &target).map_err(|e| fail(&target, &e))?;
+    Ok(Shown::Written(target))
+}
+
+/// Renames, or copies where the store lies on another file system.
+fn move_folder(from: &Path, to: &Path) -> std::io::Result<()> {
+    if std::fs::rename(from, to).is_ok() {
+        return Ok(());
+    }
+    std::fs::create_dir_all(to)?;
+    for entry in std::fs::read_dir(from)? {
+        let entry = entry?;
+        let target = to.join(entry.file_name());
+        if entry.file_type()?.is_dir() {
+            move_folder(&entry.path(), &target)?;
+        } else {
+            std::fs::copy(entry.path(), target)?;
+        }
+    }
+    Ok(())
+}
