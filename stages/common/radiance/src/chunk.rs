@@ -293,3 +293,13 @@ impl Chunk {
         self.t.len()
     }
 }
+
+#[cfg(test)]
+impl Chunk {
+    /// Sample positions of each ray, and which of them got a colour.
+    pub(crate) fn marched_and_kept(&self) -> (Vec<Vec<[f32; 3]>>, Vec<Vec<bool>>) {
+        let ranges = self.starts.windows(2).map(|r| r[0]..r[1]);
+        let kept = |i: usize| self.kept.binary_search(&(i as u32)).is_ok();
+        (ranges.clone().map(|r| self.marched[r].to_vec()).collect(), ranges.map(|r| r.map(kept).collect()).collect())
+    }
+}

@@ -30,6 +30,8 @@ mod math;
 mod mlp;
 mod occupancy;
 mod random;
+#[cfg(test)]
+mod reference;
 mod simd;
 mod space;
 mod spherical;

@@ -1,0 +1,203 @@
+//! Bad input: one line that says what and where, the right exit code, nothing half-written in the store.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+
+use common::{Project, TINY, stage};
+
+/// A data set made once, copied and damaged by each test.
+fn dataset(project: &Project) -> std::path::PathBuf {
+    let folder = project.path("data");
+    let made = stage("demo-scene", r#"{"size": 32, "train": 4, "test": 2, "samples": 1}"#, &[], &folder, &[]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    std::fs::remove_file(folder.join("artifact.json")).unwrap();
+    folder
+}
+
+const FROM_FOLDER: &str = "
+default: [prep]
+stages:
+  prep:
+    inputs: {dataset: ./data}
+    parameters: {lr: 16, scale: 2}
+";
+
+/// Damages a data set, runs prep through the runner, expects an error and an empty store.
+#[track_caller]
+fn refused(damage: impl FnOnce(&Project, &Path), arguments: &[&str], code: i32, words: &[&str]) {
+    let project = Project::new(FROM_FOLDER);
+    let folder = dataset(&project);
+    damage(&project, &folder);
+    project.run(&[&["run"], arguments].concat()).fails(code, words);
+    assert_eq!(project.store_listing(), Vec::<String>::new(), "nothing may be left in the store");
+}
+
+fn edit(file: &Path, from: &str, to: &str) {
+    let text = std::fs::read_to_string(file).unwrap();
+    assert!(text.contains(from), "{text}");
+    std::fs::write(file, text.replacen(from, to, 1)).unwrap();
+}
+
+#[test]
+fn datasets_that_cannot_be_used() {
+    refused(|_, d| std::fs::remove_dir_all(d).unwrap(), &[], 3, &["input dataset", "data", "name a folder that is there"]);
+    refused(|_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(), &[], 3, &["transforms_test.json", "expected a folder"]);
+    refused(|_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(), &[], 3, &["transforms_train.json: frame 2", "r_2.png is not there"]);
+    refused(
+        |_, d| {
+            let png = std::fs::read(d.join("train/r_1.png")).unwrap();
+            std::fs::write(d.join("train/r_1.png"), &png[..png.len() / 2]).unwrap();
+        },
+        &[],
+        3,
+        &["frame 1 (r_1)", "train/r_1.png", "not a whole PNG"],
+    );
+    let first_number = |d: &Path| {
+        let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
+        let at = text.find("\"transform_matrix\"").unwrap();
+        let rest = &text[at..];
+        rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..].split(',').next().unwrap().trim().to_owned()
+    };
+    refused(|_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"), &[], 3, &["transforms_train.json: frame 0", "is NaN"]);
+    refused(|_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"), &[], 3, &["camera_angle_x is 3.2", "focal length"]);
+    refused(
+        |_, d| std::fs::write(d.join("transforms_test.json"), r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap(),
+        &[],
+        3,
+        &["transforms_test.json", "`frames` is empty"],
+    );
+}
+
+#[test]
+fn sizes_that_cannot_be() {
+    refused(|_, _| {}, &["-p", "lr=64", "-p", "scale=1"], 2, &["lr = 64", "larger than", "32"]);
+    refused(|_, _| {}, &["-p", "lr=0"], 2, &["stage prep", "parameter lr", "minimum"]);
+    refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
+    refused(|_, _| {}, &["-p", "near=5", "-p", "far=3"], 2, &["near", "far = 3"]);
+}
+
+#[test]
+fn output_that_cannot_be_written() {
+    let project = Project::new(FROM_FOLDER);
+    let folder = dataset(&project);
+    // A file where the store should be: root may write anywhere else.
+    project.write("taken", "");
+    project.run(&["run", "--store", "taken/store"]).fails(1, &["cannot open the store", "--store"]);
+    let inputs = [("dataset", folder.as_path())];
+    stage("prep", r#"{"lr": 16}"#, &inputs, &project.path("taken/out"), &[]).fails(2, &["--params"]);
+    project.write("p.json", r#"{"lr": 16}"#);
+    let output = std::process::Command::new(common::bin("prep"))
+        .args(["--params", "p.json", "--output", "taken/out", "--input", "dataset=data"])
+        .current_dir(project.path("."))
+        .output()
+        .unwrap();
+    common::Finished::of(output).fails(1, &["--output taken/out", "cannot write there"]);
+}
+
+/// A small tmpfs as the store: needs root, as CI has; says so where it can't be mounted.
+#[test]
+fn a_full_disk() {
+    let project = Project::new(TINY);
+    let disk = project.path("disk");
+    std::fs::create_dir(&disk).unwrap();
+    let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", "size=120k", "tmpfs"]).arg(&disk).output();
+    if !mounted.is_ok_and(|m| m.status.success()) {
+        eprintln!("skipped: a tmpfs can't be mounted here (it needs root)");
+        return;
+    }
+    let store = disk.join("store");
+    let finished = project.run(&["run", "--store", store.to_str().unwrap()]);
+    let objects: Vec<_> = std::fs::read_dir(store.join("objects")).map(|d| d.count()).into_iter().collect();
+    let records = std::fs::read_dir(store.join("actions")).map_or(0, Iterator::count);
+    std::process::Command::new("umount").arg(&disk).status().unwrap();
+    finished.fails(1, &["No space left on device"]);
+    assert_eq!((objects, records), (vec![0], 0));
+}
+
+#[test]
+fn a_flipped_byte_in_an_artifact_is_noticed_and_named() {
+    let project = Project::tiny();
+    project.ok(&["run"]);
+    let scene = project.output_of("prep", &[]).remove(0);
+    let victim = project.object(&scene).join("train/images/r_3.png");
+    let mut bytes = std::fs::read(&victim).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&victim, bytes).unwrap();
+    let before = project.store_listing();
+    // Training reads it.
+    project.run(&["run", "-p", "seed=1"]).fails(2, &["-p seed", "demo-scene.seed, train-ss.seed"]);
+    project.run(&["run", "-p", "train-ss.seed=1"]).fails(3, &["train/images/r_3.png", "blake3 differs", "nerf-sr verify --remove"]);
+    assert_eq!(project.store_listing(), before);
+    project.run(&["verify"]).fails_on_stdout(3, &["train/images/r_3.png"]);
+    project.run(&["verify", "--remove"]).fails_on_stdout(3, &["removed"]);
+    let run = project.ok(&["run", "-p", "train-ss.seed=1"]);
+    assert!(run.contains("4 of 5 stages ran"), "prep, training, rendering and scoring run: {run}");
+    assert_eq!(project.output_of("prep", &[]), [scene]);
+}
+
+impl common::Finished {
+    #[track_caller]
+    fn fails_on_stdout(&self, code: i32, words: &[&str]) {
+        assert_eq!(self.code, code, "{}", self.stdout);
+        assert!(words.iter().all(|w| self.stdout.contains(w)), "{}", self.stdout);
+    }
+}
+
+#[test]
+fn pipelines_that_cannot_be_used() {
+    for (from, to, line, words) in [
+        ("    inputs: {dataset: demo-scene}", "    inputs: {dataset: demo-scene}\n    imputs: {}", 7, "imputs"),
+        ("  eval:\n", "  eval: {}\n  eval:\n", 0, "duplicate entry"),
+        ("{dataset: demo-scene}", "{dataset: demo}", 7, "no stage \"demo\""),
+        ("{dataset: demo-scene}", "{}", 6, "input dataset is missing"),
+        ("{dataset: demo-scene}", "{dataset: demo-scene, masks: ./m}", 7, "no input \"masks\""),
+        ("prep/train}", "prep/test}", 10, "no folder \"test\"; known: cameras, references, train, truth"),
+        ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
+        ("{dataset: demo-scene}", "{dataset: render-depth}", 7, "takes dataset, but render-depth is views"),
+        ("lr: 24", "lr: twenty", 8, "parameter lr"),
+        ("lr: 24", "lr: -3", 8, "parameter lr"),
+        ("lr: 24", "ir: 24", 8, "parameter ir: unknown"),
+        ("default: [eval]", "default: [all]", 0, "named in `default`"),
+        ("  eval:\n", "  eval:\n    run: ./nowhere\n", 0, "set `run:`"),
+        ("default: [eval]", "default: [eval", 0, ""),
+    ] {
+        let project = Project::new(&TINY.replacen(from, to, 1));
+        let place = if line == 0 { "pipeline.yaml".to_owned() } else { format!("pipeline.yaml:{line}") };
+        project.run(&["run"]).fails(2, &[&place, words]);
+        assert_eq!(project.store_listing(), Vec::<String>::new());
+    }
+}
+
+#[test]
+fn a_cycle_is_named() {
+    let script = "#!/bin/sh\necho '{\"name\":\"x\",\"version\":\"1\",\"code\":\"1\",\"summary\":\"\",\"parameters\":{\"type\":\"object\"},\"inputs\":{\"a\":{\"kinds\":[\"k\"],\"summary\":\"\"}},\"output\":{\"kind\":\"k\"}}'\n";
+    let project = Project::new("default: [one]\nstages:\n  one: {run: ./x, inputs: {a: two}}\n  two: {run: ./x, inputs: {a: three}}\n  three: {run: ./x, inputs: {a: one}}\n");
+    project.write("x", script);
+    std::process::Command::new("chmod").arg("+x").arg(project.path("x")).status().unwrap();
+    project.run(&["run"]).fails(2, &["pipeline.yaml:", "lead back to it", "one ← two ← three ← one"]);
+}
+
+#[test]
+fn command_lines_that_cannot_be_used() {
+    let project = Project::tiny();
+    for (arguments, words) in [
+        (&["run", "nowhere"][..], "no stage \"nowhere\""),
+        (&["run", "-p", "kernal=box"], "no stage has such a parameter"),
+        (&["run", "-p", "kernel"], "expected NAME=VALUE"),
+        (&["run", "-p", "kernel=box", "-p", "prep.kernel=lanczos"], "given twice"),
+        (&["run", "-i", "nothing=."], "no stage has such an input"),
+        (&["run", "-j", "0"], "at least 1"),
+        (&["why", "nowhere"], "no stage \"nowhere\""),
+    ] {
+        project.run(arguments).fails(2, &[words]);
+    }
+    stage("prep", r#"{"lr": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[]).fails(2, &["parameter x", "unknown"]);
+    stage("prep", r#"{"lr": 16"#, &[("dataset", Path::new("."))], &project.path("o"), &[]).fails(2, &["--params", "line 1"]);
+    stage("prep", "{}", &[], &project.path("o"), &[]).fails(2, &["input dataset is missing"]);
+    stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[]).fails(2, &["--input data", "known: dataset"]);
+    stage("prep", "{}", &[("dataset", Path::new("/nowhere"))], &project.path("o"), &[]).fails(3, &["/nowhere", "no such folder"]);
+    stage("prep", "{}", &[("dataset", Path::new("."))], &project.path("."), &[]).fails(2, &["--output"]);
+}

@@ -1,0 +1,167 @@
+//! One builder for end-to-end tests: a folder with a pipeline of its own, the real runner and the real stages.
+
+#![allow(dead_code, reason = "every test file uses a part of it")]
+#![allow(unreachable_pub, reason = "shared by several test binaries")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// The binaries' folder: that of the runner, where `make build` put the stages, too.
+pub fn bin(name: &str) -> PathBuf {
+    let path = Path::new(env!("CARGO_BIN_EXE_nerf-sr")).with_file_name(name);
+    assert!(path.exists(), "{} is not built; run `make build` first", path.display());
+    path
+}
+
+/// A pipeline that runs in seconds: 12 views of 24 pixels, a small field.
+pub const TINY: &str = "
+default: [eval]
+stages:
+  demo-scene:
+    parameters: {size: 48, train: 12, test: 3, samples: 2}
+  prep:
+    inputs: {dataset: demo-scene}
+    parameters: {lr: 24, scale: 2}
+  train-ss:
+    inputs: {scene: prep/train}
+    parameters: {rays: 60000, levels: 4, finest: 64, log2_entries: 12, hidden: 16, steps: 128, batch: 2048, samples: 16384}
+  render-depth:
+    inputs: {field: train-ss, cameras: prep/cameras}
+  eval:
+    inputs: {views: render-depth, truth: prep/truth}
+";
+
+/// A folder with a pipeline.
+pub struct Project {
+    dir: tempfile::TempDir,
+}
+
+impl Project {
+    pub fn new(pipeline: &str) -> Self {
+        let project = Self { dir: tempfile::tempdir().unwrap() };
+        project.write("pipeline.yaml", pipeline);
+        project
+    }
+
+    pub fn tiny() -> Self {
+        Self::new(TINY)
+    }
+
+    pub fn path(&self, file: &str) -> PathBuf {
+        self.dir.path().join(file)
+    }
+
+    pub fn write(&self, file: &str, text: &str) {
+        let path = self.path(file);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+
+    /// Changes the pipeline's text.
+    #[track_caller]
+    pub fn replace(&self, from: &str, to: &str) {
+        let text = std::fs::read_to_string(self.path("pipeline.yaml")).unwrap();
+        assert!(text.contains(from), "the pipeline has no {from:?}");
+        self.write("pipeline.yaml", &text.replace(from, to));
+    }
+
+    pub fn command(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_nerf-sr"));
+        command.args(arguments).current_dir(self.dir.path()).env_remove("NERF_SR_STORE");
+        command
+    }
+
+    pub fn run(&self, arguments: &[&str]) -> Finished {
+        Finished::of(self.command(arguments).output().unwrap())
+    }
+
+    /// Runs and expects success.
+    #[track_caller]
+    pub fn ok(&self, arguments: &[&str]) -> String {
+        let finished = self.run(arguments);
+        assert_eq!(finished.code, 0, "{}\n{}", finished.stdout, finished.stderr);
+        finished.stdout
+    }
+
+    /// Identity of the artifact that a stage has now, in the order of the sweep's points.
+    #[track_caller]
+    pub fn output_of(&self, stage: &str, arguments: &[&str]) -> Vec<String> {
+        let status = self.ok(&[&["status"], arguments].concat());
+        let lines = status.lines().filter(|l| l.split_whitespace().next() == Some(stage));
+        lines.map(|l| l.split("cached").nth(1).unwrap_or_else(|| panic!("{l}")).split_whitespace().next().unwrap().to_owned()).collect()
+    }
+
+    /// Folder of an artifact, by the beginning of its identity.
+    #[track_caller]
+    pub fn object(&self, start: &str) -> PathBuf {
+        let objects = std::fs::read_dir(self.path(".nerf-sr/objects")).unwrap();
+        let found = objects.map(|e| e.unwrap().path()).find(|p| p.file_name().unwrap().to_str().unwrap().starts_with(start));
+        found.unwrap_or_else(|| panic!("no object {start}"))
+    }
+
+    /// Every object and record of the store, sorted.
+    pub fn store_listing(&self) -> Vec<String> {
+        let mut names: Vec<String> = ["objects", "actions"]
+            .into_iter()
+            .flat_map(|f| std::fs::read_dir(self.path(&format!(".nerf-sr/{f}"))).into_iter().flatten())
+            .map(|e| e.unwrap().path().display().to_string())
+            .collect();
+        names.sort();
+        names
+    }
+}
+
+/// What a command left.
+pub struct Finished {
+    pub code: i32,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl Finished {
+    pub fn of(output: Output) -> Self {
+        Self {
+            code: output.status.code().unwrap_or(-1),
+            stdout: String::from_utf8(output.stdout).unwrap(),
+            stderr: String::from_utf8(output.stderr).unwrap(),
+        }
+    }
+
+    /// Expects an exit code and, as the last line on stderr, one that has all the words.
+    #[track_caller]
+    pub fn fails(&self, code: i32, words: &[&str]) {
+        assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
+        let line = self.stderr.lines().rfind(|l| words.iter().all(|w| l.contains(w)));
+        assert!(line.is_some(), "no line with {words:?} in:\n{}", self.stderr);
+        assert!(!self.stderr.contains("panicked"), "{}", self.stderr);
+    }
+}
+
+/// Runs a stage by the contract.
+pub fn stage(name: &str, params: &str, inputs: &[(&str, &Path)], output: &Path, more: &[&str]) -> Finished {
+    Finished::of(stage_command(name, params, inputs, output, more).output().unwrap())
+}
+
+/// The command of a stage by the contract; its parameters lie beside the output.
+pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output: &Path, more: &[&str]) -> Command {
+    let file = output.with_extension("params.json");
+    if let Some(folder) = file.parent().filter(|f| f.is_dir()) {
+        std::fs::write(folder.join(file.file_name().unwrap()), params).ok();
+    }
+    let mut command = Command::new(bin(name));
+    command.arg("--params").arg(&file).arg("--output").arg(output).args(["--progress", "none"]).args(more);
+    for (name, folder) in inputs {
+        command.arg("--input").arg(format!("{name}={}", folder.display()));
+    }
+    command
+}
+
+/// The data folder with real scenes and weights; without it a test says so and ends.
+pub fn data() -> Option<PathBuf> {
+    let path = std::env::var("NERF_SR_DATA").map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    if path.is_dir() {
+        return Some(path);
+    }
+    eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", path.display());
+    None
+}

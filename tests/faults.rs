@@ -1,0 +1,117 @@
+//! Kills at any moment: what was finished stays whole, what wasn't goes on, and the bytes come out equal.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use common::{Finished, Project, stage, stage_command};
+
+/// Long enough for several checkpoints, the first after about a second.
+const PARAMS: &str = r#"{"rays": 2000000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
+
+fn scene(project: &Project) -> std::path::PathBuf {
+    let (data, scene) = (project.path("data"), project.path("scene"));
+    assert_eq!(stage("demo-scene", r#"{"size": 48, "train": 8, "test": 1, "samples": 1}"#, &[], &data, &[]).code, 0);
+    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
+    scene.join("train")
+}
+
+fn signal(child: &std::process::Child, name: &str) {
+    Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
+}
+
+fn manifest(folder: &Path) -> String {
+    std::fs::read_to_string(folder.join("artifact.json")).unwrap()
+}
+
+#[test]
+fn training_killed_at_any_moment_ends_in_the_same_bytes() {
+    let project = Project::tiny();
+    let train = scene(&project);
+    let inputs = [("scene", train.as_path())];
+    let whole = project.path("whole");
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
+
+    let (output, work) = (project.path("killed"), project.path("work"));
+    let more = ["--work", work.to_str().unwrap()];
+    let mut resumed = 0;
+    for milliseconds in [100, 1300, 700, 1500, 1250] {
+        let mut child = stage_command("train-ss", PARAMS, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        signal(&child, "-KILL");
+        child.wait().unwrap();
+        assert!(!output.exists(), "a killed stage leaves no output");
+        resumed += usize::from(work.join("checkpoint.safetensors").exists());
+    }
+    assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
+    let finished = stage("train-ss", PARAMS, &inputs, &output, &more);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    assert_eq!(manifest(&output), manifest(&whole));
+}
+
+#[test]
+fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
+    let project = Project::tiny();
+    let train = scene(&project);
+    let inputs = [("scene", train.as_path())];
+    let (output, work) = (project.path("out"), project.path("work"));
+    let more = ["--work", work.to_str().unwrap()];
+    let child = stage_command("train-ss", PARAMS, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(600));
+    signal(&child, "-TERM");
+    let finished = Finished::of(child.wait_with_output().unwrap());
+    assert_eq!(finished.code, 130, "{}", finished.stderr);
+    assert!(finished.stderr.contains("interrupted; run again to go on from here"), "{}", finished.stderr);
+    assert!(work.join("checkpoint.safetensors").exists() && !output.exists());
+    // A checkpoint cut short is said and left out, not trusted.
+    let checkpoint = work.join("checkpoint.safetensors");
+    let bytes = std::fs::read(&checkpoint).unwrap();
+    std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &output, &more).code, 0);
+    let whole = project.path("whole");
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
+    assert_eq!(manifest(&output), manifest(&whole));
+}
+
+#[test]
+fn a_runner_killed_or_interrupted_goes_on() {
+    let project = Project::tiny();
+    project.replace("rays: 60000", "rays: 1500000");
+    let spawn = || project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    for (name, milliseconds) in [("-KILL", 150), ("-KILL", 900), ("-INT", 1200)] {
+        let child = spawn();
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        signal(&child, name);
+        let finished = Finished::of(child.wait_with_output().unwrap());
+        if name == "-INT" {
+            assert_eq!(finished.code, 130, "{}", finished.stderr);
+            assert!(finished.stderr.contains("interrupted"), "{}", finished.stderr);
+            assert!(project.ok(&["status"]).contains("has a checkpoint to go on from"));
+        }
+    }
+    let last = project.run(&["run"]);
+    assert_eq!(last.code, 0, "{}", last.stderr);
+    assert!(last.stderr.contains("going on from step"), "{}", last.stderr);
+    assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
+    let undisturbed = Project::new(&std::fs::read_to_string(project.path("pipeline.yaml")).unwrap());
+    undisturbed.ok(&["run"]);
+    assert_eq!(project.output_of("eval", &[]), undisturbed.output_of("eval", &[]));
+}
+
+#[test]
+fn a_record_that_was_cut_short_is_made_again() {
+    let project = Project::tiny();
+    project.ok(&["run"]);
+    let actions = project.path(".nerf-sr/actions");
+    for entry in std::fs::read_dir(&actions).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|e| e == "json") {
+            let bytes = std::fs::read(&path).unwrap();
+            std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        }
+    }
+    assert!(project.ok(&["run"]).contains("5 of 5 stages ran"));
+}

@@ -1,0 +1,143 @@
+//! The pipeline end to end on a tiny scene: caching, explanations, sweeps, equal bytes.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use common::Project;
+
+#[test]
+fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
+    let project = Project::tiny();
+    let first = project.ok(&["run"]);
+    assert!(first.contains("eval: PSNR"), "{first}");
+    assert!(first.contains("5 of 5 stages ran"), "{first}");
+    let listing = project.store_listing();
+    assert!(project.ok(&["run"]).contains("nothing to run"));
+    // A comment, another order of keys, another number of threads, another place.
+    project.replace("default: [eval]", "# a comment\ndefault: [eval]");
+    project.replace("{lr: 24, scale: 2}", "{scale: 2, lr: 24}");
+    assert!(project.ok(&["run", "--threads", "1"]).contains("nothing to run"));
+    let moved = Project::new(&std::fs::read_to_string(project.path("pipeline.yaml")).unwrap());
+    std::fs::rename(project.path(".nerf-sr"), moved.path(".nerf-sr")).unwrap();
+    assert!(moved.ok(&["run"]).contains("nothing to run"));
+    assert_eq!(listing.len(), moved.store_listing().len());
+}
+
+#[test]
+fn why_names_the_changed_parameter_and_equal_output_cuts_off() {
+    let project = Project::tiny();
+    assert!(project.ok(&["why", "prep"]).contains("waits for demo-scene"));
+    project.ok(&["run"]);
+    assert!(project.ok(&["why", "prep"]).contains("cached"));
+    // Another kernel: prep reruns, what depends on it waits for it.
+    let why = project.ok(&["why", "train-ss", "-p", "kernel=box"]);
+    assert!(why.contains("train-ss: waits for prep"), "{why}");
+    assert!(why.contains(r#"prep: will run: parameter kernel: "lanczos" → "box""#), "{why}");
+    let plan = project.ok(&["plan", "-p", "kernel=box"]);
+    assert!(plan.lines().any(|l| l.starts_with("demo-scene") && l.contains("cached")), "{plan}");
+    assert!(plan.lines().any(|l| l.starts_with("eval") && l.contains("waits for")), "{plan}");
+    // The same sizes said otherwise: prep runs, its output is equal, all else stays cached.
+    let run = project.ok(&["run", "-p", "hr=48"]);
+    assert!(run.contains("1 of 5 stages ran, 4 were cached"), "{run}");
+    // And with the other kernel everything after demo-scene runs.
+    let run = project.ok(&["run", "-p", "kernel=box"]);
+    assert!(run.contains("4 of 5 stages ran, 1 were cached"), "{run}");
+}
+
+#[test]
+fn equal_bytes_with_one_and_two_threads() {
+    let (one, two) = (Project::tiny(), Project::tiny());
+    one.ok(&["run", "--threads", "1"]);
+    two.ok(&["run", "--threads", "2"]);
+    for stage in ["demo-scene", "prep", "train-ss", "render-depth", "eval"] {
+        assert_eq!(one.output_of(stage, &[]), two.output_of(stage, &[]), "{stage}");
+    }
+}
+
+#[test]
+fn a_sweep_shares_what_it_can() {
+    let project = Project::tiny();
+    let sweep = ["-p", "supersample=1,2", "-p", "ssim_border=reflect,valid"];
+    let run = project.ok(&[&["run"][..], &sweep].concat());
+    // demo-scene and prep once, training and rendering twice, eval four times.
+    assert!(run.contains("10 of 10 stages ran"), "{run}");
+    assert!(run.contains("eval [supersample=2, ssim_border=valid]: PSNR"), "{run}");
+    assert_eq!(project.output_of("train-ss", &sweep).len(), 2);
+    // A single point of it is cached.
+    assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));
+}
+
+#[test]
+fn graph_status_log_gc_and_verify() {
+    let project = Project::tiny();
+    project.ok(&["run"]);
+    assert!(project.ok(&["graph"]).contains("train-ss (cached)  ← scene = prep/train"));
+    assert!(project.ok(&["graph", "--format", "dot"]).contains("-> n"));
+    assert!(project.ok(&["graph", "--format", "svg"]).ends_with("</svg>\n"));
+    assert!(project.ok(&["status"]).lines().all(|l| l.contains("cached")));
+    assert!(project.ok(&["log", "train-ss"]).contains("train-ss:"));
+    assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
+    // What another kernel left is garbage, what the pipeline comes to is not.
+    project.ok(&["run", "-p", "kernel=box"]);
+    let before = project.store_listing();
+    assert!(project.ok(&["gc"]).contains("0.0 MB freed"), "young things stay");
+    assert_eq!(project.store_listing(), before);
+    let dry = project.ok(&["gc", "--dry-run", "--keep-days", "0"]);
+    assert!(dry.contains("train-ss") && dry.contains("would go"), "{dry}");
+    assert_eq!(project.store_listing(), before);
+    project.ok(&["gc", "--keep-days", "0"]);
+    assert_eq!(project.store_listing().len(), before.len() - 4 * 3);
+    assert!(project.ok(&["run"]).contains("nothing to run"));
+}
+
+#[test]
+fn the_page_is_written_and_then_up_to_date() {
+    let project = Project::tiny();
+    project.replace("default: [eval]", "default: [report]");
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + "  report:\n    inputs: {run: eval}\n"));
+    let run = project.ok(&["run", "-p", "supersample=1,2"]);
+    assert!(run.contains("out/report/index.html"), "{run}");
+    let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
+    for words in ["supersample=1", "supersample=2", "data:image/png;base64,", "weights not given", "depth (warm is near)", "ground truth, 48 px"] {
+        assert!(page.contains(words), "the page lacks {words:?}");
+    }
+    // Self-contained: nothing is fetched from anywhere.
+    assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("<script"));
+    let again = project.ok(&["run", "-p", "supersample=1,2"]);
+    assert!(again.contains("up to date") && again.contains("nothing to run"), "{again}");
+}
+
+#[test]
+fn a_stage_in_python_takes_evals_place() {
+    let project = Project::tiny();
+    let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
+    std::fs::copy(script, project.path("my-eval.py")).unwrap();
+    project.replace("  eval:\n", "  eval:\n    run: ./my-eval.py\n");
+    let run = project.ok(&["run"]);
+    assert!(run.contains("eval: mean squared error"), "{run}");
+    assert!(project.ok(&["run"]).contains("nothing to run"));
+    assert!(project.ok(&["log", "eval"]).contains("scoring with Python"));
+    let why = project.ok(&["why", "eval", "-p", "peak=1"]);
+    assert!(why.contains("parameter peak: 255 → 1"), "{why}");
+    // Changed code is noticed, and the rest isn't run again.
+    let text = std::fs::read_to_string(project.path("my-eval.py")).unwrap();
+    project.write("my-eval.py", &text.replace("scoring with Python", "scoring anew"));
+    std::process::Command::new("chmod").arg("+x").arg(project.path("my-eval.py")).status().unwrap();
+    assert!(project.ok(&["why", "eval"]).contains("will run: code"));
+    assert!(project.ok(&["run"]).contains("1 of 5 stages ran, 4 were cached"));
+}
+
+#[test]
+fn two_runners_at_once_make_everything_once() {
+    let project = Project::tiny();
+    let spawn = || project.command(&["run"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    let runners = [spawn(), spawn()].map(|child| common::Finished::of(child.wait_with_output().unwrap()));
+    let mut ran = 0;
+    for runner in &runners {
+        assert_eq!(runner.code, 0, "{}", runner.stderr);
+        let last = runner.stdout.lines().last().unwrap();
+        ran += if last.starts_with("nothing") { 0 } else { last.split(' ').next().unwrap().parse::<usize>().unwrap() };
+    }
+    assert_eq!(ran, 5);
+}

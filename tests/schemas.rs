@@ -1,0 +1,91 @@
+//! `schemas/` is made from the types; this test keeps it current. `UPDATE=1 cargo test --test schemas` writes it anew.
+
+#![allow(missing_docs, reason = "a test")]
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use artifact::Stage;
+use schemars::{JsonSchema, schema_for};
+
+fn of<T: JsonSchema>() -> serde_json::Value {
+    schema_for!(T).to_value()
+}
+
+fn parameters<S: Stage>(all: &mut BTreeMap<String, serde_json::Value>) {
+    all.insert(format!("parameters/{}.json", S::NAME), of::<S::Params>());
+}
+
+#[test]
+fn schemas_are_current() {
+    let mut all = BTreeMap::new();
+    parameters::<demo_scene::DemoScene>(&mut all);
+    parameters::<prep::Prep>(&mut all);
+    parameters::<train_ss::TrainSs>(&mut all);
+    parameters::<render_depth::RenderDepth>(&mut all);
+    parameters::<eval::Eval>(&mut all);
+    parameters::<report::Report>(&mut all);
+    for (name, schema) in [
+        ("pipeline", of::<runner::Pipeline>()),
+        ("describe", of::<artifact::Description>()),
+        ("artifact", of::<artifact::Manifest>()),
+        ("action", of::<artifact::Record>()),
+        ("run", of::<runner::RunRecord>()),
+        ("views", of::<scene::Views>()),
+        ("scene", of::<prep::SceneSummary>()),
+        ("field", of::<radiance::FieldFile>()),
+        ("training", of::<train_ss::TrainingLog>()),
+        ("metrics", of::<eval::Metrics>()),
+    ] {
+        all.insert(format!("{name}.json"), schema);
+    }
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("schemas");
+    let update = std::env::var_os("UPDATE").is_some();
+    for (name, schema) in &all {
+        let path = folder.join(name);
+        let text = serde_json::to_string_pretty(schema).unwrap() + "\n";
+        if update {
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(&path, text).unwrap();
+        } else {
+            let found = std::fs::read_to_string(&path).unwrap_or_default();
+            assert!(found == text, "schemas/{name} is out of date: UPDATE=1 cargo test --test schemas");
+        }
+    }
+    let files = walkdir::WalkDir::new(&folder).into_iter().filter(|e| e.as_ref().unwrap().file_type().is_file()).count();
+    assert_eq!(files, all.len(), "schemas/ has a file that no type makes");
+}
+
+/// What the stages write is what the schemas say.
+#[test]
+fn artifacts_fit_their_schemas() {
+    let project = common::Project::tiny();
+    project.ok(&["run"]);
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("schemas");
+    let check = |schema: &str, file: &Path| {
+        let read = |path: &Path| -> serde_json::Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() };
+        let validator = jsonschema::validator_for(&read(&folder.join(schema))).unwrap();
+        let errors: Vec<String> = validator.iter_errors(&read(file)).map(|e| e.to_string()).collect();
+        assert!(errors.is_empty(), "{}: {errors:?}", file.display());
+    };
+    let object = |stage: &str| project.object(&project.output_of(stage, &[])[0]);
+    let (scene, field, views, metrics) = (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
+    for folder in [&scene, &field, &views, &metrics] {
+        check("artifact.json", &folder.join("artifact.json"));
+    }
+    check("scene.json", &scene.join("scene.json"));
+    for views in [scene.join("train"), scene.join("truth"), scene.join("cameras"), scene.join("references"), views] {
+        check("views.json", &views.join("views.json"));
+    }
+    check("field.json", &field.join("field.json"));
+    check("training.json", &field.join("training.json"));
+    check("metrics.json", &metrics.join("metrics.json"));
+    for action in std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap() {
+        let path = action.unwrap().path();
+        if path.extension().is_some_and(|e| e == "json") {
+            check("action.json", &path);
+        }
+    }
+}
+
+mod common;
