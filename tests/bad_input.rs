@@ -43,8 +43,18 @@ fn edit(file: &Path, from: &str, to: &str) {
 #[test]
 fn datasets_that_cannot_be_used() {
     refused(|_, d| std::fs::remove_dir_all(d).unwrap(), &[], 3, &["input dataset", "data", "name a folder that is there"]);
-    refused(|_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(), &[], 3, &["transforms_test.json", "expected a folder"]);
-    refused(|_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(), &[], 3, &["transforms_train.json: frame 2", "r_2.png is not there"]);
+    refused(
+        |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
+        &[],
+        3,
+        &["transforms_test.json", "expected a folder"],
+    );
+    refused(
+        |_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(),
+        &[],
+        3,
+        &["transforms_train.json: frame 2", "r_2.png is not there"],
+    );
     refused(
         |_, d| {
             let png = std::fs::read(d.join("train/r_1.png")).unwrap();
@@ -60,7 +70,12 @@ fn datasets_that_cannot_be_used() {
         let rest = &text[at..];
         rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..].split(',').next().unwrap().trim().to_owned()
     };
-    refused(|_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"), &[], 3, &["transforms_train.json: frame 0", "is NaN"]);
+    refused(
+        |_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"),
+        &[],
+        3,
+        &["transforms_train.json: frame 0", "is NaN"],
+    );
     refused(|_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"), &[], 3, &["camera_angle_x is 3.2", "focal length"]);
     refused(
         |_, d| std::fs::write(d.join("transforms_test.json"), r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap(),
@@ -109,11 +124,15 @@ fn a_full_disk() {
     }
     let store = disk.join("store");
     let finished = project.run(&["run", "--store", store.to_str().unwrap()]);
-    let objects: Vec<_> = std::fs::read_dir(store.join("objects")).map(|d| d.count()).into_iter().collect();
-    let records = std::fs::read_dir(store.join("actions")).map_or(0, Iterator::count);
+    // What was finished before the disk was full is whole; nothing else is there.
+    let verified = project.run(&["verify", "--store", store.to_str().unwrap()]);
+    let count = |folder: &str| std::fs::read_dir(store.join(folder)).unwrap().count();
+    let (objects, actions) = (count("objects"), count("actions"));
+    let staged = count("partial");
     std::process::Command::new("umount").arg(&disk).status().unwrap();
     finished.fails(1, &["No space left on device"]);
-    assert_eq!((objects, records), (vec![0], 0));
+    assert!(verified.stdout.contains(&format!("{objects} artifacts, 0 damaged")), "{}", verified.stdout);
+    assert!(objects < 3 && actions <= 2 * objects && staged <= 1, "{objects} {actions} {staged}");
 }
 
 #[test]
@@ -129,7 +148,9 @@ fn a_flipped_byte_in_an_artifact_is_noticed_and_named() {
     let before = project.store_listing();
     // Training reads it.
     project.run(&["run", "-p", "seed=1"]).fails(2, &["-p seed", "demo-scene.seed, train-ss.seed"]);
-    project.run(&["run", "-p", "train-ss.seed=1"]).fails(3, &["train/images/r_3.png", "blake3 differs", "nerf-sr verify --remove"]);
+    project
+        .run(&["run", "-p", "train-ss.seed=1"])
+        .fails(3, &["train/images/r_3.png", "blake3 differs", "nerf-sr verify --remove"]);
     assert_eq!(project.store_listing(), before);
     project.run(&["verify"]).fails_on_stdout(3, &["train/images/r_3.png"]);
     project.run(&["verify", "--remove"]).fails_on_stdout(3, &["removed"]);
@@ -149,7 +170,7 @@ impl common::Finished {
 #[test]
 fn pipelines_that_cannot_be_used() {
     for (from, to, line, words) in [
-        ("    inputs: {dataset: demo-scene}", "    inputs: {dataset: demo-scene}\n    imputs: {}", 7, "imputs"),
+        ("    inputs: {dataset: demo-scene}", "    inputs: {dataset: demo-scene}\n    imputs: {}", 8, "imputs"),
         ("  eval:\n", "  eval: {}\n  eval:\n", 0, "duplicate entry"),
         ("{dataset: demo-scene}", "{dataset: demo}", 7, "no stage \"demo\""),
         ("{dataset: demo-scene}", "{}", 6, "input dataset is missing"),
@@ -174,7 +195,9 @@ fn pipelines_that_cannot_be_used() {
 #[test]
 fn a_cycle_is_named() {
     let script = "#!/bin/sh\necho '{\"name\":\"x\",\"version\":\"1\",\"code\":\"1\",\"summary\":\"\",\"parameters\":{\"type\":\"object\"},\"inputs\":{\"a\":{\"kinds\":[\"k\"],\"summary\":\"\"}},\"output\":{\"kind\":\"k\"}}'\n";
-    let project = Project::new("default: [one]\nstages:\n  one: {run: ./x, inputs: {a: two}}\n  two: {run: ./x, inputs: {a: three}}\n  three: {run: ./x, inputs: {a: one}}\n");
+    let project = Project::new(
+        "default: [one]\nstages:\n  one: {run: ./x, inputs: {a: two}}\n  two: {run: ./x, inputs: {a: three}}\n  three: {run: ./x, inputs: {a: one}}\n",
+    );
     project.write("x", script);
     std::process::Command::new("chmod").arg("+x").arg(project.path("x")).status().unwrap();
     project.run(&["run"]).fails(2, &["pipeline.yaml:", "lead back to it", "one ← two ← three ← one"]);
@@ -194,7 +217,8 @@ fn command_lines_that_cannot_be_used() {
     ] {
         project.run(arguments).fails(2, &[words]);
     }
-    stage("prep", r#"{"lr": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[]).fails(2, &["parameter x", "unknown"]);
+    stage("prep", r#"{"lr": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
+        .fails(2, &["parameter x", "unknown"]);
     stage("prep", r#"{"lr": 16"#, &[("dataset", Path::new("."))], &project.path("o"), &[]).fails(2, &["--params", "line 1"]);
     stage("prep", "{}", &[], &project.path("o"), &[]).fails(2, &["input dataset is missing"]);
     stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[]).fails(2, &["--input data", "known: dataset"]);

@@ -99,7 +99,14 @@ fn the_page_is_written_and_then_up_to_date() {
     let run = project.ok(&["run", "-p", "supersample=1,2"]);
     assert!(run.contains("out/report/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
-    for words in ["supersample=1", "supersample=2", "data:image/png;base64,", "weights not given", "depth (warm is near)", "ground truth, 48 px"] {
+    for words in [
+        "supersample=1",
+        "supersample=2",
+        "data:image/png;base64,",
+        "weights not given",
+        "depth (warm is near)",
+        "ground truth, 48 px",
+    ] {
         assert!(page.contains(words), "the page lacks {words:?}");
     }
     // Self-contained: nothing is fetched from anywhere.
@@ -131,7 +138,8 @@ fn a_stage_in_python_takes_evals_place() {
 #[test]
 fn two_runners_at_once_make_everything_once() {
     let project = Project::tiny();
-    let spawn = || project.command(&["run"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    let spawn =
+        || project.command(&["run"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
     let runners = [spawn(), spawn()].map(|child| common::Finished::of(child.wait_with_output().unwrap()));
     let mut ran = 0;
     for runner in &runners {

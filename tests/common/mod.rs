@@ -88,7 +88,9 @@ impl Project {
     pub fn output_of(&self, stage: &str, arguments: &[&str]) -> Vec<String> {
         let status = self.ok(&[&["status"], arguments].concat());
         let lines = status.lines().filter(|l| l.split_whitespace().next() == Some(stage));
-        lines.map(|l| l.split("cached").nth(1).unwrap_or_else(|| panic!("{l}")).split_whitespace().next().unwrap().to_owned()).collect()
+        lines
+            .map(|l| l.split("cached").nth(1).unwrap_or_else(|| panic!("{l}")).split_whitespace().next().unwrap().to_owned())
+            .collect()
     }
 
     /// Folder of an artifact, by the beginning of its identity.
@@ -158,7 +160,8 @@ pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output:
 
 /// The data folder with real scenes and weights; without it a test says so and ends.
 pub fn data() -> Option<PathBuf> {
-    let path = std::env::var("NERF_SR_DATA").map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let path = std::env::var("NERF_SR_DATA")
+        .map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
     if path.is_dir() {
         return Some(path);
     }

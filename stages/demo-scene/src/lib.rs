@@ -101,22 +101,32 @@ impl Stage for DemoScene {
                 .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}))
                 .context("cannot write the cameras")?;
         }
-        context.write_summary(&format!("{} training and {} test views, {size}×{size}", params.train, params.test, size = params.size))
+        context.write_summary(&format!(
+            "{} training and {} test views, {size}×{size}",
+            params.train,
+            params.test,
+            size = params.size
+        ))
     }
 }
 
 /// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
 fn write_depth(path: &std::path::Path, frame: &Frame) -> Result<(), PixelError> {
-    let channels =
-        [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+    let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
     let size = frame.colour.width;
-    write_exr(path, (size, size), &channels, "Z: camera-space z-depth in scene units; A: 0 where nothing is seen", |first, rows, samples| {
-        let band = &frame.depth[first * size..(first + rows) * size];
-        for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
-            sample.copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
-        }
-        Ok(())
-    })
+    write_exr(
+        path,
+        (size, size),
+        &channels,
+        "Z: camera-space z-depth in scene units; A: 0 where nothing is seen",
+        |first, rows, samples| {
+            let band = &frame.depth[first * size..(first + rows) * size];
+            for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
+                sample.copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
+            }
+            Ok(())
+        },
+    )
 }
 
 /// Camera `i` of `count`: training views spread evenly over the upper hemisphere, test views on a wavy circle between them.

@@ -70,7 +70,13 @@ pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) ->
         }
         Material::Crate => {
             // The face's own two coordinates.
-            let (u, v) = if normal.x.abs() > 0.5 { (p.y, p.z) } else if normal.y.abs() > 0.5 { (p.x, p.z) } else { (p.x, p.y) };
+            let (u, v) = if normal.x.abs() > 0.5 {
+                (p.y, p.z)
+            } else if normal.y.abs() > 0.5 {
+                (p.x, p.z)
+            } else {
+                (p.x, p.y)
+            };
             let face = cell(normal.x * 1.5) * 9 + cell(normal.y * 1.5) * 3 + cell(normal.z * 1.5);
             if u.abs().max(v.abs()) > 0.88 {
                 return matt(DVec3::new(0.45, 0.30, 0.10));

@@ -69,10 +69,18 @@ impl World {
 
         let crate_half = 0.26;
         let spin = 0.5 + turn;
-        let to_local =
-            DMat3::from_cols(DVec3::new(libm::cos(spin), -libm::sin(spin), 0.0), DVec3::new(libm::sin(spin), libm::cos(spin), 0.0), DVec3::Z);
+        let to_local = DMat3::from_cols(
+            DVec3::new(libm::cos(spin), -libm::sin(spin), 0.0),
+            DVec3::new(libm::sin(spin), libm::cos(spin), 0.0),
+            DVec3::Z,
+        );
         let centre = place(0, 0.62) + DVec3::Z * crate_half;
-        groups.push(group(vec![Thing { shape: Shape::Block(DVec3::splat(crate_half)), centre, to_local, material: Material::Crate }]));
+        groups.push(group(vec![Thing {
+            shape: Shape::Block(DVec3::splat(crate_half)),
+            centre,
+            to_local,
+            material: Material::Crate,
+        }]));
 
         groups.push(group(vec![thing(Shape::Ball(0.3), place(1, 0.62) + DVec3::Z * 0.3, Material::Ball)]));
 
@@ -119,7 +127,12 @@ impl World {
         );
         groups.push(group(vec![
             thing(Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014), foot, Material::Rod),
-            Thing { shape: Shape::Block(DVec3::new(0.27, 0.010, 0.19)), centre: foot + DVec3::Z * 0.62, to_local, material: Material::Sign },
+            Thing {
+                shape: Shape::Block(DVec3::new(0.27, 0.010, 0.19)),
+                centre: foot + DVec3::Z * 0.62,
+                to_local,
+                material: Material::Sign,
+            },
         ]));
         Self { groups, seed }
     }
@@ -155,7 +168,13 @@ impl World {
 }
 
 fn group(things: Vec<Thing>) -> Group {
-    let spheres: Vec<(DVec3, f64)> = things.iter().map(|t| { let (c, r) = t.shape.bounding_ball(); (t.centre + t.to_local.transpose() * c, r) }).collect();
+    let spheres: Vec<(DVec3, f64)> = things
+        .iter()
+        .map(|t| {
+            let (c, r) = t.shape.bounding_ball();
+            (t.centre + t.to_local.transpose() * c, r)
+        })
+        .collect();
     let centre = spheres.iter().map(|(c, _)| *c).sum::<DVec3>() / spheres.len() as f64;
     let radius = spheres.iter().map(|(c, r)| (*c - centre).length() + r).fold(0.0, f64::max);
     Group { centre, radius, things }
@@ -217,7 +236,13 @@ impl Shape {
                     return None;
                 }
                 let p = (o + t * d) / half;
-                let axis = if p.x.abs() >= p.y.abs().max(p.z.abs()) { DVec3::X } else if p.y.abs() >= p.z.abs() { DVec3::Y } else { DVec3::Z };
+                let axis = if p.x.abs() >= p.y.abs().max(p.z.abs()) {
+                    DVec3::X
+                } else if p.y.abs() >= p.z.abs() {
+                    DVec3::Y
+                } else {
+                    DVec3::Z
+                };
                 Some((t, axis * p.dot(axis).signum()))
             }
             Self::Drum(r, h) => {

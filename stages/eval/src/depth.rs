@@ -42,7 +42,11 @@ mod tests {
 
     #[test]
     fn only_surfaces_count() {
-        let image = |z: [f32; 4], a: [f32; 4]| ExrImage { width: 2, height: 2, channels: vec![("A".into(), a.to_vec()), ("Z".into(), z.to_vec())] };
+        let image = |z: [f32; 4], a: [f32; 4]| ExrImage {
+            width: 2,
+            height: 2,
+            channels: vec![("A".into(), a.to_vec()), ("Z".into(), z.to_vec())],
+        };
         let truth = image([4.0, 5.0, 3.0, 0.0], [1.0, 1.0, 1.0, 0.0]);
         let error = depth_error(&image([4.5, 5.0, 3.1, 9.0], [1.0, 0.2, 1.0, 1.0]), &truth).unwrap();
         assert!((error.mean_absolute - 0.2).abs() < 1e-6 && (error.median_absolute - 0.1).abs() < 1e-6);

@@ -114,7 +114,13 @@ impl Stage for Eval {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("truth", Input::required(&["scene/truth"], "ground truth, views of the same names")),
-            ("weights", Input::optional(&["weights"], "folder with squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, for LPIPS")),
+            (
+                "weights",
+                Input::optional(
+                    &["weights"],
+                    "folder with squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, for LPIPS",
+                ),
+            ),
         ]
     }
 
@@ -139,7 +145,11 @@ impl Stage for Eval {
                 let found = read_view(views_in, view, views.background)?;
                 let size = |p: &Picture| format!("{}×{}", p.width, p.height);
                 if size(&expected) != size(&found) {
-                    let message = format!("view {name}: rendered at {} where the truth has {}; set size in render-depth", size(&found), size(&expected));
+                    let message = format!(
+                        "view {name}: rendered at {} where the truth has {}; set size in render-depth",
+                        size(&found),
+                        size(&expected)
+                    );
                     return Err(Failure::BadInput(message).into());
                 }
                 let error_map = format!("errors/{name}.png");
@@ -202,7 +212,10 @@ fn draw_error(found: &Picture, expected: &Picture, range: f32) -> Rgba8 {
     Rgba8::new(found.width, found.height, data)
 }
 
-fn score_depth((views_in, view): (&GivenInput, &View), (truth_in, truth): (&GivenInput, &View)) -> anyhow::Result<Option<DepthError>> {
+fn score_depth(
+    (views_in, view): (&GivenInput, &View),
+    (truth_in, truth): (&GivenInput, &View),
+) -> anyhow::Result<Option<DepthError>> {
     let (Some(found), Some(expected)) = (&view.depth, &truth.depth) else { return Ok(None) };
     let read = |path: &Path| read_exr(path).bad_input(format!("view {}", view.camera.name));
     let (found, expected) = (read(&views_in.path(found))?, read(&truth_in.path(expected))?);
@@ -248,7 +261,13 @@ fn summary(metrics: &Metrics, perceptual: &Perceptual) -> String {
     let mean = &metrics.mean;
     let lpips = mean.lpips.map_or_else(|| perceptual.missing().to_owned(), |v| format!("{v:.4}"));
     let depth = mean.depth.map(|d| format!(" · depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute));
-    format!("PSNR {:.2} dB · SSIM {:.4} · LPIPS {lpips}{} · {} views", mean.psnr, mean.ssim, depth.unwrap_or_default(), metrics.views.len())
+    format!(
+        "PSNR {:.2} dB · SSIM {:.4} · LPIPS {lpips}{} · {} views",
+        mean.psnr,
+        mean.ssim,
+        depth.unwrap_or_default(),
+        metrics.views.len()
+    )
 }
 
 /// LPIPS, or the reason why there is none.

@@ -42,7 +42,10 @@ const FIRES: [(usize, i64, i64, i64); 8] = [
 const STAGES: [i64; 7] = [64, 128, 256, 384, 384, 512, 512];
 
 fn conv(weights: &Weights, name: &str, shape: [i64; 4]) -> Result<Conv, WeightsError> {
-    Ok(Conv { weight: weights.tensor(&format!("{name}.weight"), &shape)?, bias: weights.tensor(&format!("{name}.bias"), &shape[..1])? })
+    Ok(Conv {
+        weight: weights.tensor(&format!("{name}.weight"), &shape)?,
+        bias: weights.tensor(&format!("{name}.bias"), &shape[..1])?,
+    })
 }
 
 impl Conv {
@@ -87,7 +90,12 @@ impl Lpips {
     /// Distance of two RGB pictures in [0, 1].
     pub fn distance(&self, a: &Picture, b: &Picture) -> anyhow::Result<f64> {
         // Three poolings by 2 need this much.
-        anyhow::ensure!(a.width >= 17 && a.height >= 17, "LPIPS needs pictures of at least 17×17 pixels, not {}×{}", a.width, a.height);
+        anyhow::ensure!(
+            a.width >= 17 && a.height >= 17,
+            "LPIPS needs pictures of at least 17×17 pixels, not {}×{}",
+            a.width,
+            a.height
+        );
         let distance = no_grad(|| {
             let (a, b) = (self.features(&input(a)), self.features(&input(b)));
             let stage = |((a, b), head): ((&Tensor, &Tensor), &Tensor)| {

@@ -43,7 +43,8 @@ fn one_pixel_and_narrow_pictures_have_an_ssim() {
 #[cfg(feature = "torch")]
 #[test]
 fn lpips_gives_the_published_distances() {
-    let data = std::env::var("NERF_SR_DATA").map_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into(), std::path::PathBuf::from);
+    let data = std::env::var("NERF_SR_DATA")
+        .map_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into(), std::path::PathBuf::from);
     let weights = data.join("weights");
     if !weights.is_dir() {
         eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", weights.display());

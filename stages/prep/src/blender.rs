@@ -155,7 +155,11 @@ fn read_frame(folder: &Path, entry: &FrameEntry) -> Result<Frame, String> {
     camera.check().map_err(|e: CameraError| format!("transform_matrix: {e}"))?;
     let existing = |path: &Path| {
         let path = folder.join(path);
-        if path.is_file() { Ok(path) } else { Err(format!("{} is not there; remove the frame or restore the file", path.display())) }
+        if path.is_file() {
+            Ok(path)
+        } else {
+            Err(format!("{} is not there; remove the frame or restore the file", path.display()))
+        }
     };
     let image = existing(&file)?;
     let depth = entry.depth_file_path.as_ref().map(|p| existing(&relative_path(p)?)).transpose()?;
@@ -175,7 +179,9 @@ mod tests {
     }
 
     fn with_pose(entry: &str) -> String {
-        format!(r#"{{"camera_angle_x": 0.7, "frames": [{{"file_path": "./train/r_0", "transform_matrix": [[{entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#)
+        format!(
+            r#"{{"camera_angle_x": 0.7, "frames": [{{"file_path": "./train/r_0", "transform_matrix": [[{entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#
+        )
     }
 
     #[test]
@@ -196,7 +202,7 @@ mod tests {
             (with_pose("1").replace("r_0", "r_1"), "r_1.png is not there"),
             (r#"{"camera_angle_x": 0.7, "frames": []}"#.to_owned(), "`frames` is empty"),
             (with_pose("1")[..60].to_owned(), "line 1"),
-            (with_pose("1").replace("[0,1,0,0],", ""), "") ,
+            (with_pose("1").replace("[0,1,0,0],", ""), ""),
         ] {
             let outcome = read(&json);
             if words.is_empty() {

@@ -63,11 +63,20 @@ mod tests {
         let right = DVec3::Z.cross(back).normalize();
         let up = back.cross(right);
         let row = |k: usize| [right[k], up[k], back[k], from[k]];
-        Camera { name: "c".into(), intrinsics: Intrinsics::from_angle_x(100, 100, 0.69), camera_to_world: [row(0), row(1), row(2)] }
+        Camera {
+            name: "c".into(),
+            intrinsics: Intrinsics::from_angle_x(100, 100, 0.69),
+            camera_to_world: [row(0), row(1), row(2)],
+        }
     }
 
     fn circle(target: DVec3, distance: f64) -> Vec<Camera> {
-        (0..12).map(|i| { let a = f64::from(i) * 0.5236; looking_at(target + distance * DVec3::new(a.cos(), a.sin(), 0.4).normalize(), target) }).collect()
+        (0..12)
+            .map(|i| {
+                let a = f64::from(i) * 0.5236;
+                looking_at(target + distance * DVec3::new(a.cos(), a.sin(), 0.4).normalize(), target)
+            })
+            .collect()
     }
 
     #[test]

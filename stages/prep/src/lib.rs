@@ -126,7 +126,10 @@ impl Stage for Prep {
     const SUMMARY: &'static str = "Makes a scene of posed images: LR images to train on, HR ground truth, cameras and bounds.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("dataset", Input::required(&["dataset"], "folder with transforms_train.json and transforms_test.json (Blender format)"))]
+        vec![(
+            "dataset",
+            Input::required(&["dataset"], "folder with transforms_train.json and transforms_test.json (Blender format)"),
+        )]
     }
 
     fn output() -> Output {
@@ -282,7 +285,11 @@ impl Job<'_> {
         let image = read_png(&frame.image).bad_input(frame_place(split, index, frame))?;
         let size = (image.width as u32, image.height as u32);
         if size != self.native {
-            let message = format!("{}: {size:?} pixels where the first has {:?}; all images must be of one size", frame_place(split, index, frame), self.native);
+            let message = format!(
+                "{}: {size:?} pixels where the first has {:?}; all images must be of one size",
+                frame_place(split, index, frame),
+                self.native
+            );
             return Err(Failure::BadInput(message).into());
         }
         Ok(degrade(&image, &self.sizes, self.params.kernel))
@@ -310,43 +317,59 @@ impl Job<'_> {
     /// True depth at HR size: that of the nearest native pixel centre, since averaging depths across an edge invents surfaces.
     fn write_depth(&self, source: &Path, name: &str) -> anyhow::Result<()> {
         let native = read_exr(source)?;
-        let channel = |name: &str| {
-            native.channel(name).with_context(|| format!("{}: no channel {name}", source.display()))
-        };
+        let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", source.display()));
         let (depth, opacity) = (channel("Z")?, channel("A")?);
         let (width, height) = (self.sizes.hr.0 as usize, self.sizes.hr.1 as usize);
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
-        let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
-        write_exr(&path, (width, height), &channels, "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen", |first, _, samples| {
-            for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
-                let (x, y) = (nearest(i % width, native.width, width), nearest(first + i / width, native.height, height));
-                let at = y * native.width + x;
-                sample.copy_from_slice(&[opacity[at], depth[at]]);
-            }
-            Ok(())
-        })
+        let channels =
+            [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+        write_exr(
+            &path,
+            (width, height),
+            &channels,
+            "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen",
+            |first, _, samples| {
+                for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
+                    let (x, y) = (nearest(i % width, native.width, width), nearest(first + i / width, native.height, height));
+                    let at = y * native.width + x;
+                    sample.copy_from_slice(&[opacity[at], depth[at]]);
+                }
+                Ok(())
+            },
+        )
     }
 
     fn summarise(&self, train: &Dataset, test: &Dataset, bounds: Bounds) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let scale = [f64::from(hr.0) / f64::from(lr.0), f64::from(hr.1) / f64::from(lr.1)];
-        self.context.write_json("scene.json", &SceneSummary {
-            format: "blender".to_owned(),
-            native: self.native.into(),
-            hr: hr.into(),
-            lr: lr.into(),
-            scale,
-            kernel: self.params.kernel,
-            background: self.params.background,
-            bounds,
-            train: train.frames.len(),
-            test: test.frames.len(),
-            has_depth: test.frames.iter().any(|f| f.depth.is_some()),
-        })?;
+        self.context.write_json(
+            "scene.json",
+            &SceneSummary {
+                format: "blender".to_owned(),
+                native: self.native.into(),
+                hr: hr.into(),
+                lr: lr.into(),
+                scale,
+                kernel: self.params.kernel,
+                background: self.params.background,
+                bounds,
+                train: train.frames.len(),
+                test: test.frames.len(),
+                has_depth: test.frames.iter().any(|f| f.depth.is_some()),
+            },
+        )?;
         self.context.write_summary(&format!(
             "{} training views at {}×{} from {}×{} ({:?}), {} test views; rays from {:.2} to {:.2}",
-            train.frames.len(), lr.0, lr.1, hr.0, hr.1, self.params.kernel, test.frames.len(), bounds.near, bounds.far
+            train.frames.len(),
+            lr.0,
+            lr.1,
+            hr.0,
+            hr.1,
+            self.params.kernel,
+            test.frames.len(),
+            bounds.near,
+            bounds.far
         ))
     }
 }

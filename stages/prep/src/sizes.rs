@@ -84,7 +84,13 @@ mod tests {
     fn any_two_of_three() {
         let expected = Sizes { lr: (100, 100), hr: (200, 200) };
         let native = (800, 800);
-        for (lr, hr, scale) in [(Some(100), Some(200), None), (Some(100), None, Some(2.0)), (None, Some(200), Some(2.0)), (Some(100), None, None), (Some(100), Some(200), Some(2.0))] {
+        for (lr, hr, scale) in [
+            (Some(100), Some(200), None),
+            (Some(100), None, Some(2.0)),
+            (None, Some(200), Some(2.0)),
+            (Some(100), None, None),
+            (Some(100), Some(200), Some(2.0)),
+        ] {
             assert_eq!(sizes(native, lr, hr, scale), Ok(expected));
         }
         assert_eq!(sizes(native, None, None, None), Ok(Sizes { lr: (400, 400), hr: native }));
@@ -95,7 +101,10 @@ mod tests {
     #[test]
     fn enlarging_and_contradictions_are_refused() {
         assert!(matches!(sizes((800, 800), Some(900), None, Some(1.0)), Err(SizeError::TooLarge { name: "lr", asked: 900, .. })));
-        assert!(matches!(sizes((800, 800), Some(500), None, Some(2.0)), Err(SizeError::TooLarge { name: "hr", asked: 1000, .. })));
+        assert!(matches!(
+            sizes((800, 800), Some(500), None, Some(2.0)),
+            Err(SizeError::TooLarge { name: "hr", asked: 1000, .. })
+        ));
         assert!(matches!(sizes((800, 800), Some(500), Some(400), None), Err(SizeError::TooLarge { larger: "hr", .. })));
         assert!(matches!(sizes((800, 800), Some(100), Some(300), Some(2.0)), Err(SizeError::Contradiction { .. })));
         assert!(matches!(sizes((4, 4), None, None, Some(16.0)), Err(SizeError::Nothing { .. })));

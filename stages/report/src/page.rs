@@ -100,7 +100,8 @@ fn scores(run: &Run, points: &[Point<'_>]) -> Markup {
 
 /// Time of the ancestors of a kind.
 fn time_of(run: &Run, point: &Point<'_>, kind: &str) -> String {
-    let seconds: f64 = run.ancestors(point.index).into_iter().map(|i| &run.nodes[i]).filter(|n| n.kind == kind).map(|n| n.seconds).sum();
+    let seconds: f64 =
+        run.ancestors(point.index).into_iter().map(|i| &run.nodes[i]).filter(|n| n.kind == kind).map(|n| n.seconds).sum();
     if seconds < 90.0 { format!("{seconds:.1} s") } else { format!("{:.1} min", seconds / 60.0) }
 }
 
@@ -131,8 +132,12 @@ fn gallery(run: &Run, point: &Point<'_>, count: usize) -> anyhow::Result<Markup>
         let expected = picture(&truth, &true_view.image, truths.background)?;
         let error = scores["error_map"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
         let depth = depth(&rendered, &view)?;
-        let caption = |what: &str, found: &Option<(String, usize)>| found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default();
-        let number = |key: &str, digits: usize| scores["scores"][key].as_f64().map(|v| format!("{v:.digits$}")).unwrap_or_else(|| "–".to_owned());
+        let caption = |what: &str, found: &Option<(String, usize)>| {
+            found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
+        };
+        let number = |key: &str, digits: usize| {
+            scores["scores"][key].as_f64().map(|v| format!("{v:.digits$}")).unwrap_or_else(|| "–".to_owned())
+        };
         rows.push(html! {
             h3 { "View " (name) " " small { "PSNR " (number("psnr", 2)) " dB · SSIM " (number("ssim", 4)) } }
             div class="row" {

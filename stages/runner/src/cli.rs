@@ -211,9 +211,17 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
                 let detail = match &state {
                     State::Cached(record) => {
                         let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
-                        format!("{}  {:>9.1} MB  {:>9}  {}", &record.output[..10], size as f64 / 1e6, seconds(record.seconds), age(record))
+                        format!(
+                            "{}  {:>9.1} MB  {:>9}  {}",
+                            &record.output[..10],
+                            size as f64 / 1e6,
+                            seconds(record.seconds),
+                            age(record)
+                        )
                     }
-                    State::WillRun { key_parts } if session.store.partial(&hash_json(key_parts)).join("work").exists() => "has a checkpoint to go on from".to_owned(),
+                    State::WillRun { key_parts } if session.store.partial(&hash_json(key_parts)).join("work").exists() => {
+                        "has a checkpoint to go on from".to_owned()
+                    }
                     _ => String::new(),
                 };
                 println!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
@@ -223,11 +231,14 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Graph { what, format } => {
             let plan = session.plan(&what)?;
             let states = session.states(&plan)?;
-            print!("{}", match format {
-                GraphFormat::Ascii => ascii(&plan, &states),
-                GraphFormat::Dot => dot(&plan),
-                GraphFormat::Svg => svg(&plan, &states),
-            });
+            print!(
+                "{}",
+                match format {
+                    GraphFormat::Ascii => ascii(&plan, &states),
+                    GraphFormat::Dot => dot(&plan),
+                    GraphFormat::Svg => svg(&plan, &states),
+                }
+            );
             Ok(ExitCode::SUCCESS)
         }
         Verb::Log { stage, what } => {
@@ -280,10 +291,15 @@ fn run_plan(session: &Session, what: &What, options: &Options, out: &Path) -> an
     }
     if let Some((index, failure)) = outcome.failures.first() {
         let skipped = outcome.skipped.len();
-        eprintln!("nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said", plan.nodes[*index].label(), plan.nodes[*index].stage);
+        eprintln!(
+            "nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said",
+            plan.nodes[*index].label(),
+            plan.nodes[*index].stage
+        );
         return Ok(ExitCode::from(failure.code));
     }
-    let ends: BTreeSet<usize> = (0..plan.nodes.len()).filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i))).collect();
+    let ends: BTreeSet<usize> =
+        (0..plan.nodes.len()).filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i))).collect();
     for index in ends {
         let record = outcome.records[index].as_ref().context("every node is done")?;
         let summary = std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).unwrap_or_default();
@@ -305,7 +321,12 @@ fn run_plan(session: &Session, what: &What, options: &Options, out: &Path) -> an
     if outcome.ran.is_empty() && !wrote {
         println!("nothing to run: all {} stages are cached", plan.nodes.len());
     } else {
-        println!("{} of {} stages ran, {} were cached", outcome.ran.len(), plan.nodes.len(), plan.nodes.len() - outcome.ran.len());
+        println!(
+            "{} of {} stages ran, {} were cached",
+            outcome.ran.len(),
+            plan.nodes.len(),
+            plan.nodes.len() - outcome.ran.len()
+        );
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -337,7 +358,10 @@ fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
     let found: Vec<usize> = (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
     if found.is_empty() {
         let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
-        return Err(PlanError::Usage(format!("no stage {stage:?} in this plan; there are: {}", known.into_iter().collect::<Vec<_>>().join(", "))));
+        return Err(PlanError::Usage(format!(
+            "no stage {stage:?} in this plan; there are: {}",
+            known.into_iter().collect::<Vec<_>>().join(", ")
+        )));
     }
     Ok(found)
 }

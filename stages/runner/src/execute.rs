@@ -57,7 +57,9 @@ pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBo
         loop {
             let give_up = stop.load(Ordering::Relaxed) || (!options.keep_going && !outcome.failures.is_empty());
             let ready: Vec<usize> = (0..count)
-                .filter(|&i| matches!(progress[i], Progress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some()))
+                .filter(|&i| {
+                    matches!(progress[i], Progress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some())
+                })
                 .collect();
             let places = if give_up { 0 } else { options.jobs.saturating_sub(running) };
             let starting = &ready[..ready.len().min(places)];
@@ -130,16 +132,21 @@ impl Job<'_> {
             return Ok((record, false));
         }
         let attempt = self.store.begin(&key, &self.node.parameters).map_err(|e| fail(e.to_string()))?;
-        let inputs: Vec<(String, PathBuf)> = self.node.inputs.iter().map(|input| {
-            let folder = match &input.from {
-                From::Node { index, subtree } => {
-                    let object = self.store.object(&output_of(*index));
-                    subtree.as_ref().map_or(object.clone(), |s| object.join(s))
-                }
-                From::Folder(folder) => folder.clone(),
-            };
-            (input.name.clone(), folder)
-        }).collect();
+        let inputs: Vec<(String, PathBuf)> = self
+            .node
+            .inputs
+            .iter()
+            .map(|input| {
+                let folder = match &input.from {
+                    From::Node { index, subtree } => {
+                        let object = self.store.object(&output_of(*index));
+                        subtree.as_ref().map_or(object.clone(), |s| object.join(s))
+                    }
+                    From::Folder(folder) => folder.clone(),
+                };
+                (input.name.clone(), folder)
+            })
+            .collect();
         let call = Call {
             program: &self.node.program,
             params: &attempt.params,
@@ -199,7 +206,8 @@ impl Display {
 
     pub(crate) fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
-            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg} · {eta} left").expect("the template is constant");
+            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg} · {eta} left")
+                .expect("the template is constant");
             bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned()))
         });
         if bar.is_none() {

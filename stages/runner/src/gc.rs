@@ -21,7 +21,8 @@ const GRACE: Duration = Duration::from_secs(3600);
 pub(crate) fn find(store: &Store, keep: &BTreeSet<String>, days: u64) -> Result<Garbage, StoreError> {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
     let old = |unix: u64| now.saturating_sub(unix) >= days * 86_400;
-    let (mut garbage, mut live) = (Garbage { lines: vec![], bytes: 0, records: vec![], objects: vec![], partials: vec![] }, BTreeSet::new());
+    let (mut garbage, mut live) =
+        (Garbage { lines: vec![], bytes: 0, records: vec![], objects: vec![], partials: vec![] }, BTreeSet::new());
     let mut makers: BTreeMap<String, String> = BTreeMap::new();
     for record in store.records()? {
         let key = record.key();
@@ -42,7 +43,12 @@ pub(crate) fn find(store: &Store, keep: &BTreeSet<String>, days: u64) -> Result<
         }
         let bytes = store.manifest(&object).map_or(0, |m| m.size());
         garbage.bytes += bytes;
-        garbage.lines.push(format!("{}  {:>9.1} MB  {}", &object[..10.min(object.len())], bytes as f64 / 1e6, named.map_or("no record names it", String::as_str)));
+        garbage.lines.push(format!(
+            "{}  {:>9.1} MB  {}",
+            &object[..10.min(object.len())],
+            bytes as f64 / 1e6,
+            named.map_or("no record names it", String::as_str)
+        ));
         garbage.objects.push(object);
     }
     for partial in store.partials()? {

@@ -40,7 +40,8 @@ pub(crate) fn dot(plan: &Plan) -> String {
         writeln!(text, "  n{i} [label={:?}];", node.label()).expect("a string can be written");
         for input in &node.inputs {
             if let From::Node { index, subtree } = &input.from {
-                writeln!(text, "  n{index} -> n{i} [label={:?}];", subtree.as_deref().unwrap_or_default()).expect("a string can be written");
+                writeln!(text, "  n{index} -> n{i} [label={:?}];", subtree.as_deref().unwrap_or_default())
+                    .expect("a string can be written");
             }
         }
     }
@@ -60,13 +61,16 @@ pub(crate) fn svg(plan: &Plan, states: &[State]) -> String {
         })
         .collect();
     let (width, height) = (rows.len() * (BOX.0 + GAP.0) + 20, rows.iter().max().unwrap_or(&0) * (BOX.1 + GAP.1) + 20);
-    let mut text = format!("<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\" font-size=\"12\">\n");
+    let mut text = format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\" font-size=\"12\">\n"
+    );
     for (i, node) in plan.nodes.iter().enumerate() {
         for parent in node.parents() {
             let (x1, y1) = (places[parent].0 + BOX.0, places[parent].1 + BOX.1 / 2);
             let (x2, y2) = (places[i].0, places[i].1 + BOX.1 / 2);
             let middle = usize::midpoint(x1, x2);
-            writeln!(text, "<path d=\"M{x1} {y1} C{middle} {y1} {middle} {y2} {x2} {y2}\" fill=\"none\" stroke=\"#888\"/>").expect("a string can be written");
+            writeln!(text, "<path d=\"M{x1} {y1} C{middle} {y1} {middle} {y2} {x2} {y2}\" fill=\"none\" stroke=\"#888\"/>")
+                .expect("a string can be written");
         }
     }
     for (i, node) in plan.nodes.iter().enumerate() {

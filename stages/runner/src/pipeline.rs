@@ -47,8 +47,9 @@ impl Pipeline {
     /// Reads the file. Duplicate keys, unknown keys and types are refused here, with line and column.
     pub fn read(path: &Path) -> Result<Self, PipelineError> {
         let fail = |place: String, problem: String| PipelineError { place, problem };
-        let text = std::fs::read_to_string(path)
-            .map_err(|e| fail(path.display().to_string(), format!("{e}; run in the folder of pipeline.yaml or name it with --pipeline")))?;
+        let text = std::fs::read_to_string(path).map_err(|e| {
+            fail(path.display().to_string(), format!("{e}; run in the folder of pipeline.yaml or name it with --pipeline"))
+        })?;
         let located = |e: serde_yaml::Error| {
             let place = match e.location() {
                 Some(at) => format!("{}:{}", path.display(), at.line()),

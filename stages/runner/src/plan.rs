@@ -134,7 +134,8 @@ impl Plan {
                 return Err(PlanError::Usage(format!("no stage {target:?}; known: {known}")));
             }
         }
-        Expansion { pipeline, programs: &programs, axes: &axes, nodes: Vec::new(), of_stage: BTreeMap::new() }.expand(&order, targets)
+        Expansion { pipeline, programs: &programs, axes: &axes, nodes: Vec::new(), of_stage: BTreeMap::new() }
+            .expand(&order, targets)
     }
 
     /// What is known of each node before a run.
@@ -162,16 +163,19 @@ impl Plan {
 }
 
 /// Content hashes of a node's inputs, given its parents' outputs.
-pub(crate) fn input_hashes(node: &Node, store: &Store, output_of: impl Fn(usize) -> String) -> Result<Vec<(String, String)>, PlanError> {
+pub(crate) fn input_hashes(
+    node: &Node,
+    store: &Store,
+    output_of: impl Fn(usize) -> String,
+) -> Result<Vec<(String, String)>, PlanError> {
     let hash = |input: &NodeInput| match &input.from {
         From::Node { index, subtree: None } => Ok(output_of(*index)),
         From::Node { index, subtree: Some(folder) } => {
             let manifest = store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
             Ok(manifest.subtree(folder).identity())
         }
-        From::Folder(folder) => {
-            crate::sources::hash_source(store, folder).map_err(|e| PlanError::Source(format!("stage {}: input {}: {e}", node.stage, input.name)))
-        }
+        From::Folder(folder) => crate::sources::hash_source(store, folder)
+            .map_err(|e| PlanError::Source(format!("stage {}: input {}: {e}", node.stage, input.name))),
     };
     node.inputs.iter().map(|input| Ok((input.name.clone(), hash(input)?))).collect()
 }
@@ -190,7 +194,8 @@ fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>) ->
     }
     for (name, block) in &pipeline.stages {
         let description = &programs[name].description;
-        let schema = Schema::new(&description.parameters).map_err(|e| pipeline.error(name, None, format!("its parameter schema is {e}")))?;
+        let schema = Schema::new(&description.parameters)
+            .map_err(|e| pipeline.error(name, None, format!("its parameter schema is {e}")))?;
         if let Err(problems) = schema.resolve(&block.parameters) {
             return Err(pipeline.error(name, Some(&problems[0].name), problems[0].to_string()));
         }
@@ -204,7 +209,11 @@ fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>) ->
             }
             let (other, subtree) = split(source);
             let Some(program) = programs.get(other) else {
-                return Err(pipeline.error(name, Some(input), format!("input {input}: no stage {other:?}; a folder begins with ./ or /")));
+                return Err(pipeline.error(
+                    name,
+                    Some(input),
+                    format!("input {input}: no stage {other:?}; a folder begins with ./ or /"),
+                ));
             };
             if description.sink {
                 continue;
@@ -216,10 +225,18 @@ fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>) ->
             };
             let Some(kind) = kind else {
                 let known = output.subtrees.keys().cloned().collect::<Vec<_>>().join(", ");
-                return Err(pipeline.error(name, Some(input), format!("input {input}: {other} has no folder {:?}; known: {known}", subtree.unwrap_or_default())));
+                return Err(pipeline.error(
+                    name,
+                    Some(input),
+                    format!("input {input}: {other} has no folder {:?}; known: {known}", subtree.unwrap_or_default()),
+                ));
             };
             if !port.kinds.contains(kind) {
-                return Err(pipeline.error(name, Some(input), format!("input {input} takes {}, but {source} is {kind}", port.kinds.join(" or "))));
+                return Err(pipeline.error(
+                    name,
+                    Some(input),
+                    format!("input {input} takes {}, but {source} is {kind}", port.kinds.join(" or ")),
+                ));
             }
         }
         for (input, port) in &description.inputs {
@@ -272,7 +289,8 @@ fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, req
     let parameters = request.parameters.iter().map(|text| ("-p", text, true));
     let inputs = request.inputs.iter().map(|text| ("-i", text, false));
     for (flag, text, is_parameter) in parameters.chain(inputs) {
-        let (name, values) = text.split_once('=').ok_or_else(|| PlanError::Usage(format!("{flag} {text}: expected NAME=VALUE[,VALUE…]")))?;
+        let (name, values) =
+            text.split_once('=').ok_or_else(|| PlanError::Usage(format!("{flag} {text}: expected NAME=VALUE[,VALUE…]")))?;
         let has = |stage: &str, name: &str| {
             let description = &programs[stage].description;
             if is_parameter {
@@ -289,7 +307,10 @@ fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, req
             [stage] => stage.clone(),
             [] => {
                 let what = if is_parameter { "parameter" } else { "input" };
-                return Err(PlanError::Usage(format!("{flag} {name}: no stage has such {} {what}; see `STAGE --help`", if is_parameter { "a" } else { "an" })));
+                return Err(PlanError::Usage(format!(
+                    "{flag} {name}: no stage has such {} {what}; see `STAGE --help`",
+                    if is_parameter { "a" } else { "an" }
+                )));
             }
             _ => {
                 let options = stages.iter().map(|s| format!("{s}.{own}")).collect::<Vec<_>>().join(", ");
@@ -322,14 +343,21 @@ impl Expansion<'_> {
         let mut wanted: BTreeSet<String> = targets.iter().cloned().collect();
         for stage in order.iter().rev().filter(|s| pipeline_has(self.pipeline, s)) {
             if wanted.contains(stage) {
-                wanted.extend(self.block_inputs(stage).into_iter().filter(|(_, s)| as_path(s).is_none()).map(|(_, s)| split(&s).0.to_owned()));
+                wanted.extend(
+                    self.block_inputs(stage)
+                        .into_iter()
+                        .filter(|(_, s)| as_path(s).is_none())
+                        .map(|(_, s)| split(&s).0.to_owned()),
+                );
             }
         }
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
             let program = Arc::clone(&self.programs[stage]);
             if program.description.sink {
-                let shows = needs(self.pipeline, stage).flat_map(|s| self.of_stage[&s].iter().map(|(_, node)| *node).collect::<Vec<_>>()).collect();
+                let shows = needs(self.pipeline, stage)
+                    .flat_map(|s| self.of_stage[&s].iter().map(|(_, node)| *node).collect::<Vec<_>>())
+                    .collect();
                 let parameters = self.resolve(stage, &BTreeMap::new())?;
                 sinks.push(Sink { stage: stage.clone(), program, parameters, shows });
             } else {
@@ -355,7 +383,16 @@ impl Expansion<'_> {
         let mut points: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new()];
         for axis in reach {
             let values = 0..self.axes[axis].values.len();
-            points = points.into_iter().flat_map(|point| values.clone().map(move |v| { let mut p = point.clone(); p.insert(axis, v); p })).collect();
+            points = points
+                .into_iter()
+                .flat_map(|point| {
+                    values.clone().map(move |v| {
+                        let mut p = point.clone();
+                        p.insert(axis, v);
+                        p
+                    })
+                })
+                .collect();
         }
         for point in points {
             let mut sources: Vec<NodeInput> = Vec::new();
@@ -365,7 +402,10 @@ impl Expansion<'_> {
                     None => {
                         let (other, subtree) = split(source);
                         let fits = |values: &BTreeMap<usize, usize>| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
-                        let (_, index) = self.of_stage[other].iter().find(|(values, _)| fits(values)).expect("a parent's axes reach its children");
+                        let (_, index) = self.of_stage[other]
+                            .iter()
+                            .find(|(values, _)| fits(values))
+                            .expect("a parent's axes reach its children");
                         From::Node { index: *index, subtree: subtree.map(str::to_owned) }
                     }
                 };
@@ -373,14 +413,26 @@ impl Expansion<'_> {
             }
             for (axis, value) in &point {
                 if let (true, What::Input(name)) = (self.axes[*axis].stage == stage, &self.axes[*axis].what) {
-                    sources.push(NodeInput { name: name.clone(), from: From::Folder(PathBuf::from(&self.axes[*axis].values[*value])) });
+                    sources.push(NodeInput {
+                        name: name.clone(),
+                        from: From::Folder(PathBuf::from(&self.axes[*axis].values[*value])),
+                    });
                 }
             }
             sources.sort_by(|a, b| a.name.cmp(&b.name));
             let swept = point.iter().filter(|(axis, _)| self.axes[**axis].values.len() > 1);
-            let label = swept.map(|(a, v)| format!("{}={}", self.axes[*a].label, self.axes[*a].values[*v])).collect::<Vec<_>>().join(", ");
+            let label = swept
+                .map(|(a, v)| format!("{}={}", self.axes[*a].label, self.axes[*a].values[*v]))
+                .collect::<Vec<_>>()
+                .join(", ");
             let parameters = self.resolve(stage, &point)?;
-            self.nodes.push(Node { stage: stage.to_owned(), point: label, parameters, inputs: sources, program: Arc::clone(program) });
+            self.nodes.push(Node {
+                stage: stage.to_owned(),
+                point: label,
+                parameters,
+                inputs: sources,
+                program: Arc::clone(program),
+            });
             self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len() - 1));
         }
         Ok(())

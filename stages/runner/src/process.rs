@@ -80,7 +80,8 @@ impl Call<'_> {
             return Ok(());
         }
         let code = status.code().and_then(|c| u8::try_from(c).ok()).unwrap_or(1);
-        let message = if last_words.is_empty() { format!("{} ended with {status}", self.program.description.name) } else { last_words };
+        let message =
+            if last_words.is_empty() { format!("{} ended with {status}", self.program.description.name) } else { last_words };
         Err(StageFailure { code, message })
     }
 
@@ -125,5 +126,8 @@ fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ExitStatus> {
 /// Lines of a pipe; bytes that aren't UTF-8 are replaced, not refused.
 fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
     let reader = pipe.map(BufReader::new);
-    reader.into_iter().flat_map(|r| r.split(b'\n').map_while(Result::ok)).map(|l| String::from_utf8_lossy(&l).trim_end().to_owned())
+    reader
+        .into_iter()
+        .flat_map(|r| r.split(b'\n').map_while(Result::ok))
+        .map(|l| String::from_utf8_lossy(&l).trim_end().to_owned())
 }

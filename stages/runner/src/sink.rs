@@ -96,7 +96,15 @@ pub(crate) enum Shown {
 }
 
 /// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store, out: &Path, options: &Options, stop: &AtomicBool) -> Result<Shown, StageFailure> {
+pub(crate) fn show(
+    plan: &Plan,
+    sink: &Sink,
+    outcome: &Outcome,
+    store: &Store,
+    out: &Path,
+    options: &Options,
+    stop: &AtomicBool,
+) -> Result<Shown, StageFailure> {
     let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
     let Some(record) = record(plan, sink, outcome, store) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
@@ -116,7 +124,15 @@ pub(crate) fn show(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store, o
     let display = Display::new();
     let view = display.start(&sink.stage);
     let inputs = [("run".to_owned(), run)];
-    let call = Call { program: &sink.program, params: &params, inputs: &inputs, output: &output, work: None, device: &options.device, threads: options.threads };
+    let call = Call {
+        program: &sink.program,
+        params: &params,
+        inputs: &inputs,
+        output: &output,
+        work: None,
+        device: &options.device,
+        threads: options.threads,
+    };
     let result = call.run(&scratch.join("log"), &view, stop);
     view.end();
     result?;

@@ -30,7 +30,8 @@ pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String
     }
     let content = hash_json(&hash_folder(&absolute).map_err(fail)?);
     // A file changed within the clock's grain could change again unseen; such a listing isn't kept.
-    let settled = SystemTime::now().duration_since(UNIX_EPOCH).is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
+    let settled =
+        SystemTime::now().duration_since(UNIX_EPOCH).is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
     if settled {
         cache.0.insert(absolute, Entry { listing, content: content.clone() });
         if let Ok(bytes) = serde_json::to_vec(&cache) {

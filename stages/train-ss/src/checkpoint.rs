@@ -64,9 +64,10 @@ impl Checkpoints {
         }
         // The curve of the checkpoint's step proves that the pair is whole; look for it before the trainer is touched.
         let step = radiance::Trainer::checkpoint_step(&path);
-        let curve = step.as_ref().ok().and_then(|step| {
-            serde_json::from_slice(&std::fs::read(folder.join(format!("curve-{step}.json"))).ok()?).ok()
-        });
+        let curve = step
+            .as_ref()
+            .ok()
+            .and_then(|step| serde_json::from_slice(&std::fs::read(folder.join(format!("curve-{step}.json"))).ok()?).ok());
         match curve.map(|curve: Curve| trainer.resume(&path).map(|()| curve)) {
             Some(Ok(curve)) => {
                 say(&format!("going on from step {}", trainer.steps()));

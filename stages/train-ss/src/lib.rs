@@ -190,7 +190,10 @@ impl Stage for TrainSs {
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         context.write_summary(&format!(
             "supersample {}: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
-            params.supersample, log.rays as f64 / 1e6, log.steps, log.samples_per_ray
+            params.supersample,
+            log.rays as f64 / 1e6,
+            log.steps,
+            log.samples_per_ray
         ))
     }
 }
@@ -213,11 +216,19 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
         };
         let k = view.camera.intrinsics;
         if (straight.width, straight.height) != (k.width as usize, k.height as usize) {
-            let message = format!("{}: {}×{} pixels where its camera has {}×{}", path.display(), straight.width, straight.height, k.width, k.height);
+            let message = format!(
+                "{}: {}×{} pixels where its camera has {}×{}",
+                path.display(),
+                straight.width,
+                straight.height,
+                k.width,
+                k.height
+            );
             return Err(Failure::BadInput(message).into());
         }
         if views.background == scene::Background::Alpha {
-            let premultiplied = straight.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
+            let premultiplied =
+                straight.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
             return Ok(Picture::new(straight.width, straight.height, 4, premultiplied));
         }
         Ok(straight.over(views.background.shown()))
@@ -257,7 +268,8 @@ fn train(context: &Context, params: &Params, trainer: &mut Trainer, supervision:
         })?;
         let Some(report) = report else { break };
         if report.skipped {
-            context.say(format!("step {}: something wasn't finite; the step was thrown away and the rate halved", trainer.steps()));
+            context
+                .say(format!("step {}: something wasn't finite; the step was thrown away and the rate halved", trainer.steps()));
         }
         let rays = trainer.rays_done(group);
         curve.add(&report, rays, total);

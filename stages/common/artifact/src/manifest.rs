@@ -50,7 +50,9 @@ pub enum Damage {
         source: io::Error,
     },
     /// The size differs.
-    #[error("{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    #[error(
+        "{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: `nerf-sr verify --remove`, then run again"
+    )]
     Size {
         /// The file.
         path: PathBuf,
@@ -60,7 +62,9 @@ pub enum Damage {
         found: u64,
     },
     /// The content differs.
-    #[error("{path}: the content is not what was written (blake3 differs); the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    #[error(
+        "{path}: the content is not what was written (blake3 differs); the artifact is damaged: `nerf-sr verify --remove`, then run again"
+    )]
     Content {
         /// The file.
         path: PathBuf,
@@ -109,9 +113,7 @@ impl Manifest {
     /// The manifest of a folder inside the artifact, its kind `KIND/FOLDER`.
     pub fn subtree(&self, folder: &str) -> Self {
         let prefix = format!("{folder}/");
-        let inside = |f: &FileEntry| {
-            f.path.strip_prefix(&prefix).map(|path| FileEntry { path: path.to_owned(), ..f.clone() })
-        };
+        let inside = |f: &FileEntry| f.path.strip_prefix(&prefix).map(|path| FileEntry { path: path.to_owned(), ..f.clone() });
         Self {
             kind: format!("{}/{folder}", self.kind),
             schema: self.schema,

@@ -52,10 +52,25 @@ impl Schema {
         for error in self.validator.iter_errors(&resolved) {
             let path = error.instance_path().to_string();
             let name = path.trim_start_matches('/').to_owned();
+            let problem = match self.choices(&name) {
+                Some(choices) => format!("{} is not one of {}", error.instance(), choices.join(", ")),
+                None => error.to_string(),
+            };
             let name = if name.is_empty() { "(all)".to_owned() } else { name };
-            problems.push(ParameterProblem { name, problem: error.to_string() });
+            problems.push(ParameterProblem { name, problem });
         }
         if problems.is_empty() { Ok(resolved) } else { Err(problems) }
+    }
+
+    /// The words a parameter may be, where it is a choice: the validator itself only says that no alternative fits.
+    fn choices(&self, name: &str) -> Option<Vec<String>> {
+        let property = self.properties()?.get(name)?;
+        let definition = property.get("$ref").and_then(Value::as_str).and_then(|r| self.schema.pointer(r.strip_prefix('#')?));
+        let definition = definition.unwrap_or(property);
+        if let Some(words) = definition.get("enum").and_then(Value::as_array) {
+            return Some(words.iter().map(ToString::to_string).collect());
+        }
+        definition.get("oneOf")?.as_array()?.iter().map(|one| one.get("const").map(ToString::to_string)).collect()
     }
 
     fn properties(&self) -> Option<&Map<String, Value>> {
@@ -74,8 +89,9 @@ mod tests {
             "additionalProperties": false,
             "properties": {
                 "scale": {"type": "integer", "minimum": 1, "default": 2},
-                "kernel": {"type": "string", "enum": ["box", "lanczos"], "default": "lanczos"}
-            }
+                "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"}
+            },
+            "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"}, {"const": "lanczos", "type": "string"}]}}
         }))
         .unwrap()
     }
@@ -95,7 +111,7 @@ mod tests {
             (json!({"kernal": "box"}), "kernal", "known: kernel, scale"),
             (json!({"scale": 0}), "scale", "minimum"),
             (json!({"scale": "two"}), "scale", "integer"),
-            (json!({"kernel": "gauss"}), "kernel", "lanczos"),
+            (json!({"kernel": "gauss"}), "kernel", r#""gauss" is not one of "box", "lanczos""#),
         ] {
             let problems = resolve(given).unwrap_err();
             assert_eq!(problems[0].name, name);

@@ -162,7 +162,8 @@ impl GivenInput {
 impl Context {
     /// An input that must be there.
     pub fn input(&self, name: &str) -> anyhow::Result<&GivenInput> {
-        self.optional_input(name).ok_or_else(|| Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into())
+        self.optional_input(name)
+            .ok_or_else(|| Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into())
     }
 
     /// An input that may be left out.
@@ -280,8 +281,7 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     let mut inputs = BTreeMap::new();
     let mut folders = Vec::new();
     for text in &arguments.inputs {
-        let (name, folder) =
-            text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
+        let (name, folder) = text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
         if !description.inputs.contains_key(name) {
             let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
             return Err(Failure::Usage(format!("--input {name}: no such input; known: {known}")).into());
@@ -357,7 +357,8 @@ impl Staging {
         if output.exists() {
             return Err(Failure::Usage(format!("--output {}: exists already; name a new folder", output.display())).into());
         }
-        let name = output.file_name().ok_or_else(|| Failure::Usage(format!("--output {}: not a folder name", output.display())))?;
+        let name =
+            output.file_name().ok_or_else(|| Failure::Usage(format!("--output {}: not a folder name", output.display())))?;
         let folder = output.with_file_name(format!(".{}.partial", name.to_string_lossy()));
         if folder.exists() {
             fs::remove_dir_all(&folder).with_context(|| format!("cannot clear {}", folder.display()))?;

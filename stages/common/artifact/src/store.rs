@@ -215,7 +215,10 @@ impl Store {
         }
         let stated = Manifest::read(output)?;
         if stated != found {
-            return Err(StoreError::NoArtifact(format!("{} differs from the files beside it, or its kind is not {kind:?}", MANIFEST_FILE)));
+            return Err(StoreError::NoArtifact(format!(
+                "{} differs from the files beside it, or its kind is not {kind:?}",
+                MANIFEST_FILE
+            )));
         }
         if found.files.is_empty() {
             return Err(StoreError::NoArtifact("it has no files".to_owned()));

@@ -24,11 +24,8 @@ const BUILD_ENV: [&str; 5] = ["TARGET", "PROFILE", "OPT_LEVEL", "DEBUG", "CARGO_
 /// When called outside a Cargo build script or when a manifest can't be read: the build must not go on with a shorter key.
 pub fn emit() {
     let crate_dir = PathBuf::from(env::var("CARGO_MANIFEST_DIR").expect("fingerprint::emit runs in a build script"));
-    let root = crate_dir
-        .ancestors()
-        .find(|dir| dir.join("Cargo.lock").is_file())
-        .expect("the workspace has a Cargo.lock")
-        .to_path_buf();
+    let root =
+        crate_dir.ancestors().find(|dir| dir.join("Cargo.lock").is_file()).expect("the workspace has a Cargo.lock").to_path_buf();
     println!("cargo:rerun-if-changed={}", root.join("Cargo.lock").display());
     println!("cargo:rerun-if-changed={}", root.join("Cargo.toml").display());
 
@@ -106,11 +103,9 @@ fn workspace_crates(root: &Path, workspace: &Table, start: &Path) -> BTreeMap<St
                 dependencies.push(name.clone());
                 let path = match spec.get("path") {
                     Some(path) => path.as_str().map(|p| dir.join(p)),
-                    None => shared
-                        .and_then(|s| s.get(name))
-                        .and_then(|s| s.get("path"))
-                        .and_then(Value::as_str)
-                        .map(|p| root.join(p)),
+                    None => {
+                        shared.and_then(|s| s.get(name)).and_then(|s| s.get("path")).and_then(Value::as_str).map(|p| root.join(p))
+                    }
                 };
                 waiting.extend(path);
             }

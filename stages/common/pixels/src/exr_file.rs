@@ -4,9 +4,9 @@ use std::path::Path;
 
 use exr::block::UncompressedBlock;
 use exr::block::writer::ChunksWriter as _;
+use exr::meta::BlockDescription;
 use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, LineOrder, Text};
 use exr::meta::header::Header;
-use exr::meta::BlockDescription;
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
 use crate::{MAX_PIXELS, PixelError};
@@ -159,12 +159,8 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .map_err(|e| exr_error(path, e))?;
     let layer = image.layer_data.into_iter().next().ok_or_else(|| format("it has no layer".to_owned()))?;
     let (width, height) = (layer.size.width(), layer.size.height());
-    let channels = layer
-        .channel_data
-        .list
-        .into_iter()
-        .map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect()))
-        .collect();
+    let channels =
+        layer.channel_data.list.into_iter().map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect())).collect();
     Ok(ExrImage { width, height, channels })
 }
 

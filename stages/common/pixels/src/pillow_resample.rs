@@ -77,8 +77,7 @@ fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
             // `as` truncates towards zero and saturates at 0, as the C code's cast and clamp do.
             let first = (centre - support + 0.5) as usize;
             let end = ((centre + support + 0.5) as usize).min(input);
-            let raw: Vec<f64> =
-                (first..end).map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch))).collect();
+            let raw: Vec<f64> = (first..end).map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch))).collect();
             let sum: f64 = raw.iter().sum();
             let fixed = |w: f64| {
                 let w = if sum == 0.0 { w } else { w / sum } * f64::from(1 << PRECISION_BITS);

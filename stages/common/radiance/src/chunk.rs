@@ -163,7 +163,14 @@ impl Chunk {
     fn shade(&mut self, field: &Field, rays: &[UnitRay], n: usize) {
         let m = self.kept.len().next_multiple_of(LANES);
         let input = fit(&mut self.colour_in, COLOUR_INPUTS * m);
-        gather(&self.kept, &self.density[n.min(self.density.len())..], n, DENSITY_OUTPUTS - 1, &mut input[..(DENSITY_OUTPUTS - 1) * m], m);
+        gather(
+            &self.kept,
+            &self.density[n.min(self.density.len())..],
+            n,
+            DENSITY_OUTPUTS - 1,
+            &mut input[..(DENSITY_OUTPUTS - 1) * m],
+            m,
+        );
         let directions = &mut input[(DENSITY_OUTPUTS - 1) * m..];
         for (ray, range) in rays.iter().zip(self.kept_starts.windows(2)) {
             if range[0] < range[1] {
@@ -199,7 +206,15 @@ impl Chunk {
 
     /// Goes back from each ray's colour gradient: adds to the networks' partial sums (`lanes`) and appends to `into`.
     /// `transposed` are the weights output by output.
-    pub(crate) fn backward(&mut self, field: &Field, transposed: &[f32], colour_gradients: &[[f32; 3]], backgrounds: &[[f32; 3]], lanes: &mut [f32], into: &mut FeatureGradients) {
+    pub(crate) fn backward(
+        &mut self,
+        field: &Field,
+        transposed: &[f32],
+        colour_gradients: &[[f32; 3]],
+        backgrounds: &[[f32; 3]],
+        lanes: &mut [f32],
+        into: &mut FeatureGradients,
+    ) {
         let count = self.kept.len();
         if count == 0 {
             return;
@@ -234,7 +249,13 @@ impl Chunk {
             }
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
-            optical_depth_gradients(&shade[..len], &transmittance[..len], &weight[..len], behind, &mut tau_gradient[range[0]..range[1]]);
+            optical_depth_gradients(
+                &shade[..len],
+                &transmittance[..len],
+                &weight[..len],
+                behind,
+                &mut tau_gradient[range[0]..range[1]],
+            );
         }
 
         let [first, second, third] = field.layers.colour;

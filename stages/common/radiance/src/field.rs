@@ -213,7 +213,10 @@ impl Field {
     /// Writes `field.safetensors`: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest). No metadata, so bytes repeat.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
-        write_tensors(path, &[("grid", Tensor::F32(&self.grid)), ("network", Tensor::F32(&self.network)), ("occupancy", Tensor::U8(&occupancy))])
+        write_tensors(
+            path,
+            &[("grid", Tensor::F32(&self.grid)), ("network", Tensor::F32(&self.network)), ("occupancy", Tensor::U8(&occupancy))],
+        )
     }
 
     /// Reads what [`Field::write`] wrote; sizes must fit the architecture and numbers be finite.

@@ -197,7 +197,10 @@ mod tests {
             encode(&level, &table, &rows(&p), &mut out, n);
             let mut gradient = vec![0.0; table.len()];
             scatter(&level, &mut gradient, &p, &d);
-            let left: f64 = (0..n).flat_map(|s| (0..4).map(move |k| (s, k))).map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k])).sum();
+            let left: f64 = (0..n)
+                .flat_map(|s| (0..4).map(move |k| (s, k)))
+                .map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k]))
+                .sum();
             let right: f64 = table.iter().zip(&gradient).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
             assert!((left - right).abs() < 1e-5 * left.abs().max(1.0), "{left} {right} {level:?}");
         }

@@ -38,7 +38,7 @@ mod spherical;
 mod trainer;
 
 pub use field::{Architecture, Field, FieldError, Pixel};
-pub use field_file::{FieldFile, FieldKind, FIELD_FILE};
+pub use field_file::{FIELD_FILE, FieldFile, FieldKind};
 pub use random::{Draws, uniform};
 pub use simd::{Family, set_family};
 pub use space::{Ray, Space};

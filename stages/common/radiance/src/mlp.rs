@@ -26,7 +26,15 @@ pub(crate) enum After<'a> {
 
 /// TO outputs of TV vectors of samples, all in registers. The sum over inputs has one order, whatever the tile.
 #[inline(always)]
-fn tile<L: Lanes, const TO: usize, const TV: usize>(w: &[f32], x: &[f32], y: &mut [f32], (inputs, outputs, n): (usize, usize, usize), s: usize, j: usize, after: After<'_>) {
+fn tile<L: Lanes, const TO: usize, const TV: usize>(
+    w: &[f32],
+    x: &[f32],
+    y: &mut [f32],
+    (inputs, outputs, n): (usize, usize, usize),
+    s: usize,
+    j: usize,
+    after: After<'_>,
+) {
     let mut acc = [[L::splat(0.0); TV]; TO];
     for i in 0..inputs {
         let xs: [L; TV] = std::array::from_fn(|v| row(x, i * n + s + v * LANES));
@@ -52,7 +60,14 @@ fn tile<L: Lanes, const TO: usize, const TV: usize>(w: &[f32], x: &[f32], y: &mu
 }
 
 #[inline(always)]
-fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(w: &[f32], x: &[f32], y: &mut [f32], shape: (usize, usize, usize), s: usize, after: After<'_>) {
+fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(
+    w: &[f32],
+    x: &[f32],
+    y: &mut [f32],
+    shape: (usize, usize, usize),
+    s: usize,
+    after: After<'_>,
+) {
     let outputs = shape.1;
     let mut j = 0;
     while j + TO <= outputs {
@@ -88,7 +103,14 @@ kernel! {
 }
 
 #[inline(always)]
-fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(x: &[f32], dy: &[f32], lanes: &mut [f32], (outputs, n): (usize, usize), i: usize, j: usize) {
+fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
+    x: &[f32],
+    dy: &[f32],
+    lanes: &mut [f32],
+    (outputs, n): (usize, usize),
+    i: usize,
+    j: usize,
+) {
     let mut acc = [[L::splat(0.0); TJ]; TI];
     let mut s = 0;
     while s < n {
@@ -110,7 +132,13 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(x: &[f32], dy: &[f32],
 }
 
 #[inline(always)]
-fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(x: &[f32], dy: &[f32], lanes: &mut [f32], shape: (usize, usize), i: usize) {
+fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(
+    x: &[f32],
+    dy: &[f32],
+    lanes: &mut [f32],
+    shape: (usize, usize),
+    i: usize,
+) {
     let mut j = 0;
     while j + TJ <= shape.0 {
         outer_tile::<L, TI, TJ>(x, dy, lanes, shape, i, j);
@@ -210,7 +238,13 @@ mod tests {
                         let expected = match after {
                             After::Linear => sum,
                             After::Relu => sum.max(0.0),
-                            After::Gate(gate) => if gate[j * n + s] > 0.0 { sum } else { 0.0 },
+                            After::Gate(gate) => {
+                                if gate[j * n + s] > 0.0 {
+                                    sum
+                                } else {
+                                    0.0
+                                }
+                            }
                         };
                         assert!((f64::from(y[j * n + s]) - expected).abs() < 1e-5);
                     }

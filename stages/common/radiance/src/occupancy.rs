@@ -127,7 +127,8 @@ mod tests {
             let all = (0..2000).map(|k| (k as f32 + 0.3).mul_add(step, 0.0)).take_while(|t| *t < leave);
             let expected: Vec<f32> = all
                 .filter(|&t| {
-                    let c: Vec<usize> = (0..3).map(|i| (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize).collect();
+                    let c: Vec<usize> =
+                        (0..3).map(|i| (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize).collect();
                     occupancy.is_occupied(c[0] + GRID * (c[1] + GRID * c[2]))
                 })
                 .collect();

@@ -24,7 +24,12 @@ impl Judge<'_> {
         for corner in 0..8u32 {
             let d = [corner & 1, corner >> 1 & 1, corner >> 2];
             let v: [u32; 3] = std::array::from_fn(|i| cell[i] + d[i]);
-            let w: f64 = (0..3).map(|i| { let f = at[i] - f64::from(cell[i]); if d[i] == 1 { f } else { 1.0 - f } }).product();
+            let w: f64 = (0..3)
+                .map(|i| {
+                    let f = at[i] - f64::from(cell[i]);
+                    if d[i] == 1 { f } else { 1.0 - f }
+                })
+                .product();
             let side = level.resolution + 1;
             let index = if level.hashed {
                 (v[0] ^ v[1].wrapping_mul(2_654_435_761) ^ v[2].wrapping_mul(805_459_861)) as usize % level.entries
@@ -115,7 +120,9 @@ fn fused_passes_equal_the_plain_ones() {
     let mut draws = Draws::new(1, 1, 1);
     let g: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| draws.uniform() - 0.5)).collect();
     let loss = |judge: &Judge<'_>| -> f64 {
-        let dot = |i: usize| -> f64 { judge.ray(&rays[i], &samples[i], &kept[i]).iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum() };
+        let dot = |i: usize| -> f64 {
+            judge.ray(&rays[i], &samples[i], &kept[i]).iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum()
+        };
         (0..rays.len()).map(dot).sum()
     };
     for (i, sum) in chunk.sums.iter().enumerate() {
@@ -158,7 +165,12 @@ fn fused_passes_equal_the_plain_ones() {
             norm += exact.powi(2);
             checked += 1;
         }
-        assert!(checked > 50 && error.sqrt() < 1e-5 * norm.sqrt(), "{which}: {} of {}, {checked} checked", error.sqrt(), norm.sqrt());
+        assert!(
+            checked > 50 && error.sqrt() < 1e-5 * norm.sqrt(),
+            "{which}: {} of {}, {checked} checked",
+            error.sqrt(),
+            norm.sqrt()
+        );
     }
 }
 
@@ -201,8 +213,10 @@ fn extremes_stay_finite() {
             field.network.fill(raw / 1e3);
             let s = scale as f32;
             let directions = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [0.0; 3], [f32::NAN, 0.0, 1.0], [0.577, 0.577, 0.577]];
-            let rays: Vec<Ray> =
-                directions.iter().map(|&direction| Ray { origin: [0.0, 0.0, 4.0 * s], direction, background: [1.0; 3] }).collect();
+            let rays: Vec<Ray> = directions
+                .iter()
+                .map(|&direction| Ray { origin: [0.0, 0.0, 4.0 * s], direction, background: [1.0; 3] })
+                .collect();
             for (pixel, ray) in field.render(&rays).iter().zip(&rays) {
                 let numbers = [pixel.colour[0], pixel.colour[1], pixel.colour[2], pixel.opacity, pixel.depth, pixel.median_depth];
                 assert!(numbers.iter().all(|x| x.is_finite()), "{raw} {scale} {ray:?}: {pixel:?}");

@@ -214,9 +214,7 @@ pub(crate) mod x86 {
         #[inline(always)]
         fn where_positive(self, gate: Self) -> Self {
             // SAFETY: the caller runs with AVX2.
-            Self([0, 1].map(|i| unsafe {
-                _mm256_and_ps(self.0[i], _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[i], _mm256_setzero_ps()))
-            }))
+            Self([0, 1].map(|i| unsafe { _mm256_and_ps(self.0[i], _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[i], _mm256_setzero_ps())) }))
         }
     }
 }

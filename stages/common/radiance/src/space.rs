@@ -100,7 +100,13 @@ mod tests {
             assert!((hit.enter - 1.5).abs() < 1e-5 && (hit.leave - 2.5).abs() < 1e-5, "{hit:?}");
             // Starting inside, missing, parallel to a face inside and outside, behind, zero length, NaN.
             assert_eq!(space.clip(&ray([0.; 3], [1., 0., 0.])).enter, 0.0);
-            for (o, d) in [([0., 3., 4.], [0., 0., -1.]), ([2., 0., 0.], [0., 1., 0.]), ([0., 0., 4.], [0., 0., 1.]), ([0.; 3], [0.; 3]), ([0.; 3], [f32::NAN, 0., 1.])] {
+            for (o, d) in [
+                ([0., 3., 4.], [0., 0., -1.]),
+                ([2., 0., 0.], [0., 1., 0.]),
+                ([0., 0., 4.], [0., 0., 1.]),
+                ([0.; 3], [0.; 3]),
+                ([0.; 3], [f32::NAN, 0., 1.]),
+            ] {
                 let miss = space.clip(&ray(o.map(|x| x * s), d));
                 assert!(miss.enter >= miss.leave, "{o:?} {d:?}: {miss:?}");
             }

@@ -257,11 +257,18 @@ impl Trainer {
         let rate = options.rate * self.rate_scale * warm * options.final_rate.powf(progress.min(1.0));
         let grid_step = AdamStep::new(self.step + 1, rate, options.grid_decay);
         let network_step = AdamStep::new(self.step + 1, rate, options.network_decay);
-        adam(&network_step, &mut self.field.network, &mut self.gradients.network, &mut self.first.network, &mut self.second.network);
+        adam(
+            &network_step,
+            &mut self.field.network,
+            &mut self.gradients.network,
+            &mut self.first.network,
+            &mut self.second.network,
+        );
 
         let shards = &self.shards;
         let mut work = Vec::with_capacity(self.field.levels.len());
-        let mut grids = (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
+        let mut grids =
+            (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
         for (i, level) in self.field.levels.iter().enumerate() {
             let len = level.entries * crate::grid::FEATURES;
             let (w, rest_w) = grids.0.split_at_mut(len);
@@ -320,7 +327,8 @@ impl Trainer {
         // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
         let threshold = mean.min(0.01 / self.field.step());
         self.field.occupancy.density = density;
-        let occupied: Vec<bool> = self.field.occupancy.density.iter().enumerate().map(|(i, &d)| d >= threshold && hull.is_none_or(|h| h[i])).collect();
+        let occupied: Vec<bool> =
+            self.field.occupancy.density.iter().enumerate().map(|(i, &d)| d >= threshold && hull.is_none_or(|h| h[i])).collect();
         self.field.occupancy.set(|cell| occupied[cell]);
     }
 
@@ -337,17 +345,20 @@ impl Trainer {
         .flat_map(|v| v.to_le_bytes())
         .collect();
         let occupied = self.field.occupancy.to_bytes();
-        write_tensors(path, &[
-            ("counters", Tensor::U8(&counters)),
-            ("density", Tensor::F32(&self.field.occupancy.density)),
-            ("first.grid", Tensor::F32(&self.first.grid)),
-            ("first.network", Tensor::F32(&self.first.network)),
-            ("grid", Tensor::F32(&self.field.grid)),
-            ("network", Tensor::F32(&self.field.network)),
-            ("occupied", Tensor::U8(&occupied)),
-            ("second.grid", Tensor::F32(&self.second.grid)),
-            ("second.network", Tensor::F32(&self.second.network)),
-        ])
+        write_tensors(
+            path,
+            &[
+                ("counters", Tensor::U8(&counters)),
+                ("density", Tensor::F32(&self.field.occupancy.density)),
+                ("first.grid", Tensor::F32(&self.first.grid)),
+                ("first.network", Tensor::F32(&self.first.network)),
+                ("grid", Tensor::F32(&self.field.grid)),
+                ("network", Tensor::F32(&self.field.network)),
+                ("occupied", Tensor::U8(&occupied)),
+                ("second.grid", Tensor::F32(&self.second.grid)),
+                ("second.network", Tensor::F32(&self.second.network)),
+            ],
+        )
     }
 
     /// The step a checkpoint was written at.
@@ -398,7 +409,17 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
 
 impl Shard {
     #[allow(clippy::too_many_arguments, reason = "what a shard reads of the trainer, which is borrowed elsewhere")]
-    fn run(&mut self, worker: &mut Worker, field: &Field, transposed: &[f32], supervision: &impl Supervision, seed: u64, first_group: u64, range: std::ops::Range<usize>, groups: usize) {
+    fn run(
+        &mut self,
+        worker: &mut Worker,
+        field: &Field,
+        transposed: &[f32],
+        supervision: &impl Supervision,
+        seed: u64,
+        first_group: u64,
+        range: std::ops::Range<usize>,
+        groups: usize,
+    ) {
         let group = supervision.rays_per_group();
         self.features.positions.clear();
         self.features.levels.iter_mut().for_each(Vec::clear);
@@ -432,10 +453,18 @@ impl Shard {
             }
             for (k, g) in here.clone().enumerate() {
                 let part = k * group..(k + 1) * group;
-                self.loss += supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
+                self.loss +=
+                    supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
             }
             worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
-            worker.chunk.backward(field, transposed, &worker.gradients, &worker.backgrounds, &mut worker.lanes, &mut self.features);
+            worker.chunk.backward(
+                field,
+                transposed,
+                &worker.gradients,
+                &worker.backgrounds,
+                &mut worker.lanes,
+                &mut self.features,
+            );
             next = here.end;
         }
         drain_lanes(&mut worker.lanes, &mut self.network);

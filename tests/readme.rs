@@ -1,0 +1,96 @@
+//! The README tells the truth: its commands parse and plan, its pipeline blocks are valid, the files it names are there.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use common::Project;
+
+fn readme() -> String {
+    std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).unwrap()
+}
+
+/// Contents of the fenced blocks of a language.
+fn blocks(text: &str, language: &str) -> Vec<String> {
+    let fence = format!("```{language}\n");
+    text.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
+}
+
+#[test]
+fn every_command_plans() {
+    let project =
+        Project::new(&std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("pipeline.yaml")).unwrap());
+    // Folders that the examples name.
+    for folder in ["my-scene", "weights", "../shared/data/nerf_synthetic/lego", "../shared/data/weights"] {
+        let target = project.path("project").join(folder);
+        std::fs::create_dir_all(&target).unwrap();
+        std::fs::write(target.join("x"), "").unwrap();
+    }
+    std::fs::rename(project.path("pipeline.yaml"), project.path("project/pipeline.yaml")).unwrap();
+    let mut planned = 0;
+    for block in blocks(&readme(), "sh") {
+        let joined = block.replace("\\\n", " ");
+        for line in joined.lines().map(|l| l.split('#').next().unwrap().trim()) {
+            let Some(rest) = line.strip_prefix("nerf-sr ").or_else(|| line.strip_prefix("target/release/nerf-sr ")) else {
+                assert!(
+                    line.is_empty()
+                        || line.starts_with("make ")
+                        || line.starts_with("export ")
+                        || line.contains("--help")
+                        || line.contains("describe"),
+                    "{line}"
+                );
+                continue;
+            };
+            let mut words: Vec<&str> = rest.split_whitespace().collect();
+            // `run` would train for minutes; the plan is the same code up to running. It has no use for run's own options.
+            if words[0] == "run" {
+                words[0] = "plan";
+                while let Some(at) = words.iter().position(|w| ["-j", "--out"].contains(w)) {
+                    words.drain(at..at + 2);
+                }
+            }
+            let output = project.command(&words).current_dir(project.path("project")).output().unwrap();
+            assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
+            planned += 1;
+        }
+    }
+    assert!(planned >= 8, "the README shows the runner's verbs");
+}
+
+#[test]
+fn every_make_target_exists() {
+    let makefile = std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("Makefile")).unwrap();
+    for block in blocks(&readme(), "sh") {
+        for line in block.lines().filter_map(|l| l.trim().strip_prefix("make ")) {
+            let target = line.split_whitespace().next().unwrap();
+            assert!(makefile.contains(&format!("\n{target}:")), "no make target {target}");
+        }
+    }
+}
+
+#[test]
+fn pipeline_blocks_are_valid() {
+    let blocks = blocks(&readme(), "yaml");
+    assert!(!blocks.is_empty());
+    for block in blocks {
+        let project = Project::tiny();
+        std::fs::create_dir(project.path("scripts")).unwrap();
+        let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
+        std::fs::copy(script, project.path("scripts/example-eval.py")).unwrap();
+        // Each block replaces the stage of its name.
+        let name = block.lines().next().unwrap().trim().trim_end_matches(':').to_owned();
+        let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+        let start = text.find(&format!("  {name}:")).unwrap();
+        project.write("pipeline.yaml", &format!("{}{block}", &text[..start]));
+        project.ok(&["plan"]);
+    }
+}
+
+#[test]
+fn links_lead_somewhere() {
+    let text = readme();
+    for target in text.split("](").skip(1).map(|rest| rest.split(')').next().unwrap()) {
+        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(target);
+        assert!(path.exists(), "{target} is not there");
+    }
+}
