@@ -149,3 +149,51 @@ fn two_runners_at_once_make_everything_once() {
     }
     assert_eq!(ran, 5);
 }
+
+/// Options that change what flows between stages, each through the whole pipeline to a plausible score.
+#[test]
+fn every_option_goes_through() {
+    let project = Project::tiny();
+    project.replace("rays: 60000", "rays: 400000");
+    for options in [
+        &["-p", "background=alpha"][..],
+        &["-p", "background=black", "-p", "kernel=bicubic"],
+        &["-p", "hull=alpha"],
+        &["-p", "kernel=avg", "-p", "jitter=true"],
+        &["-p", "supersample=3", "-p", "depth=median", "-p", "ray_distance=true"],
+        &["-p", "lr=20", "-p", "scale=1.5", "-p", "references=2", "-p", "test_views=2"],
+        &["-p", "lr=24", "-p", "scale=1", "-p", "supersample=1"],
+    ] {
+        let run = project.ok(&[&["run"], options].concat());
+        let psnr: f64 = run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+        assert!((17.0..40.0).contains(&psnr), "{options:?}: {run}");
+        assert!(run.contains("depth error"), "{run}");
+    }
+}
+
+/// A field renders at any size, and pictures need not be square.
+#[test]
+fn any_size_and_shape() {
+    let project = Project::tiny();
+    project.ok(&["run", "render-depth", "-p", "render-depth.size=1"]);
+    project.ok(&["run", "render-depth", "-p", "render-depth.size=100"]);
+    // Cut the data set's pictures to 48×30: the same focal length, the same centre.
+    let dataset = project.object(&project.output_of("demo-scene", &[])[0]);
+    for split in ["train", "test"] {
+        let text = std::fs::read_to_string(dataset.join(format!("transforms_{split}.json"))).unwrap();
+        let file = project.path(&format!("cut/transforms_{split}.json"));
+        std::fs::create_dir_all(file.parent().unwrap().join(split)).unwrap();
+        std::fs::write(file, text.replace("depth_file_path", "ignored")).unwrap();
+        for i in 0..12 {
+            let name = format!("{split}/r_{i}.png");
+            let Ok(image) = pixels::read_png(&dataset.join(&name)) else { continue };
+            let data = image.data[9 * 48 * 4..39 * 48 * 4].to_vec();
+            pixels::write_png(&project.path(&format!("cut/{name}")), &pixels::Rgba8::new(48, 30, data)).unwrap();
+        }
+    }
+    let run = project.ok(&["run", "-i", "dataset=cut"]);
+    assert!(run.contains("eval: PSNR") && !run.contains("depth error"), "{run}");
+    let scene = project.object(&project.output_of("prep", &["-i", "dataset=cut"])[0]);
+    let image = pixels::read_png(&scene.join("train/images/r_0.png")).unwrap();
+    assert_eq!((image.width, image.height), (24, 15));
+}

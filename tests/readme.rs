@@ -89,7 +89,7 @@ fn pipeline_blocks_are_valid() {
 #[test]
 fn links_lead_somewhere() {
     let text = readme();
-    for target in text.split("](").skip(1).map(|rest| rest.split(')').next().unwrap()) {
+    for target in text.split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
         let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(target);
         assert!(path.exists(), "{target} is not there");
     }

@@ -73,7 +73,7 @@ mod tests {
     fn circle(target: DVec3, distance: f64) -> Vec<Camera> {
         (0..12)
             .map(|i| {
-                let a = f64::from(i) * 0.5236;
+                let a = f64::from(i) * std::f64::consts::FRAC_PI_6;
                 looking_at(target + distance * DVec3::new(a.cos(), a.sin(), 0.4).normalize(), target)
             })
             .collect()

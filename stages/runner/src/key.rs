@@ -58,7 +58,7 @@ fn describe_change(name: &str, before: Option<&Value>, now: Option<&Value>) -> S
 mod tests {
     use super::*;
 
-    fn record(stage: &str, started_unix: u64, parts: Value) -> Record {
+    fn record(stage: &str, started_unix: u64, parts: &Value) -> Record {
         Record {
             stage: stage.to_owned(),
             point: String::new(),
@@ -74,9 +74,9 @@ mod tests {
     #[test]
     fn the_nearest_earlier_run_explains() {
         let records = [
-            record("prep", 1, json!({"code": "a", "parameter kernel": "box"})),
-            record("prep", 9, json!({"code": "z", "parameter kernel": "avg"})),
-            record("eval", 9, json!({"code": "a", "parameter kernel": "lanczos"})),
+            record("prep", 1, &json!({"code": "a", "parameter kernel": "box"})),
+            record("prep", 9, &json!({"code": "z", "parameter kernel": "avg"})),
+            record("eval", 9, &json!({"code": "a", "parameter kernel": "lanczos"})),
         ];
         let now = json!({"code": "a", "parameter kernel": "lanczos"});
         let changes = explain(now.as_object().unwrap(), "prep", &records).unwrap();

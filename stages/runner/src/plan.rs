@@ -327,6 +327,9 @@ fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, req
     Ok(axes)
 }
 
+/// The value (by number) of every axis that reaches a node.
+type Point = BTreeMap<usize, usize>;
+
 /// The expansion of stages to nodes.
 struct Expansion<'a> {
     pipeline: &'a Pipeline,
@@ -334,14 +337,14 @@ struct Expansion<'a> {
     axes: &'a [Axis],
     nodes: Vec<Node>,
     /// The nodes of each stage, with the value (by number) of every axis that reaches them.
-    of_stage: BTreeMap<String, Vec<(BTreeMap<usize, usize>, usize)>>,
+    of_stage: BTreeMap<String, Vec<(Point, usize)>>,
 }
 
 impl Expansion<'_> {
     fn expand(mut self, order: &[String], targets: &[String]) -> Result<Plan, PlanError> {
         // Only what the targets need; an input replaced from the command line needs nothing.
         let mut wanted: BTreeSet<String> = targets.iter().cloned().collect();
-        for stage in order.iter().rev().filter(|s| pipeline_has(self.pipeline, s)) {
+        for stage in order.iter().rev() {
             if wanted.contains(stage) {
                 wanted.extend(
                     self.block_inputs(stage)
@@ -380,7 +383,7 @@ impl Expansion<'_> {
         for (_, source) in inputs.iter().filter(|(_, s)| as_path(s).is_none()) {
             reach.extend(self.of_stage[split(source).0].iter().flat_map(|(values, _)| values.keys().copied()));
         }
-        let mut points: Vec<BTreeMap<usize, usize>> = vec![BTreeMap::new()];
+        let mut points: Vec<Point> = vec![BTreeMap::new()];
         for axis in reach {
             let values = 0..self.axes[axis].values.len();
             points = points
@@ -401,7 +404,7 @@ impl Expansion<'_> {
                     Some(path) => From::Folder(self.pipeline.folder().join(path)),
                     None => {
                         let (other, subtree) = split(source);
-                        let fits = |values: &BTreeMap<usize, usize>| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
+                        let fits = |values: &Point| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
                         let (_, index) = self.of_stage[other]
                             .iter()
                             .find(|(values, _)| fits(values))
@@ -439,7 +442,7 @@ impl Expansion<'_> {
     }
 
     /// A stage's parameters at a point: the command line's over the file's over the defaults.
-    fn resolve(&self, stage: &str, point: &BTreeMap<usize, usize>) -> Result<Value, PlanError> {
+    fn resolve(&self, stage: &str, point: &Point) -> Result<Value, PlanError> {
         let mut given = self.pipeline.stages[stage].parameters.clone();
         for (axis, value) in self.axes.iter().enumerate().filter(|(_, a)| a.stage == stage) {
             if let What::Parameter(name) = &value.what {
@@ -452,8 +455,4 @@ impl Expansion<'_> {
         let schema = Schema::new(&self.programs[stage].description.parameters).map_err(PlanError::Usage)?;
         schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
     }
-}
-
-fn pipeline_has(pipeline: &Pipeline, stage: &str) -> bool {
-    pipeline.stages.contains_key(stage)
 }

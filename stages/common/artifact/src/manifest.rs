@@ -233,7 +233,7 @@ mod tests {
     fn a_flipped_byte_is_noticed_and_named() {
         let (dir, manifest) = example();
         manifest.check_contents(dir.path()).unwrap();
-        fs::write(dir.path().join("train/a.txt"), "alphA").unwrap();
+        fs::write(dir.path().join("train/a.txt"), "alphb").unwrap();
         manifest.check_sizes(dir.path()).unwrap();
         let damage = manifest.check_contents(dir.path()).unwrap_err();
         assert!(matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")), "{damage}");

@@ -96,13 +96,13 @@ mod tests {
         .unwrap()
     }
 
-    fn resolve(given: Value) -> Result<Value, Vec<ParameterProblem>> {
+    fn resolve(given: &Value) -> Result<Value, Vec<ParameterProblem>> {
         schema().resolve(given.as_object().unwrap())
     }
 
     #[test]
     fn defaults_are_filled_in() {
-        assert_eq!(resolve(json!({"scale": 4})).unwrap(), json!({"kernel": "lanczos", "scale": 4}));
+        assert_eq!(resolve(&json!({"scale": 4})).unwrap(), json!({"kernel": "lanczos", "scale": 4}));
     }
 
     #[test]
@@ -113,7 +113,7 @@ mod tests {
             (json!({"scale": "two"}), "scale", "integer"),
             (json!({"kernel": "gauss"}), "kernel", r#""gauss" is not one of "box", "lanczos""#),
         ] {
-            let problems = resolve(given).unwrap_err();
+            let problems = resolve(&given).unwrap_err();
             assert_eq!(problems[0].name, name);
             assert!(problems[0].problem.contains(word), "{}", problems[0]);
         }

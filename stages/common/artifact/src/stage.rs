@@ -310,6 +310,11 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         signal_hook::flag::register(signal, Arc::clone(&interrupted))?;
     }
 
+    if arguments.progress == ProgressMode::Json {
+        // The parent is a runner: when it is killed, end as if interrupted, with a checkpoint, rather than work on unseen.
+        rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
+    }
+
     let output = arguments.output.expect("clap requires --output");
     let staging = Staging::new(&output)?;
     if let Some(work) = &arguments.work {

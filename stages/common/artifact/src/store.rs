@@ -216,8 +216,7 @@ impl Store {
         let stated = Manifest::read(output)?;
         if stated != found {
             return Err(StoreError::NoArtifact(format!(
-                "{} differs from the files beside it, or its kind is not {kind:?}",
-                MANIFEST_FILE
+                "{MANIFEST_FILE} differs from the files beside it, or its kind is not {kind:?}"
             )));
         }
         if found.files.is_empty() {
@@ -316,7 +315,7 @@ mod tests {
         let (a, b) = (make(&store, "a", "same"), make(&store, "b", "same"));
         assert_eq!(a.output, b.output);
         assert_ne!(a.key(), b.key());
-        assert_eq!(store.objects().unwrap(), [a.output.clone()]);
+        assert_eq!(store.objects().unwrap(), std::slice::from_ref(&a.output));
         assert_eq!(store.hit(&a.key()), Some(a));
         assert!(store.partials().unwrap().is_empty());
     }

@@ -1,0 +1,38 @@
+#!/usr/bin/env python3
+"""Makes docs/demo.png, the picture on top of the README, from the last `make demo`. Needs Pillow (make goldens installs it).
+
+    .venv/bin/python scripts/readme-picture.py
+"""
+
+import json
+import pathlib
+
+from PIL import Image, ImageDraw
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+SIDE = 300
+
+
+def main():
+    run = json.loads((ROOT / ".nerf-sr/sinks/report/run/run.json").read_text())
+    folder = {node["stage"]: pathlib.Path(node["folder"]) for node in run["nodes"]}
+    name = "r_5"
+    truth = folder["prep"] / "truth"
+    parts = [
+        ("LR input, 100 px", truth / f"low/{name}.png", Image.NEAREST),
+        ("rendered, 200 px", folder["render-depth"] / f"previews/{name}.png", Image.LANCZOS),
+        ("ground truth", truth / f"images/{name}.png", Image.LANCZOS),
+        ("error", folder["eval"] / f"errors/{name}.png", Image.NEAREST),
+    ]
+    sheet = Image.new("RGB", (len(parts) * SIDE, SIDE + 18), "white")
+    draw = ImageDraw.Draw(sheet)
+    for i, (label, path, kernel) in enumerate(parts):
+        image = Image.open(path).convert("RGBA").resize((SIDE, SIDE), kernel)
+        sheet.paste(image, (i * SIDE, 0), image)
+        draw.text((i * SIDE + 8, SIDE + 2), label, fill="black")
+    (ROOT / "docs").mkdir(exist_ok=True)
+    sheet.save(ROOT / "docs/demo.png", optimize=True)
+
+
+if __name__ == "__main__":
+    main()
