@@ -126,7 +126,7 @@ impl Job<'_> {
         if let Some(record) = self.store.hit(&key) {
             return Ok((record, false));
         }
-        let _lock = self.store.lock(&key).map_err(|e| fail(e.to_string()))?;
+        let lock = self.store.lock(&key).map_err(|e| fail(e.to_string()))?;
         // Another runner may have made it while this one waited.
         if let Some(record) = self.store.hit(&key) {
             return Ok((record, false));
@@ -155,6 +155,7 @@ impl Job<'_> {
             work: Some(&attempt.work),
             device: &self.options.device,
             threads: self.threads,
+            lock: Some(&lock),
         };
         let label = self.node.label();
         let view = self.display.start(&label);

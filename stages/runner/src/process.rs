@@ -6,7 +6,7 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use artifact::Event;
+use artifact::{Event, KeyLock};
 
 use crate::stages::StageProgram;
 
@@ -23,6 +23,8 @@ pub(crate) struct Call<'a> {
     pub(crate) work: Option<&'a Path>,
     pub(crate) device: &'a str,
     pub(crate) threads: usize,
+    /// The key's lock, which the stage holds on to as its standard input.
+    pub(crate) lock: Option<&'a KeyLock>,
 }
 
 /// How a stage ended, if not well.
@@ -47,7 +49,11 @@ impl Call<'_> {
         let fail = |message: String| StageFailure { code: 1, message };
         let mut log = File::options().create(true).append(true).open(log).map_err(|e| fail(format!("{}: {e}", log.display())))?;
         let path = self.program.path.display();
-        let mut child = self.command().spawn().map_err(|e| fail(format!("{path}: {e}")))?;
+        let stdin = match self.lock {
+            Some(lock) => Stdio::from(lock.share().map_err(|e| fail(format!("{path}: {e}")))?),
+            None => Stdio::null(),
+        };
+        let mut child = self.command().stdin(stdin).spawn().map_err(|e| fail(format!("{path}: {e}")))?;
         let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
         let mut last_words = String::new();
         let status = std::thread::scope(|scope| {
@@ -101,7 +107,7 @@ impl Call<'_> {
         let passed = ENVIRONMENT.into_iter().chain(declared).filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
         command.env_clear().envs(passed);
         // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end, once.
-        command.process_group(0).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
 }

@@ -132,6 +132,7 @@ pub(crate) fn show(
         work: None,
         device: &options.device,
         threads: options.threads,
+        lock: None,
     };
     let result = call.run(&scratch.join("log"), &view, stop);
     view.end();

@@ -80,7 +80,7 @@ impl Default for Params {
             supersample: 2,
             jitter: false,
             rays: 30_000_000,
-            batch: 16_384,
+            batch: 4_096,
             samples: 131_072,
             rate: 1e-2,
             final_rate: 0.02,

@@ -74,10 +74,18 @@ pub enum StoreError {
     NoArtifact(String),
 }
 
-/// The lock on a key; held while it lives.
+/// The lock on a key; held while it, or a process that was handed [`KeyLock::share`], lives.
 #[derive(Debug)]
 pub struct KeyLock {
-    _file: File,
+    file: File,
+}
+
+impl KeyLock {
+    /// The lock's file, to be handed to the stage (as its standard input, which reads as empty): so the lock outlives a runner
+    /// that is killed while its stage is still writing.
+    pub fn share(&self) -> io::Result<File> {
+        self.file.try_clone()
+    }
 }
 
 /// An action being carried out: where it writes.
@@ -116,9 +124,9 @@ impl Store {
     /// Waits for the key's lock. Take it, look for the record again, then act.
     pub fn lock(&self, key: &str) -> Result<KeyLock, StoreError> {
         let path = self.root.join("locks").join(key);
-        let file = at(&path, File::options().create(true).append(true).open(&path))?;
+        let file = at(&path, File::options().create(true).read(true).append(true).open(&path))?;
         at(&path, file.lock())?;
-        Ok(KeyLock { _file: file })
+        Ok(KeyLock { file })
     }
 
     /// The record of a key, if the action was done and its object is whole (sizes only; see [`Store::verify`]).
