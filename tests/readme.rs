@@ -81,7 +81,10 @@ fn pipeline_blocks_are_valid() {
         let name = block.lines().next().unwrap().trim().trim_end_matches(':').to_owned();
         let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
         let start = text.find(&format!("  {name}:")).unwrap();
-        project.write("pipeline.yaml", &format!("{}{block}", &text[..start]));
+        let after = &text[start + 3..];
+        let end =
+            after.match_indices("\n  ").map(|(i, _)| i + 1).find(|&i| !after[i + 2..].starts_with(' ')).unwrap_or(after.len());
+        project.write("pipeline.yaml", &format!("{}{block}{}", &text[..start], &after[end..]));
         project.ok(&["plan"]);
     }
 }

@@ -30,7 +30,7 @@ fn schemas_are_current() {
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<artifact::Record>()),
-        ("run", of::<runner::RunRecord>()),
+        ("run", of::<artifact::RunRecord>()),
         ("views", of::<scene::Views>()),
         ("scene", of::<prep::SceneSummary>()),
         ("field", of::<radiance::FieldFile>()),

@@ -16,7 +16,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Palette, Picture, Rgba8, heat, read_exr, read_png, write_png};
+use pixels::{Palette, Picture, Rgba8, heat, read_exr, read_premultiplied, write_png};
 use rayon::prelude::*;
 use scene::{Background, View, Views};
 use schemars::JsonSchema;
@@ -183,20 +183,7 @@ fn read_view(input: &GivenInput, view: &View, background: Background) -> anyhow:
     let place = format!("view {}", view.camera.name);
     let name = view.image.as_ref().with_context(|| "it has no image").bad_input(&place)?;
     let path = input.path(name);
-    let mut picture = if path.extension().is_some_and(|e| e == "exr") {
-        let image = read_exr(&path).bad_input(&place)?;
-        let channel = |c: &str| image.channel(c).with_context(|| format!("{}: no channel {c}", path.display())).bad_input(&place);
-        let (r, g, b, a) = (channel("R")?, channel("G")?, channel("B")?, channel("A")?);
-        let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-        let rgba = Picture::new(image.width, image.height, 4, data);
-        if background == Background::Alpha {
-            rgba.premultiplied_over(background.shown())
-        } else {
-            Picture::new(rgba.width, rgba.height, 3, rgba.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect())
-        }
-    } else {
-        Picture::from_rgba8(&read_png(&path).bad_input(&place)?).over(background.shown())
-    };
+    let mut picture = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
     picture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     Ok(picture)
 }

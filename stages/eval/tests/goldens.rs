@@ -51,10 +51,7 @@ fn lpips_gives_the_published_distances() {
         return;
     }
     let lpips = eval::Lpips::read(&weights).unwrap();
-    let read = |name: &str| {
-        let image = Picture::from_rgba8(&pixels::read_png(&weights.join(name)).unwrap());
-        image.over(1.0)
-    };
+    let read = |name: &str| pixels::read_premultiplied(&weights.join(name)).unwrap().over(1.0);
     let reference = read("ex_ref.png");
     for (name, expected) in [("ex_p0.png", 0.7112), ("ex_p1.png", 0.1479)] {
         let distance = lpips.distance(&reference, &read(name)).unwrap();

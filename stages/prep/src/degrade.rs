@@ -43,12 +43,12 @@ impl Kernel {
     }
 }
 
-/// An LR picture as its kernel gives it: RGBA with straight alpha.
+/// An LR picture as its kernel gives it.
 #[derive(Clone, Debug, PartialEq)]
 pub enum LowResolution {
-    /// Rounded to 8 bits.
+    /// Rounded to 8 bits, alpha straight.
     Bytes(Rgba8),
-    /// Not rounded.
+    /// Not rounded, alpha premultiplied.
     Floats(Picture),
 }
 
@@ -74,7 +74,12 @@ pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResol
         Some(filter) => LowResolution::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, filter)),
         None => {
             let pooled = average_pool(&hr, hr_size.0 / lr_size.0, hr_size.1 / lr_size.1);
-            LowResolution::Floats(pooled.expect("avg is refused for sizes that don't divide"))
+            let mut picture = pooled.expect("avg is refused for sizes that don't divide");
+            // The mean of straight colours times the mean alpha: what the paper's code composites.
+            for p in picture.data.chunks_exact_mut(4) {
+                (0..3).for_each(|c| p[c] *= p[3]);
+            }
+            LowResolution::Floats(picture)
         }
     };
     (hr, lr)

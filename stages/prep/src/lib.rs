@@ -305,10 +305,16 @@ impl Job<'_> {
             LowResolution::Bytes(image) => write_png(&path, image)?,
             LowResolution::Floats(picture) => {
                 let channels = ["R", "G", "B", "A"].map(|name| Channel { name, sample_type: SampleType::Float });
-                write_exr(&path, (picture.width, picture.height), &channels, "sRGB, straight alpha", |first, rows, samples| {
-                    samples.copy_from_slice(&picture.data[first * picture.width * 4..(first + rows) * picture.width * 4]);
-                    Ok::<(), pixels::PixelError>(())
-                })?;
+                write_exr(
+                    &path,
+                    (picture.width, picture.height),
+                    &channels,
+                    "display-encoded sRGB, premultiplied",
+                    |first, rows, samples| {
+                        samples.copy_from_slice(&picture.data[first * picture.width * 4..(first + rows) * picture.width * 4]);
+                        Ok::<(), pixels::PixelError>(())
+                    },
+                )?;
             }
         }
         Ok(())

@@ -116,11 +116,7 @@ impl Job<'_> {
         if self.params.ray_distance {
             channels.push(single("distance"));
         }
-        let note = match self.background {
-            Background::Alpha => "display-encoded sRGB, premultiplied; Z: camera-space z-depth",
-            Background::White => "display-encoded sRGB over white; Z: camera-space z-depth",
-            Background::Black => "display-encoded sRGB over black; Z: camera-space z-depth",
-        };
+        let note = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
         let exr = self.context.output_path(&format!("images/{}.exr", self.camera.name))?;
         let mut png = PngRows::create(&self.context.output_path(&format!("previews/{}.png", self.camera.name))?, width, height)?;
         write_exr(&exr, (width, height), &channels, note, |first, rows, samples| -> Result<(), Stopped> {
@@ -151,8 +147,7 @@ impl Job<'_> {
             .unzip();
         let pixels = self.field.render(&rays);
         for ((pixel, to_z), sample) in pixels.iter().zip(to_z).zip(samples.chunks_exact_mut(channels)) {
-            let colour = if self.background == Background::Alpha { pixel.premultiplied } else { pixel.colour };
-            sample[..3].copy_from_slice(&colour);
+            sample[..3].copy_from_slice(&pixel.premultiplied);
             sample[3] = pixel.opacity;
             let distance = match self.params.depth {
                 Depth::Expected => pixel.depth,

@@ -2,18 +2,15 @@
 //!
 //! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it shows times and hashes.
 //!
-//! * `tables`: scores of every point of a sweep, stages with parameters, hashes and times.
-//! * `pictures`: LR input, render, truth, error and depth side by side.
+//! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes and times.
+//! * `pictures`: views and depth as embedded PNG data.
 
 mod page;
 mod pictures;
-mod record;
 
-use artifact::{Context, Failure, Input, Output, Stage};
+use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-pub use record::{Run, RunNode};
 
 /// Parameters of `report`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -48,10 +45,8 @@ impl Stage for Report {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let run: Run = context.input("run")?.read_json("run.json")?;
-        if run.nodes.iter().any(|n| n.inputs.values().filter_map(|i| i.node).any(|i| i >= run.nodes.len())) {
-            return Err(Failure::BadInput("run.json: an input names a node that isn't listed".to_owned()).into());
-        }
+        let run: RunRecord = context.input("run")?.read_json("run.json")?;
+        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
         let html = page::page(&run, params.views as usize)?;
         std::fs::write(context.output_path("index.html")?, html.into_string())?;
         Ok(())

@@ -1,11 +1,11 @@
 use std::path::Path;
 
 use anyhow::Context as _;
+use artifact::{RunInput, RunNode, RunRecord};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use serde_json::Value;
 
 use crate::pictures::{colour, data_uri, depth, read_views, uri_of};
-use crate::record::{Run, RunNode};
 
 const STYLE: &str = "
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
@@ -24,7 +24,7 @@ struct Point<'a> {
     index: usize,
 }
 
-pub(crate) fn page(run: &Run, views: usize) -> anyhow::Result<Markup> {
+pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
     let mut points = Vec::new();
     for (index, node) in run.nodes.iter().enumerate().filter(|(_, n)| n.kind == "metrics") {
         let path = node.folder.join("metrics.json");
@@ -55,7 +55,7 @@ pub(crate) fn page(run: &Run, views: usize) -> anyhow::Result<Markup> {
 }
 
 /// A table of means, one row a point, the best figure of each column in bold.
-fn scores(run: &Run, points: &[Point<'_>]) -> Markup {
+fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
     let columns: [(&str, &str, usize, bool); 6] = [
         ("PSNR ↑ dB", "psnr", 2, true),
@@ -99,14 +99,14 @@ fn scores(run: &Run, points: &[Point<'_>]) -> Markup {
 }
 
 /// Time of the ancestors of a kind.
-fn time_of(run: &Run, point: &Point<'_>, kind: &str) -> String {
+fn time_of(run: &RunRecord, point: &Point<'_>, kind: &str) -> String {
     let seconds: f64 =
         run.ancestors(point.index).into_iter().map(|i| &run.nodes[i]).filter(|n| n.kind == kind).map(|n| n.seconds).sum();
     if seconds < 90.0 { format!("{seconds:.1} s") } else { format!("{:.1} min", seconds / 60.0) }
 }
 
 /// LR input, render, truth, error, depth of some views.
-fn gallery(run: &Run, point: &Point<'_>, count: usize) -> anyhow::Result<Markup> {
+fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<Markup> {
     let folder = |input: &str| point.node.inputs.get(input).map(|s| run.folder_of(s));
     let (Some(rendered), Some(truth)) = (folder("views"), folder("truth")) else {
         return Ok(html! { p { "These metrics have no inputs `views` and `truth` to show." } });
@@ -153,8 +153,8 @@ fn gallery(run: &Run, point: &Point<'_>, count: usize) -> anyhow::Result<Markup>
 }
 
 /// Every node with parameters, hashes and times.
-fn stages(run: &Run) -> Markup {
-    let source = |input: &crate::record::Source| match (input.node, &input.subtree) {
+fn stages(run: &RunRecord) -> Markup {
+    let source = |input: &RunInput| match (input.node, &input.subtree) {
         (Some(i), Some(folder)) => format!("{}/{folder}", run.nodes[i].stage),
         (Some(i), None) => run.nodes[i].stage.clone(),
         (None, _) => input.folder.as_ref().map(|f| f.display().to_string()).unwrap_or_default(),

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use base64::Engine as _;
-use pixels::{Palette, Picture, Rgba8, encode_png, heat, read_exr, read_png};
+use pixels::{Palette, Rgba8, encode_png, heat, read_exr, read_premultiplied};
 use scene::{Background, View, Views};
 
 /// A picture as the value of an `<img src>`.
@@ -19,20 +19,7 @@ pub(crate) fn read_views(folder: &Path) -> anyhow::Result<Views> {
 
 /// A view's picture over its background, for looking at.
 pub(crate) fn colour(folder: &Path, file: &str, background: Background) -> anyhow::Result<Rgba8> {
-    let path = folder.join(file);
-    if path.extension().is_some_and(|e| e == "exr") {
-        let image = read_exr(&path)?;
-        let channel = |c: &str| image.channel(c).with_context(|| format!("{}: no channel {c}", path.display()));
-        let (r, g, b, a) = (channel("R")?, channel("G")?, channel("B")?, channel("A")?);
-        let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-        let rgba = Picture::new(image.width, image.height, 4, data);
-        let shown = match background {
-            Background::Alpha => rgba.premultiplied_over(background.shown()),
-            _ => Picture::new(rgba.width, rgba.height, 3, rgba.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect()),
-        };
-        return Ok(shown.to_rgba8());
-    }
-    Ok(Picture::from_rgba8(&read_png(&path)?).over(background.shown()).to_rgba8())
+    Ok(read_premultiplied(&folder.join(file))?.over(background.shown()).to_rgba8())
 }
 
 /// Depth of a rendered view as colours from near (warm) to far; white where nothing stands.

@@ -152,10 +152,12 @@ impl Session {
     fn open(cli: &Cli) -> anyhow::Result<Self> {
         let pipeline = Pipeline::read(&cli.pipeline).map_err(PlanError::from)?;
         let root = cli.store.clone().unwrap_or_else(|| pipeline.folder().join(".nerf-sr"));
-        let store = Store::open(&root).context("cannot open the store; name another with --store")?;
+        std::fs::create_dir_all(&root)
+            .with_context(|| format!("cannot open the store {}; name another with --store", root.display()))?;
         // Stages get absolute paths, whatever folder they run in.
-        let root = root.canonicalize().context("cannot open the store")?;
-        Ok(Self { pipeline, store: Store::open(&root).unwrap_or(store), device: cli.device.clone() })
+        let root = root.canonicalize().with_context(|| root.display().to_string())?;
+        let store = Store::open(&root).context("cannot open the store; name another with --store")?;
+        Ok(Self { pipeline, store, device: cli.device.clone() })
     }
 
     fn plan(&self, what: &What) -> anyhow::Result<Plan> {
@@ -199,7 +201,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let records = session.store.records()?;
             for i in of_stage(&plan, &stage)? {
                 println!("{}: {}", plan.nodes[i].label(), words(&session, &plan, i, &states[i], &records));
-                for cause in causes(&plan, &states, i) {
+                for cause in causes(&states, i) {
                     println!("  {}: {}", plan.nodes[cause].label(), words(&session, &plan, cause, &states[cause], &records));
                 }
             }
@@ -367,7 +369,7 @@ fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
 }
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
-fn causes(plan: &Plan, states: &[State], index: usize) -> Vec<usize> {
+fn causes(states: &[State], index: usize) -> Vec<usize> {
     let mut found = BTreeSet::new();
     let mut waiting = vec![index];
     while let Some(i) = waiting.pop() {
@@ -376,7 +378,6 @@ fn causes(plan: &Plan, states: &[State], index: usize) -> Vec<usize> {
             found.extend(on.iter().copied().filter(|&p| matches!(states[p], State::WillRun { .. })));
         }
     }
-    debug_assert!(found.iter().all(|&i| i < plan.nodes.len()));
     found.into_iter().collect()
 }
 

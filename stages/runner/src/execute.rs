@@ -11,7 +11,7 @@ use artifact::{Event, Record, Store, eta, hash_json};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use crate::key;
-use crate::plan::{From, Node, Plan, PlanError, input_hashes};
+use crate::plan::{Node, Origin, Plan, PlanError, input_hashes};
 use crate::process::{Call, StageFailure, Watcher};
 
 /// How to run.
@@ -72,7 +72,7 @@ pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBo
                 let (sender, display) = (sender.clone(), &display);
                 let threads = (options.threads / together).max(1);
                 scope.spawn(move || {
-                    let job = Job { plan, node: &plan.nodes[index], store, options, threads, display, stop };
+                    let job = Job { node: &plan.nodes[index], store, options, threads, display, stop };
                     // The receiver lives as long as the scope.
                     sender.send((index, job.run(&parents))).ok();
                 });
@@ -103,7 +103,6 @@ pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBo
 
 /// One node's work.
 struct Job<'a> {
-    plan: &'a Plan,
     node: &'a Node,
     store: &'a Store,
     options: &'a Options,
@@ -138,11 +137,11 @@ impl Job<'_> {
             .iter()
             .map(|input| {
                 let folder = match &input.from {
-                    From::Node { index, subtree } => {
+                    Origin::Node { index, subtree } => {
                         let object = self.store.object(&output_of(*index));
                         subtree.as_ref().map_or(object.clone(), |s| object.join(s))
                     }
-                    From::Folder(folder) => folder.clone(),
+                    Origin::Folder(folder) => folder.clone(),
                 };
                 (input.name.clone(), folder)
             })
@@ -176,7 +175,6 @@ impl Job<'_> {
         };
         let kind = &self.node.program.description.output.kind;
         let record = self.store.publish(&attempt, kind, record).map_err(|e| fail(e.to_string()))?;
-        debug_assert!(self.plan.nodes.iter().any(|n| n.stage == record.stage));
         self.display.line(&format!("{label}: done in {} → {}", seconds(record.seconds), &record.output[..10]));
         Ok((record, true))
     }

@@ -2,14 +2,14 @@
 
 use std::fmt::Write as _;
 
-use crate::plan::{From, Plan, State};
+use crate::plan::{Origin, Plan, State};
 
 /// Edges of a node, in words: `prep/train`, `./folder`.
 fn sources(plan: &Plan, index: usize) -> Vec<String> {
-    let show = |from: &From| match from {
-        From::Node { index, subtree: Some(folder) } => format!("{}/{folder}", plan.nodes[*index].label()),
-        From::Node { index, subtree: None } => plan.nodes[*index].label(),
-        From::Folder(folder) => folder.display().to_string(),
+    let show = |from: &Origin| match from {
+        Origin::Node { index, subtree: Some(folder) } => format!("{}/{folder}", plan.nodes[*index].label()),
+        Origin::Node { index, subtree: None } => plan.nodes[*index].label(),
+        Origin::Folder(folder) => folder.display().to_string(),
     };
     plan.nodes[index].inputs.iter().map(|i| format!("{} = {}", i.name, show(&i.from))).collect()
 }
@@ -39,7 +39,7 @@ pub(crate) fn dot(plan: &Plan) -> String {
     for (i, node) in plan.nodes.iter().enumerate() {
         writeln!(text, "  n{i} [label={:?}];", node.label()).expect("a string can be written");
         for input in &node.inputs {
-            if let From::Node { index, subtree } = &input.from {
+            if let Origin::Node { index, subtree } = &input.from {
                 writeln!(text, "  n{index} -> n{i} [label={:?}];", subtree.as_deref().unwrap_or_default())
                     .expect("a string can be written");
             }

@@ -21,4 +21,3 @@ mod stages;
 pub use cli::main;
 pub use pipeline::{Pipeline, PipelineError, StageBlock};
 pub use plan::{Node, Plan, PlanError};
-pub use sink::{RunNode, RunRecord};

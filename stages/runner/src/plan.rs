@@ -34,11 +34,11 @@ pub struct Node {
 #[derive(Clone, Debug)]
 pub(crate) struct NodeInput {
     pub(crate) name: String,
-    pub(crate) from: From,
+    pub(crate) from: Origin,
 }
 
 #[derive(Clone, Debug)]
-pub(crate) enum From {
+pub(crate) enum Origin {
     /// Another node's artifact, or a folder of it.
     Node { index: usize, subtree: Option<String> },
     /// A folder outside the store.
@@ -114,8 +114,8 @@ impl Node {
     /// The nodes it needs.
     pub(crate) fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(|i| match i.from {
-            From::Node { index, .. } => Some(index),
-            From::Folder(_) => None,
+            Origin::Node { index, .. } => Some(index),
+            Origin::Folder(_) => None,
         })
     }
 }
@@ -169,12 +169,12 @@ pub(crate) fn input_hashes(
     output_of: impl Fn(usize) -> String,
 ) -> Result<Vec<(String, String)>, PlanError> {
     let hash = |input: &NodeInput| match &input.from {
-        From::Node { index, subtree: None } => Ok(output_of(*index)),
-        From::Node { index, subtree: Some(folder) } => {
+        Origin::Node { index, subtree: None } => Ok(output_of(*index)),
+        Origin::Node { index, subtree: Some(folder) } => {
             let manifest = store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
             Ok(manifest.subtree(folder).identity())
         }
-        From::Folder(folder) => crate::sources::hash_source(store, folder)
+        Origin::Folder(folder) => crate::sources::hash_source(store, folder)
             .map_err(|e| PlanError::Source(format!("stage {}: input {}: {e}", node.stage, input.name))),
     };
     node.inputs.iter().map(|input| Ok((input.name.clone(), hash(input)?))).collect()
@@ -401,7 +401,7 @@ impl Expansion<'_> {
             let mut sources: Vec<NodeInput> = Vec::new();
             for (name, source) in &inputs {
                 let from = match as_path(source) {
-                    Some(path) => From::Folder(self.pipeline.folder().join(path)),
+                    Some(path) => Origin::Folder(self.pipeline.folder().join(path)),
                     None => {
                         let (other, subtree) = split(source);
                         let fits = |values: &Point| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
@@ -409,7 +409,7 @@ impl Expansion<'_> {
                             .iter()
                             .find(|(values, _)| fits(values))
                             .expect("a parent's axes reach its children");
-                        From::Node { index: *index, subtree: subtree.map(str::to_owned) }
+                        Origin::Node { index: *index, subtree: subtree.map(str::to_owned) }
                     }
                 };
                 sources.push(NodeInput { name: name.clone(), from });
@@ -418,7 +418,7 @@ impl Expansion<'_> {
                 if let (true, What::Input(name)) = (self.axes[*axis].stage == stage, &self.axes[*axis].what) {
                     sources.push(NodeInput {
                         name: name.clone(),
-                        from: From::Folder(PathBuf::from(&self.axes[*axis].values[*value])),
+                        from: Origin::Folder(PathBuf::from(&self.axes[*axis].values[*value])),
                     });
                 }
             }

@@ -5,50 +5,12 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Store, hash_json, write_json};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value, json};
+use artifact::{RunInput, RunNode, RunRecord, Store, hash_json, write_json};
+use serde_json::json;
 
 use crate::execute::{Display, Options, Outcome};
-use crate::plan::{From, Plan, Sink};
+use crate::plan::{Origin, Plan, Sink};
 use crate::process::{Call, StageFailure};
-
-/// `run.json`: what a sink is told of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct RunRecord {
-    /// Every node that what is shown was made of, in an order in which parents come first.
-    pub nodes: Vec<RunNode>,
-}
-
-/// One finished node of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct RunNode {
-    /// Name of the stage's block.
-    pub stage: String,
-    /// The sweep's point; empty without a sweep.
-    pub point: String,
-    /// Kind of its artifact.
-    pub kind: String,
-    /// The action's key.
-    pub key: String,
-    /// The artifact's identity.
-    pub output: String,
-    /// The artifact's folder.
-    pub folder: PathBuf,
-    /// All parameters.
-    pub parameters: Value,
-    /// Inputs by name: another node of this list with a folder of its artifact, or a folder outside the store.
-    pub inputs: Map<String, Value>,
-    /// When it started, seconds since 1970.
-    pub started_unix: u64,
-    /// How long it took.
-    pub seconds: f64,
-    /// Threads it had.
-    pub threads: usize,
-}
 
 /// The record of the nodes that a sink shows and all they were made of.
 fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<RunRecord> {
@@ -63,8 +25,8 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
         let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
         let inputs = node.inputs.iter().map(|input| {
             let from = match &input.from {
-                From::Node { index, subtree } => json!({"node": position(*index), "subtree": subtree}),
-                From::Folder(folder) => json!({"folder": folder}),
+                Origin::Node { index, subtree } => RunInput { node: position(*index), subtree: subtree.clone(), folder: None },
+                Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
             };
             (input.name.clone(), from)
         });
@@ -75,7 +37,7 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
             key: record.key(),
             output: record.output.clone(),
             folder: store.object(&record.output),
-            parameters: node.parameters.clone(),
+            parameters: node.parameters.as_object().cloned().unwrap_or_default(),
             inputs: inputs.collect(),
             started_unix: record.started_unix,
             seconds: record.seconds,

@@ -9,7 +9,7 @@ mod checkpoint;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{Picture, read_exr, read_png};
+use pixels::{Picture, read_premultiplied};
 use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Space, Trainer, TrainingError, TrainingOptions};
 use scene::Views;
 use schemars::JsonSchema;
@@ -203,35 +203,21 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
     let read = |view: &scene::View| -> anyhow::Result<Picture> {
         let name = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name));
         let path = input.path(name.bad_input("scene")?);
-        let straight = if path.extension().is_some_and(|e| e == "exr") {
-            let image = read_exr(&path).bad_input("scene")?;
-            let channels = ["R", "G", "B", "A"].map(|c| image.channel(c));
-            let [Some(r), Some(g), Some(b), Some(a)] = channels else {
-                return Err(Failure::BadInput(format!("{}: channels R, G, B, A are expected", path.display())).into());
-            };
-            let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-            Picture::new(image.width, image.height, 4, data)
-        } else {
-            Picture::from_rgba8(&read_png(&path).bad_input("scene")?)
-        };
+        let picture = read_premultiplied(&path).bad_input("scene")?;
         let k = view.camera.intrinsics;
-        if (straight.width, straight.height) != (k.width as usize, k.height as usize) {
+        if (picture.width, picture.height) != (k.width as usize, k.height as usize) {
             let message = format!(
                 "{}: {}×{} pixels where its camera has {}×{}",
                 path.display(),
-                straight.width,
-                straight.height,
+                picture.width,
+                picture.height,
                 k.width,
                 k.height
             );
             return Err(Failure::BadInput(message).into());
         }
-        if views.background == scene::Background::Alpha {
-            let premultiplied =
-                straight.data.chunks_exact(4).flat_map(|p| [p[0] * p[3], p[1] * p[3], p[2] * p[3], p[3]]).collect();
-            return Ok(Picture::new(straight.width, straight.height, 4, premultiplied));
-        }
-        Ok(straight.over(views.background.shown()))
+        let is_open = views.background == scene::Background::Alpha;
+        Ok(if is_open { picture } else { picture.over(views.background.shown()) })
     };
     views.views.iter().map(read).collect()
 }

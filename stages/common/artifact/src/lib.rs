@@ -4,6 +4,7 @@
 //!   exit codes, interruption and an atomic output for free.
 //! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and blake3); its hash is the artifact's identity.
 //! * [`Store`]: objects by content, actions by key, one OS lock a key.
+//! * [`RunRecord`]: what a sink (the report) is told of a run.
 //! * [`canonical`]: the one JSON form that is ever hashed.
 //!
 //! No pixels, no tensors: the runner uses this crate alone.
@@ -40,6 +41,7 @@ mod fsio;
 mod manifest;
 mod parameters;
 mod progress;
+mod run_record;
 mod stage;
 mod store;
 
@@ -50,5 +52,6 @@ pub use fsio::{write_atomically, write_json};
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_folder, relative_path};
 pub use parameters::{ParameterProblem, Schema};
 pub use progress::{Event, Progress, ProgressMode, eta};
+pub use run_record::{RunInput, RunNode, RunRecord};
 pub use stage::{Context, GivenInput, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, KeyLock, Record, Store, StoreError};

@@ -43,28 +43,22 @@ impl Picture {
         Self { width, height, channels, data }
     }
 
-    /// 8-bit samples divided by 255, alpha straight.
-    pub fn from_rgba8(image: &Rgba8) -> Self {
-        Self::new(image.width, image.height, 4, image.data.iter().map(|&v| f32::from(v) / 255.0).collect())
+    /// 8-bit RGBA in [0, 1] with premultiplied alpha.
+    pub fn premultiplied(image: &Rgba8) -> Self {
+        let level = |v: u8| f32::from(v) / 255.0;
+        let pixel = |p: &[u8]| {
+            let alpha = level(p[3]);
+            [level(p[0]) * alpha, level(p[1]) * alpha, level(p[2]) * alpha, alpha]
+        };
+        Self::new(image.width, image.height, 4, image.data.chunks_exact(4).flat_map(pixel).collect())
     }
 
-    /// RGBA with straight alpha over a grey level, in floating point as the paper does: rgb·a + (1-a)·background.
+    /// RGBA with premultiplied alpha over a grey level, in floating point as the paper does: rgb + (1-a)·background.
     ///
     /// # Panics
     /// On a picture without alpha.
     #[must_use]
     pub fn over(&self, background: f32) -> Self {
-        assert_eq!(self.channels, 4, "only a picture with alpha can lie over something");
-        let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] * p[3] + (1.0 - p[3]) * background);
-        Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())
-    }
-
-    /// RGBA with premultiplied alpha over a grey level: rgb + (1-a)·background.
-    ///
-    /// # Panics
-    /// On a picture without alpha.
-    #[must_use]
-    pub fn premultiplied_over(&self, background: f32) -> Self {
         assert_eq!(self.channels, 4, "only a picture with alpha can lie over something");
         let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
         Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())

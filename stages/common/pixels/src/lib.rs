@@ -1,6 +1,7 @@
 //! Image buffers and what happens to pixels on the way in and out.
 //!
 //! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Picture`]: floating-point samples, channels interleaved.
+//! * [`read_premultiplied`]: a view's picture, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
@@ -16,6 +17,7 @@
 mod exr_file;
 mod heat;
 mod image_buffer;
+mod picture_file;
 mod pillow_resample;
 mod png_file;
 mod pool;
@@ -24,6 +26,7 @@ mod srgb;
 pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
 pub use heat::{Palette, heat};
 pub use image_buffer::{Picture, Rgba8, to_u8};
+pub use picture_file::read_premultiplied;
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};
 pub use pool::average_pool;

@@ -32,7 +32,7 @@ pub struct Views {
 pub struct View {
     /// Where it was taken from; its intrinsics have the image's size.
     pub camera: Camera,
-    /// The picture: PNG (RGBA with straight alpha, or RGB) or EXR.
+    /// The picture: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<String>,
     /// Depth: EXR, channel `Z`.
@@ -70,7 +70,9 @@ impl Default for Conventions {
             camera: "OpenGL: x right, y up, looking along -z; camera_to_world = [R | t] row by row".into(),
             pixels: "pixel (i, j), row 0 on top, has its centre at (i + 0.5, j + 0.5)".into(),
             depth: "camera-space z-depth in scene units".into(),
-            colour: "display-encoded sRGB; PNG alpha is straight, to be composited on the background in floating point; EXR is composited or, with background alpha, premultiplied".into(),
+            colour:
+                "display-encoded sRGB; PNG has straight alpha, EXR premultiplied; composite on the background in floating point"
+                    .into(),
         }
     }
 }

@@ -1,0 +1,90 @@
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+/// `run.json`: what a sink is told of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RunRecord {
+    /// Every node that what is shown was made of; parents come before their children.
+    pub nodes: Vec<RunNode>,
+}
+
+/// One finished node of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RunNode {
+    /// Name of the stage's block.
+    pub stage: String,
+    /// The sweep's point; empty without a sweep.
+    pub point: String,
+    /// Kind of its artifact.
+    pub kind: String,
+    /// The action's key.
+    pub key: String,
+    /// The artifact's identity.
+    pub output: String,
+    /// The artifact's folder.
+    pub folder: PathBuf,
+    /// All parameters.
+    pub parameters: Map<String, Value>,
+    /// Inputs by name.
+    pub inputs: BTreeMap<String, RunInput>,
+    /// When it started, seconds since 1970.
+    pub started_unix: u64,
+    /// How long it took.
+    pub seconds: f64,
+    /// Threads it had.
+    pub threads: usize,
+}
+
+/// Where an input came from: another node of the list, or a folder outside the store.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct RunInput {
+    /// The node's place in the list.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub node: Option<usize>,
+    /// The folder of its artifact that is meant, where it isn't all of it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub subtree: Option<String>,
+    /// The folder outside the store.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub folder: Option<PathBuf>,
+}
+
+impl RunRecord {
+    /// Says what is wrong with a list whose inputs don't name earlier nodes.
+    pub fn check(&self) -> Result<(), String> {
+        for (index, node) in self.nodes.iter().enumerate() {
+            if let Some((name, _)) = node.inputs.iter().find(|(_, input)| input.node.is_some_and(|n| n >= index)) {
+                return Err(format!("{}: input {name} names a node that doesn't come before it", node.stage));
+            }
+        }
+        Ok(())
+    }
+
+    /// The folder that an input names.
+    pub fn folder_of(&self, input: &RunInput) -> PathBuf {
+        match (input.node, &input.subtree) {
+            (Some(node), Some(subtree)) => self.nodes[node].folder.join(subtree),
+            (Some(node), None) => self.nodes[node].folder.clone(),
+            (None, _) => input.folder.clone().unwrap_or_default(),
+        }
+    }
+
+    /// The nodes that a node was made of, itself included, in order.
+    pub fn ancestors(&self, of: usize) -> Vec<usize> {
+        let mut wanted = vec![false; self.nodes.len()];
+        wanted[of] = true;
+        for i in (0..self.nodes.len()).rev() {
+            if wanted[i] {
+                self.nodes[i].inputs.values().filter_map(|input| input.node).for_each(|p| wanted[p] = true);
+            }
+        }
+        (0..self.nodes.len()).filter(|&i| wanted[i]).collect()
+    }
+}
