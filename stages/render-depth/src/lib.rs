@@ -63,7 +63,7 @@ impl Stage for RenderDepth {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("field")?;
         let file: FieldFile = input.read_json(FIELD_FILE)?;
-        let field = Field::read(&input.path("field.safetensors"), file.architecture, file.space).bad_input("field")?;
+        let field = Field::read(&input.path("field.safetensors"), file.architecture, file.bounds).bad_input("field")?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();

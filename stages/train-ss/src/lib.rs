@@ -10,7 +10,7 @@ mod checkpoint;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use pixels::{Picture, read_premultiplied};
-use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Space, Trainer, TrainingError, TrainingOptions};
+use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Trainer, TrainingError, TrainingOptions};
 use scene::Views;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -172,10 +172,8 @@ impl Stage for TrainSs {
         let input = context.input("scene")?;
         let views = Views::read(input)?;
         let pictures = read_pictures(input, &views)?;
-        let b = views.bounds;
-        let space = Space::new(b.min, b.max, b.near, b.far);
         let supervision = Average::new(&views, pictures, params.supersample, params.jitter, params.seed);
-        let mut trainer = Trainer::new(Field::new(params.architecture(), space, params.seed), params.options());
+        let mut trainer = Trainer::new(Field::new(params.architecture(), views.bounds, params.seed), params.options());
         if let Some(hull) = &views.hull {
             trainer.limit_to_hull(&read_hull(&input.path(hull))?);
         }
@@ -184,7 +182,12 @@ impl Stage for TrainSs {
             return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", trainer.steps())).into());
         }
         trainer.field().write(&context.output_path("field.safetensors")?).context("cannot write the field")?;
-        let file = FieldFile { field: params.field, architecture: params.architecture(), space, background: views.background };
+        let file = FieldFile {
+            field: params.field,
+            architecture: params.architecture(),
+            bounds: views.bounds,
+            background: views.background,
+        };
         context.write_json(FIELD_FILE, &file)?;
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);

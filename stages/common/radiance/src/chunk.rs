@@ -5,8 +5,8 @@ use crate::field::{COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, encode};
 use crate::math::{exp, sigmoid};
 use crate::mlp::{After, Layer, add_outer, multiply};
+use crate::ray::UnitRay;
 use crate::simd::{LANES, kernel};
-use crate::space::UnitRay;
 use crate::spherical::{BASIS, spherical_harmonics};
 
 /// Samples behind this transmittance, and those of less weight, get no colour and no gradient.

@@ -2,6 +2,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use scene::Bounds;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -10,7 +11,7 @@ use crate::grid::{FEATURES, Level, levels};
 use crate::mlp::Layer;
 use crate::occupancy::{GRID, Occupancy};
 use crate::random::Draws;
-use crate::space::{Ray, Space};
+use crate::ray::{Ray, clip};
 use crate::spherical::BASIS;
 
 /// What a field is made of.
@@ -60,7 +61,7 @@ pub struct Field {
     /// What it is made of.
     pub architecture: Architecture,
     /// Where it lies.
-    pub space: Space,
+    pub bounds: Bounds,
     pub(crate) levels: Vec<Level>,
     pub(crate) layers: Layers,
     pub(crate) grid: Vec<f32>,
@@ -145,8 +146,8 @@ pub(crate) const CHUNK_RAYS: usize = 64;
 
 impl Field {
     /// A field before training: faint fog, drawn from a seed.
-    pub fn new(architecture: Architecture, space: Space, seed: u64) -> Self {
-        let mut field = Self::empty(architecture, space);
+    pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
+        let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {
             *value = 2e-4 * (crate::random::uniform(seed, 1, i as u64) - 0.5);
         }
@@ -161,13 +162,13 @@ impl Field {
         field
     }
 
-    fn empty(architecture: Architecture, space: Space) -> Self {
+    fn empty(architecture: Architecture, bounds: Bounds) -> Self {
         let levels = levels(architecture.levels as usize, architecture.coarsest, architecture.finest, architecture.log2_entries);
         let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
         let grid = vec![0.0; levels.last().map_or(0, |l| l.range().end)];
         // Whole vectors, for the optimiser.
         let network = vec![0.0; layers.len().next_multiple_of(crate::simd::LANES)];
-        Self { architecture, space, levels, layers, grid, network, occupancy: Occupancy::full() }
+        Self { architecture, bounds, levels, layers, grid, network, occupancy: Occupancy::full() }
     }
 
     /// Distance between samples, in cube sides.
@@ -179,12 +180,12 @@ impl Field {
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
         rays.par_chunks(CHUNK_RAYS)
             .map_init(Chunk::default, |chunk, rays| {
-                let clipped: Vec<_> = rays.iter().map(|r| self.space.clip(r)).collect();
+                let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
                 chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
-                let side = self.space.side() as f32;
+                let side = self.bounds.longest_side() as f32;
                 let pixel = |(i, ray): (usize, &Ray)| {
                     let sum = &chunk.sums[i];
-                    let far = if clipped[i].leave > clipped[i].enter { clipped[i].leave * side } else { self.space.far as f32 };
+                    let far = if clipped[i].leave > clipped[i].enter { clipped[i].leave * side } else { self.bounds.far as f32 };
                     let opacity = 1.0 - sum.transmittance;
                     Pixel {
                         colour: std::array::from_fn(|c| sum.transmittance.mul_add(ray.background[c], sum.colour[c])),
@@ -220,15 +221,15 @@ impl Field {
     }
 
     /// Reads what [`Field::write`] wrote; sizes must fit the architecture and numbers be finite.
-    pub fn read(path: &Path, architecture: Architecture, space: Space) -> Result<Self, FieldError> {
+    pub fn read(path: &Path, architecture: Architecture, bounds: Bounds) -> Result<Self, FieldError> {
         let format = |reason: String| FieldError::Format { path: path.to_path_buf(), reason };
         architecture.check().map_err(format)?;
-        if !space.is_valid() {
-            return Err(format(format!("the box {space:?} has no inside")));
+        if !bounds.is_valid() {
+            return Err(format(format!("the box {bounds:?} has no inside")));
         }
         let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
-        let mut field = Self::empty(architecture, space);
+        let mut field = Self::empty(architecture, bounds);
         read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
         read_f32(&tensors, "network", &mut field.network).map_err(format)?;
         let occupancy = read_u8(&tensors, "occupancy", GRID * GRID * GRID).map_err(format)?;

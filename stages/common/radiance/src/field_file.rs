@@ -1,7 +1,9 @@
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Architecture, Space};
+use scene::Bounds;
+
+use crate::Architecture;
 
 /// Name of the description in a field's artifact; the weights lie beside it, in `field.safetensors`.
 pub const FIELD_FILE: &str = "field.json";
@@ -15,7 +17,7 @@ pub struct FieldFile {
     /// What it is made of.
     pub architecture: Architecture,
     /// Where it lies, in scene units.
-    pub space: Space,
+    pub bounds: Bounds,
     /// What lies behind the scene.
     pub background: scene::Background,
 }

@@ -2,7 +2,7 @@
 //!
 //! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
-//! * [`Architecture`], [`Space`]: what a field is made of and where it lies.
+//! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
 //!
 //! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, colour
 //! and back in chunks that stay in the cache; what falls on the grid is kept and added level by level, in sample order. So
@@ -12,9 +12,9 @@
 //! Units: rays and depths are in scene units; inside, the scene's box is scaled to the unit cube. Colours are display-encoded sRGB.
 //!
 //! ```
-//! use radiance::{Architecture, Field, Ray, Space};
-//! let space = Space::new([-1.0; 3], [1.0; 3], 2.0, 6.0);
-//! let field = Field::new(Architecture::default(), space, 7);
+//! use radiance::{Architecture, Field, Ray};
+//! let bounds = scene::Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0 };
+//! let field = Field::new(Architecture::default(), bounds, 7);
 //! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
 //! let pixel = field.render(&[ray])[0];
 //! assert!(pixel.opacity > 0.0 && pixel.depth > 2.0 && pixel.depth < 6.0);
@@ -30,16 +30,16 @@ mod math;
 mod mlp;
 mod occupancy;
 mod random;
+mod ray;
 #[cfg(test)]
 mod reference;
 mod simd;
-mod space;
 mod spherical;
 mod trainer;
 
 pub use field::{Architecture, Field, FieldError, Pixel};
 pub use field_file::{FIELD_FILE, FieldFile, FieldKind};
 pub use random::{Draws, uniform};
+pub use ray::Ray;
 pub use simd::{Family, set_family};
-pub use space::{Ray, Space};
 pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions};

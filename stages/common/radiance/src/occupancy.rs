@@ -1,6 +1,6 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
-use crate::space::UnitRay;
+use crate::ray::UnitRay;
 
 /// Cells along each axis.
 pub(crate) const GRID: usize = 128;

@@ -1,12 +1,14 @@
 //! The same field written plainly in f64: the judge of the fused f32 passes. Tests only.
 
+use scene::Bounds;
+
 use crate::chunk::{Chunk, FeatureGradients};
 use crate::field::{Architecture, COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
 use crate::random::Draws;
+use crate::ray::{Ray, clip};
 use crate::simd::LANES;
-use crate::space::{Ray, Space};
 use crate::spherical::spherical_harmonics;
 
 /// Parameters in f64.
@@ -88,7 +90,7 @@ impl Judge<'_> {
 
 fn example() -> (Field, Vec<Ray>) {
     let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, log2_entries: 9, hidden: 16, steps: 24 };
-    let mut field = Field::new(architecture, Space::new([-1.0; 3], [1.0, 1.2, 1.0], 0.5, 9.0), 3);
+    let mut field = Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0 }, 3);
     let mut draws = Draws::new(8, 8, 8);
     // Features of the size that training reaches, and fog thick enough that every sample counts.
     field.grid.iter_mut().for_each(|g| *g = draws.uniform() - 0.5);
@@ -108,7 +110,7 @@ fn example() -> (Field, Vec<Ray>) {
 #[test]
 fn fused_passes_equal_the_plain_ones() {
     let (field, rays) = example();
-    let clipped: Vec<_> = rays.iter().map(|r| field.space.clip(r)).collect();
+    let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
     chunk.forward(&field, &clipped, &[0.5; 20]);
     let (samples, kept) = chunk.marched_and_kept();
@@ -179,7 +181,7 @@ fn every_family_renders_and_trains_to_equal_bits() {
     use crate::simd::{Family, set_family};
     let (field, rays) = example();
     let outcome = || {
-        let clipped: Vec<_> = rays.iter().map(|r| field.space.clip(r)).collect();
+        let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
         let mut chunk = Chunk::default();
         chunk.forward(&field, &clipped, &[0.25; 20]);
         let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
@@ -208,7 +210,8 @@ fn extremes_stay_finite() {
     for raw in [-1e30f32, -50.0, 0.0, 50.0, 1e30] {
         for scale in [1e-6f64, 1.0, 1e6] {
             let architecture = Architecture { levels: 2, coarsest: 2, finest: 4, log2_entries: 8, hidden: 16, steps: 64 };
-            let mut field = Field::new(architecture, Space::new([-scale; 3], [scale; 3], 0.1 * scale, 20.0 * scale), 3);
+            let mut field =
+                Field::new(architecture, Bounds { min: [-scale; 3], max: [scale; 3], near: 0.1 * scale, far: 20.0 * scale }, 3);
             field.grid.fill(1.0);
             field.network.fill(raw / 1e3);
             let s = scale as f32;

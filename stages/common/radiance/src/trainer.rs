@@ -11,8 +11,8 @@ use crate::grid::scatter;
 use crate::mlp::drain_lanes;
 use crate::occupancy::GRID;
 use crate::random::{Draws, uniform};
+use crate::ray::{Ray, clip};
 use crate::simd::LANES;
-use crate::space::Ray;
 
 /// Where a trainer's rays come from and how their colours are judged. Rays come in groups that are judged together: the s×s
 /// sub-rays of an LR pixel.
@@ -121,7 +121,7 @@ struct Worker {
     chunk: Chunk,
     lanes: Vec<f32>,
     rays: Vec<Ray>,
-    clipped: Vec<crate::space::UnitRay>,
+    clipped: Vec<crate::ray::UnitRay>,
     offsets: Vec<f32>,
     backgrounds: Vec<[f32; 3]>,
     colours: Vec<[f32; 3]>,
@@ -153,11 +153,11 @@ impl Trainer {
 
     /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
     pub fn limit_to_hull(&mut self, hull: &[u8]) {
-        let space = self.field.space;
-        let side = space.side();
+        let bounds = self.field.bounds;
+        let side = bounds.longest_side();
         // The occupancy grid covers the cube of the longest side, the hull the box.
         let covered = |axis: usize, cell: usize| {
-            let scale = side / (space.max[axis] - space.min[axis]);
+            let scale = side / (bounds.max[axis] - bounds.min[axis]);
             let low = (cell as f64 * scale) as usize;
             let high = ((cell + 1) as f64 * scale).ceil() as usize;
             low.min(GRID)..high.min(GRID)
@@ -440,7 +440,7 @@ impl Shard {
                 supervision.cast(first_group + g as u64, &mut worker.rays[k * group..(k + 1) * group]);
             }
             worker.clipped.clear();
-            worker.clipped.extend(worker.rays.iter().map(|r| field.space.clip(r)));
+            worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
             worker.backgrounds.clear();
             worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
             let first_ray = (first_group + here.start as u64) * group as u64;

@@ -110,6 +110,19 @@ pub struct Bounds {
     pub far: f64,
 }
 
+impl Bounds {
+    /// Whether the box has an inside and the range a length, all numbers finite.
+    pub fn is_valid(&self) -> bool {
+        let finite = self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
+        finite && (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far
+    }
+
+    /// Length of the longest side.
+    pub fn longest_side(&self) -> f64 {
+        (0..3).map(|i| self.max[i] - self.min[i]).fold(f64::MIN_POSITIVE, f64::max)
+    }
+}
+
 /// A `views.json` that can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewsError {
@@ -154,10 +167,8 @@ impl Views {
         if self.views.is_empty() {
             return Err(ViewsError::Empty);
         }
-        let b = &self.bounds;
-        let finite = b.min.iter().chain(&b.max).chain([&b.near, &b.far]).all(|x| x.is_finite());
-        if !finite || (0..3).any(|i| b.min[i] >= b.max[i]) || b.near < 0.0 || b.far <= b.near {
-            return Err(ViewsError::Bounds(*b));
+        if !self.bounds.is_valid() {
+            return Err(ViewsError::Bounds(self.bounds));
         }
         let mut names = BTreeSet::new();
         for view in &self.views {
