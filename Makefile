@@ -6,6 +6,9 @@ SHELL := /bin/bash
 export PATH := $(HOME)/.cargo/bin:$(PATH)
 # The libtorch that scripts/setup-libtorch.sh makes, or your own; tests and doctests find it by this.
 LIBTORCH_DIR := $(if $(LIBTORCH),$(LIBTORCH),$(CURDIR)/.libtorch)
+ifdef LIBTORCH_USE_PYTORCH
+LIBTORCH_DIR := $(shell python3 -c 'import pathlib, torch; print(pathlib.Path(torch.__file__).parent)')
+endif
 export LD_LIBRARY_PATH := $(LIBTORCH_DIR)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRARY_PATH))
 
 NERF_SR := target/release/nerf-sr

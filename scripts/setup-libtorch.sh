@@ -10,7 +10,10 @@ cd "$(dirname "$0")/.."
 say() { echo "setup-libtorch: $*" >&2; }
 die() { say "$*"; exit 1; }
 
-if [ "${LIBTORCH_USE_PYTORCH:-0}" = 1 ]; then say "using the libtorch of the installed PyTorch (LIBTORCH_USE_PYTORCH=1)"; exit 0; fi
+if [ -n "${LIBTORCH_USE_PYTORCH:-}" ]; then
+  python3 -c 'import torch' 2>/dev/null || die "LIBTORCH_USE_PYTORCH is set, but python3 has no torch; pip install torch==2.13.0 or unset it"
+  say "using the libtorch of the installed PyTorch (LIBTORCH_USE_PYTORCH)"; exit 0
+fi
 if [ -n "${LIBTORCH:-}" ]; then
   [ -e "$LIBTORCH/lib/libtorch.so" ] || die "LIBTORCH=$LIBTORCH has no lib/libtorch.so; point it at an unpacked libtorch 2.13 or unset it"
   say "using LIBTORCH=$LIBTORCH"; exit 0
