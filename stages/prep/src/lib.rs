@@ -18,7 +18,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{Channel, Rgba8, SampleType, read_exr, read_png, write_exr, write_png};
+use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Rgba8, SampleType, read_exr, read_png, write_exr, write_png};
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera, Intrinsics, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -26,7 +26,7 @@ use serde::{Deserialize, Serialize};
 
 pub use blender::{Dataset, DatasetError, Frame};
 pub use bounds::bounds_of;
-pub use degrade::{Kernel, LowResolution, degrade};
+pub use degrade::{LowResolution, degrade};
 pub use hull::{GRID, carve};
 pub use sizes::{SizeError, Sizes, sizes};
 
@@ -205,7 +205,7 @@ impl Job<'_> {
                 Ok(lr)
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
-        let low_name = |name: &str| format!("images/{name}.{}", self.params.kernel.extension());
+        let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.params.kernel));
         let mut views = Views::new(self.params.background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
@@ -217,7 +217,7 @@ impl Job<'_> {
         if self.params.hull == HullSource::Alpha {
             let cameras: Vec<Camera> = views.views.iter().map(|v| v.camera.clone()).collect();
             let alphas: Vec<Vec<f32>> = train_pictures.iter().map(LowResolution::alpha).collect();
-            let footprint = self.params.kernel.footprint();
+            let footprint = degrade::footprint(self.params.kernel);
             bounds = hull::tightened(&bounds, &cameras, &alphas, footprint).bad_input("hull: alpha")?;
             if self.params.near.is_none() && self.params.far.is_none() {
                 bounds = bounds::with_range(bounds, &train_cameras);
@@ -232,6 +232,8 @@ impl Job<'_> {
         }
         drop(train_pictures);
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
+        let degradation = Degradation { kernel: self.params.kernel, hr: self.sizes.hr.into() };
+        self.context.write_json(&format!("train/{DEGRADATION_FILE}"), &degradation)?;
 
         let high = |c: &Camera| c.resized(self.sizes.hr.0, self.sizes.hr.1);
         let reference_views = train_cameras[..references]
@@ -266,7 +268,7 @@ impl Job<'_> {
                 camera: high(c),
                 image: Some(format!("images/{}.png", c.name)),
                 depth: frame.depth.as_ref().map(|_| format!("depth/{}.exr", c.name)),
-                low_resolution: Some(format!("low/{}.{}", c.name, self.params.kernel.extension())),
+                low_resolution: Some(format!("low/{}.{}", c.name, degrade::extension(self.params.kernel))),
             })
             .collect();
         let cameras = truth.iter().map(|v| View::camera_only(v.camera.clone())).collect();
@@ -300,7 +302,7 @@ impl Job<'_> {
     }
 
     fn write_low(&self, folder: &str, name: &str, image: &LowResolution) -> anyhow::Result<()> {
-        let path = self.context.output_path(&format!("{folder}/{name}.{}", self.params.kernel.extension()))?;
+        let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.params.kernel)))?;
         match image {
             LowResolution::Bytes(image) => write_png(&path, image)?,
             LowResolution::Floats(picture) => {

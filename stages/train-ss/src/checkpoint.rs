@@ -1,10 +1,11 @@
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use radiance::{StepReport, Trainer};
 use serde::{Deserialize, Serialize};
 
-use crate::{CurvePoint, TrainingLog};
+use crate::{CurvePoint, Supersampling, TrainingLog};
 
 /// The training curve while it grows. Everything in it is saved, so that a resumed training writes the same one.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -43,7 +44,8 @@ impl Curve {
     }
 }
 
-/// Checkpoints in the work folder: `curve-STEP.json`, then `checkpoint.safetensors`, which says which STEP it belongs to.
+/// Checkpoints in the work folder: `curve-STEP.json` and, where the supervision remembers renders, `renders-STEP.bin`; then
+/// `checkpoint.safetensors`, which says which STEP they belong to.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
     last: Instant,
@@ -56,24 +58,21 @@ impl Checkpoints {
     }
 
     /// Loads what an earlier run left. What can't be read is said and left out: the training starts over.
-    pub(crate) fn resume(&self, trainer: &mut Trainer, say: impl Fn(&str)) -> Curve {
+    pub(crate) fn resume(&self, trainer: &mut Trainer, supervision: &mut Supersampling, say: impl Fn(&str)) -> Curve {
         let Some(folder) = &self.folder else { return Curve::default() };
         let path = folder.join("checkpoint.safetensors");
         if !path.exists() {
             return Curve::default();
         }
-        // The curve of the checkpoint's step proves that the pair is whole; look for it before the trainer is touched.
-        let step = radiance::Trainer::checkpoint_step(&path);
-        let curve = step
-            .as_ref()
-            .ok()
-            .and_then(|step| serde_json::from_slice(&std::fs::read(folder.join(format!("curve-{step}.json"))).ok()?).ok());
-        match curve.map(|curve: Curve| trainer.resume(&path).map(|()| curve)) {
-            Some(Ok(curve)) => {
+        match whole(folder, &path, supervision).filter(|_| trainer.resume(&path).is_ok()) {
+            Some((curve, renders)) => {
+                if let Some(memory) = supervision.memory_mut() {
+                    memory.restore(&renders);
+                }
                 say(&format!("going on from step {}", trainer.steps()));
                 curve
             }
-            _ => {
+            None => {
                 say(&format!("{}: not a whole checkpoint; starting over", path.display()));
                 Curve::default()
             }
@@ -81,29 +80,51 @@ impl Checkpoints {
     }
 
     /// Writes a checkpoint when writing costs at most a fiftieth of the time.
-    pub(crate) fn write_when_due(&mut self, trainer: &Trainer, curve: &Curve) -> anyhow::Result<()> {
+    pub(crate) fn write_when_due(&mut self, trainer: &Trainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
         if self.folder.is_some() && self.last.elapsed() > 50 * self.took {
-            self.write(trainer, curve)?;
+            self.write(trainer, supervision, curve)?;
         }
         Ok(())
     }
 
-    pub(crate) fn write(&mut self, trainer: &Trainer, curve: &Curve) -> anyhow::Result<()> {
+    pub(crate) fn write(&mut self, trainer: &Trainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let started = Instant::now();
         let (name, temporary) = (folder.join("checkpoint.safetensors"), folder.join("checkpoint.partial"));
-        let own_curve = format!("curve-{}.json", trainer.steps());
-        artifact::write_json(&folder.join(&own_curve), curve)?;
+        let step = trainer.steps();
+        let own = [curve_name(step), renders_name(step)];
+        artifact::write_json(&folder.join(&own[0]), curve)?;
+        if let Some(memory) = supervision.memory() {
+            let mut file = std::fs::File::create(folder.join(&own[1]))?;
+            memory.parts().try_for_each(|part| file.write_all(part))?;
+        }
         trainer.write_checkpoint(&temporary)?;
         std::fs::rename(&temporary, &name)?;
         for entry in std::fs::read_dir(folder)? {
             let entry = entry?;
-            let file = entry.file_name();
-            if file.to_string_lossy().starts_with("curve-") && file.to_string_lossy() != own_curve {
+            let file = entry.file_name().to_string_lossy().into_owned();
+            if (file.starts_with("curve-") || file.starts_with("renders-")) && !own.contains(&file) {
                 std::fs::remove_file(entry.path())?;
             }
         }
         (self.last, self.took) = (Instant::now(), started.elapsed());
         Ok(())
     }
+}
+
+fn curve_name(step: u64) -> String {
+    format!("curve-{step}.json")
+}
+
+fn renders_name(step: u64) -> String {
+    format!("renders-{step}.bin")
+}
+
+/// The curve and the remembered renders of a checkpoint's step, where all of it is there: looked for before anything changes.
+fn whole(folder: &Path, checkpoint: &Path, supervision: &Supersampling) -> Option<(Curve, Vec<u8>)> {
+    let step = Trainer::checkpoint_step(checkpoint).ok()?;
+    let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
+    let Some(memory) = supervision.memory() else { return Some((curve, Vec::new())) };
+    let renders = std::fs::read(folder.join(renders_name(step))).ok()?;
+    (renders.len() == memory.len()).then_some((curve, renders))
 }

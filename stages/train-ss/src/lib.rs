@@ -1,22 +1,25 @@
 //! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section "Supersampling").
 //!
 //! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
-//! * [`Average`]: the paper's supervision: the mean of s×s sub-rays is compared with the LR pixel (its eq. 4).
+//! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's average (its eq. 4), or the
+//!   kernel that made the LR images.
+//! * `memory`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
-mod average;
 mod checkpoint;
+mod memory;
+mod supervision;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{Picture, read_premultiplied};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, read_premultiplied};
 use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Trainer, TrainingError, TrainingOptions};
 use scene::Views;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use average::Average;
 use checkpoint::Checkpoints;
+pub use supervision::{Supersampling, SupersamplingOptions, Supervision};
 
 /// Parameters of `train-ss`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -24,9 +27,12 @@ use checkpoint::Checkpoints;
 pub struct Params {
     /// Which field.
     pub field: FieldKind,
-    /// Sub-rays along each side of an LR pixel; 1 is plain NeRF.
-    #[schemars(range(min = 1, max = 16))]
-    pub supersample: u32,
+    /// HR pixels along each side of an LR pixel, the paper's s; 1 is plain NeRF. It needn't be whole: sub-rays are cast for the
+    /// next whole number. Without it: the scale at which the LR images were made.
+    #[schemars(range(min = 1.0, max = 16.0))]
+    pub supersample: Option<f64>,
+    /// What an LR pixel is compared with.
+    pub supervision: Supervision,
     /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
     pub jitter: bool,
     /// Rays to train with, sub-rays counted each.
@@ -77,7 +83,8 @@ impl Default for Params {
         let grid = Architecture::default();
         Self {
             field: FieldKind::Grid,
-            supersample: 2,
+            supersample: None,
+            supervision: Supervision::Average,
             jitter: false,
             rays: 30_000_000,
             batch: 4_096,
@@ -172,12 +179,12 @@ impl Stage for TrainSs {
         let input = context.input("scene")?;
         let views = Views::read(input)?;
         let pictures = read_pictures(input, &views)?;
-        let supervision = Average::new(&views, pictures, params.supersample, params.jitter, params.seed);
+        let mut supervision = supervision(input, params, &views, pictures)?;
         let mut trainer = Trainer::new(Field::new(params.architecture(), views.bounds, params.seed), params.options());
         if let Some(hull) = &views.hull {
             trainer.limit_to_hull(&read_hull(&input.path(hull))?);
         }
-        let log = train(context, params, &mut trainer, &supervision)?;
+        let log = train(context, params, &mut trainer, &mut supervision)?;
         if !trainer.field().is_finite() {
             return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", trainer.steps())).into());
         }
@@ -192,8 +199,9 @@ impl Stage for TrainSs {
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         context.write_summary(&format!(
-            "supersample {}: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
-            params.supersample,
+            "{}×{} sub-rays: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
+            supervision.side()[0],
+            supervision.side()[1],
             log.rays as f64 / 1e6,
             log.steps,
             log.samples_per_ray
@@ -225,6 +233,40 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
     views.views.iter().map(read).collect()
 }
 
+/// What the field is compared with, by the parameters and by what the input says of its own making.
+fn supervision(
+    input: &artifact::GivenInput,
+    params: &Params,
+    views: &Views,
+    pictures: Vec<Picture>,
+) -> anyhow::Result<Supersampling> {
+    let known = input.path(DEGRADATION_FILE).exists();
+    let made: Option<Degradation> = if known { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
+    if params.supervision != Supervision::Average && made.is_none() {
+        let message = format!("parameter supervision: the scene has no {DEGRADATION_FILE} that names its kernel; choose average");
+        return Err(Failure::Usage(message).into());
+    }
+    if params.supervision == Supervision::Kernel && views.background == scene::Background::Alpha {
+        let message =
+            "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
+        return Err(Failure::Usage(message.to_owned()).into());
+    }
+    let lr = views.views[0].camera.intrinsics;
+    let scale = |i: usize, lr: u32| match (params.supersample, made) {
+        (Some(s), _) => s,
+        (None, Some(d)) => (f64::from(d.hr[i]) / f64::from(lr)).clamp(1.0, 16.0),
+        (None, None) => 2.0,
+    };
+    let options = SupersamplingOptions {
+        supervision: params.supervision,
+        scale: [scale(0, lr.width), scale(1, lr.height)],
+        filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
+        jitter: params.jitter,
+        seed: params.seed,
+    };
+    Ok(Supersampling::new(views, pictures, &options))
+}
+
 fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {
     let bytes = std::fs::read(path).bad_input(path.display())?;
     let tensors = safetensors::SafeTensors::deserialize(&bytes).bad_input(path.display())?;
@@ -236,7 +278,12 @@ fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {
 }
 
 /// Trains to the end, with checkpoints, progress and a curve.
-fn train(context: &Context, params: &Params, trainer: &mut Trainer, supervision: &Average) -> anyhow::Result<TrainingLog> {
+fn train(
+    context: &Context,
+    params: &Params,
+    trainer: &mut Trainer,
+    supervision: &mut Supersampling,
+) -> anyhow::Result<TrainingLog> {
     use radiance::Supervision as _;
     let group = supervision.rays_per_group();
     let total = params.rays / group as u64 * group as u64;
@@ -245,11 +292,11 @@ fn train(context: &Context, params: &Params, trainer: &mut Trainer, supervision:
         return Err(Failure::Usage(message).into());
     }
     let mut checkpoints = Checkpoints::new(context.work());
-    let mut curve = checkpoints.resume(trainer, |text| context.say(text));
+    let mut curve = checkpoints.resume(trainer, supervision, |text| context.say(text));
     let progress = context.progress("training", total);
     loop {
         if context.interrupted() {
-            checkpoints.write(trainer, &curve).context("cannot write the checkpoint")?;
+            checkpoints.write(trainer, supervision, &curve).context("cannot write the checkpoint")?;
             return Err(Failure::Interrupted.into());
         }
         let report = trainer.step(supervision).map_err(|e| match e {
@@ -263,7 +310,7 @@ fn train(context: &Context, params: &Params, trainer: &mut Trainer, supervision:
         let rays = trainer.rays_done(group);
         curve.add(&report, rays, total);
         progress.set(rays, &curve.note());
-        checkpoints.write_when_due(trainer, &curve).context("cannot write the checkpoint")?;
+        checkpoints.write_when_due(trainer, supervision, &curve).context("cannot write the checkpoint")?;
     }
     Ok(curve.finish(trainer.steps(), trainer.rays_done(group)))
 }

@@ -4,6 +4,7 @@
 //! * [`read_premultiplied`]: a view's picture, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
+//! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
 //!
 //! Colours are display-encoded sRGB in [0, 1] throughout.
@@ -14,18 +15,22 @@
 //! assert_eq!(resize_pillow(&image, 2, 2, Filter::Lanczos).data[0], 200);
 //! ```
 
+mod degradation;
 mod exr_file;
 mod heat;
 mod image_buffer;
+mod operator;
 mod picture_file;
 mod pillow_resample;
 mod png_file;
 mod pool;
 mod srgb;
 
+pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
 pub use heat::{Palette, heat};
 pub use image_buffer::{Picture, Rgba8, to_u8};
+pub use operator::{AxisTaps, Resampling};
 pub use picture_file::read_premultiplied;
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};

@@ -67,7 +67,8 @@ struct Taps {
     weights: Vec<i32>,
 }
 
-fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
+/// First input sample and normalised weights of each output sample.
+pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(usize, Vec<f64>)> {
     let scale = input as f64 / output as f64;
     let stretch = scale.max(1.0);
     let support = filter.support() * stretch;
@@ -77,15 +78,24 @@ fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
             // `as` truncates towards zero and saturates at 0, as the C code's cast and clamp do.
             let first = (centre - support + 0.5) as usize;
             let end = ((centre + support + 0.5) as usize).min(input);
-            let raw: Vec<f64> = (first..end).map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch))).collect();
-            let sum: f64 = raw.iter().sum();
-            let fixed = |w: f64| {
-                let w = if sum == 0.0 { w } else { w / sum } * f64::from(1 << PRECISION_BITS);
-                (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
-            };
-            Taps { first, weights: raw.into_iter().map(fixed).collect() }
+            let mut weights: Vec<f64> =
+                (first..end).map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch))).collect();
+            let sum: f64 = weights.iter().sum();
+            if sum != 0.0 {
+                weights.iter_mut().for_each(|w| *w /= sum);
+            }
+            (first, weights)
         })
         .collect()
+}
+
+fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
+    let fixed = |w: f64| {
+        let w = w * f64::from(1 << PRECISION_BITS);
+        (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
+    };
+    let runs = coefficients(input, output, filter).into_iter();
+    runs.map(|(first, weights)| Taps { first, weights: weights.into_iter().map(fixed).collect() }).collect()
 }
 
 fn clip(accumulated: i32) -> u8 {

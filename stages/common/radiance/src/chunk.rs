@@ -5,12 +5,15 @@ use crate::field::{COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, encode};
 use crate::math::{exp, sigmoid};
 use crate::mlp::{After, Layer, add_outer, multiply};
+use crate::occupancy::{DONE, march};
 use crate::ray::UnitRay;
 use crate::simd::{LANES, kernel};
 use crate::spherical::{BASIS, spherical_harmonics};
 
 /// Samples behind this transmittance, and those of less weight, get no colour and no gradient.
 const FAINT: f32 = 1e-4;
+/// Optical depth at which a ray ends: -ln([`FAINT`]).
+const DARK: f32 = 9.210_34;
 
 /// What one ray adds up to.
 #[derive(Clone, Copy, Debug, Default)]
@@ -33,12 +36,40 @@ pub(crate) struct FeatureGradients {
     pub(crate) levels: Vec<Vec<[f32; FEATURES]>>,
 }
 
-/// Buffers of one worker. "Rows" are one feature of all samples; `n` samples are all, `m` those that count.
+/// Samples of each ray in the first rounds and in all later ones: few while a surface may stop the ray, then more.
+const ROUNDS: [usize; 4] = [8, 8, 16, 32];
+
+/// Samples that were marched together. Their rows have a length of `n`, whole vectors.
+#[derive(Clone, Copy, Debug)]
+struct Round {
+    /// First sample of the round; what has k rows begins at k·start.
+    start: usize,
+    n: usize,
+    /// First of its samples that count.
+    kept: usize,
+}
+
+impl Round {
+    /// Where the `rows` rows of the round lie.
+    fn range(self, rows: usize) -> std::ops::Range<usize> {
+        rows * self.start..rows * (self.start + self.n)
+    }
+}
+
+/// Buffers of one worker. Samples are in rounds: of every ray that is still lit, the next few. "Rows" are one feature of all
+/// samples of a round; of the `m` samples that count, rows are gathered again to be shaded.
 #[derive(Debug, Default)]
 pub(crate) struct Chunk {
     pub(crate) sums: Vec<RaySum>,
-    /// First sample of each ray, and the end.
+    samples: usize,
+    rounds: Vec<Round>,
+    /// Rays still lit, and the step that each ray's march has come to.
+    active: Vec<u32>,
+    next: Vec<u32>,
+    /// First sample of each active ray in the round.
     starts: Vec<usize>,
+    /// Optical depth of each ray so far.
+    depth: Vec<f32>,
     t: Vec<f32>,
     marched: Vec<[f32; 3]>,
     positions: Vec<f32>,
@@ -49,9 +80,13 @@ pub(crate) struct Chunk {
     before: Vec<f32>,
     transmittance: Vec<f32>,
     weight: Vec<f32>,
-    /// Samples that count, and the first of each ray among them.
+    /// Samples that count, round by round, and their rays.
     kept: Vec<u32>,
-    kept_starts: Vec<usize>,
+    kept_ray: Vec<u32>,
+    /// The same, as places in `kept`, ray by ray from front to back; and the first of each ray.
+    along: Vec<u32>,
+    ray_starts: Vec<usize>,
+    bases: Vec<[f32; BASIS]>,
     kept_features: Vec<f32>,
     kept_hidden: Vec<f32>,
     colour_in: Vec<f32>,
@@ -80,108 +115,160 @@ kernel! {
 /// Density of positions (three rows of n): for the occupancy grid.
 pub(crate) fn densities<'a>(chunk: &'a mut Chunk, field: &Field, positions: &[f32], n: usize) -> &'a [f32] {
     fit(&mut chunk.positions, 3 * n).copy_from_slice(positions);
-    chunk.density_network(field, n);
+    chunk.density_network(field, Round { start: 0, n, kept: 0 });
     let raw = &chunk.density[..n];
     let density = fit(&mut chunk.tau, n);
     optical_depths(raw, 1.0, density);
     density
 }
 
+/// Grows a buffer to `len`, keeping what is in it.
+fn grow<T: Clone + Default>(buffer: &mut Vec<T>, len: usize) {
+    if buffer.len() < len {
+        buffer.resize(len, T::default());
+    }
+}
+
 impl Chunk {
-    /// Features, hidden layer and density of the positions in `self.positions` (three rows of n).
-    fn density_network(&mut self, field: &Field, n: usize) {
+    /// Features, hidden layer and density of a round's positions, `self.positions` (three rows of n).
+    fn density_network(&mut self, field: &Field, round: Round) {
+        let n = round.n;
         if n == 0 {
             return;
         }
         let positions = &self.positions[..3 * n];
-        let features = fit(&mut self.features, field.levels.len() * FEATURES * n);
+        let [first, second] = field.layers.density;
+        let part = |buffer: &mut Vec<f32>, rows: usize| grow(buffer, round.range(rows).end);
+        part(&mut self.features, first.inputs);
+        part(&mut self.hidden, first.outputs);
+        part(&mut self.density, second.outputs);
+        let features = &mut self.features[round.range(first.inputs)];
         for (level, rows) in field.levels.iter().zip(features.chunks_exact_mut(FEATURES * n)) {
             encode(level, &field.grid[level.range()], positions, rows, n);
         }
-        let [first, second] = field.layers.density;
-        let hidden = fit(&mut self.hidden, first.outputs * n);
+        let hidden = &mut self.hidden[round.range(first.outputs)];
         multiply(&field.network[first.range()], features, hidden, first.inputs, first.outputs, n, After::Relu);
-        let density = fit(&mut self.density, DENSITY_OUTPUTS * n);
+        let density = &mut self.density[round.range(second.outputs)];
         multiply(&field.network[second.range()], hidden, density, second.inputs, second.outputs, n, After::Linear);
     }
 
     /// Renders rays into [`Chunk::sums`]. `offsets` shift each ray's samples by a share of a step.
     pub(crate) fn forward(&mut self, field: &Field, rays: &[UnitRay], offsets: &[f32]) {
         let step = field.step();
+        for list in [&mut self.kept, &mut self.kept_ray, &mut self.active, &mut self.next] {
+            list.clear();
+        }
+        self.rounds.clear();
         self.t.clear();
         self.marched.clear();
-        self.starts.clear();
-        for (ray, &offset) in rays.iter().zip(offsets) {
-            self.starts.push(self.t.len());
-            let (t, marched) = (&mut self.t, &mut self.marched);
-            field.occupancy.march(ray, step, offset, |at, p| {
-                t.push(at);
-                marched.push(p);
-            });
+        self.samples = 0;
+        self.next.resize(rays.len(), 0);
+        self.depth.clear();
+        self.depth.resize(rays.len(), 0.0);
+        self.sums.clear();
+        self.sums.resize(rays.len(), RaySum { transmittance: 1.0, ..RaySum::default() });
+        self.active.extend(0..rays.len() as u32);
+        while !self.active.is_empty() {
+            let most = ROUNDS[self.rounds.len().min(ROUNDS.len() - 1)];
+            self.round(field, rays, offsets, step, most);
         }
-        self.starts.push(self.t.len());
-        let count = self.t.len();
-        let n = count.next_multiple_of(LANES);
-        let positions = fit(&mut self.positions, 3 * n);
-        for (axis, row) in positions.chunks_exact_mut(n.max(1)).enumerate() {
-            for (value, p) in row.iter_mut().zip(&self.marched) {
+        for (sum, &depth) in self.sums.iter_mut().zip(&self.depth) {
+            if depth > 0.0 {
+                sum.transmittance = exp(-depth);
+            }
+        }
+        self.order(rays.len());
+        self.shade(field, rays);
+    }
+
+    /// Takes every active ray some samples further, and drops those that end.
+    fn round(&mut self, field: &Field, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize) {
+        let start = self.t.len();
+        self.starts.clear();
+        let (t, marched, starts) = (&mut self.t, &mut self.marched, &mut self.starts);
+        march(&field.occupancy, rays, offsets, step, most, &self.active, &mut self.next, t, marched, starts);
+        let count = self.t.len() - start;
+        let round = Round { start, n: count.next_multiple_of(LANES), kept: self.kept.len() };
+        let n = round.n;
+        self.samples += count;
+        self.t.resize(start + n, 0.0);
+        self.marched.resize(start + n, [0.0; 3]);
+        grow(&mut self.positions, 3 * n);
+        for (axis, row) in self.positions[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
+            for (value, p) in row.iter_mut().zip(&self.marched[start..]) {
                 *value = p[axis];
             }
-            row[count..].fill(0.0);
         }
-        self.density_network(field, n);
-        let tau = fit(&mut self.tau, n);
-        optical_depths(&self.density[..n], step, tau);
-        let before = fit(&mut self.before, n);
-        self.sums.clear();
-        for range in self.starts.windows(2) {
-            let (mut depth, mut median) = (0.0f32, None);
-            for i in range[0]..range[1] {
+        self.density_network(field, round);
+        for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
+            grow(buffer, start + n);
+        }
+        let whole = start..start + n;
+        let tau = &mut self.tau[whole.clone()];
+        if n > 0 {
+            optical_depths(&self.density[DENSITY_OUTPUTS * start..][..n], step, tau);
+        }
+        let before = &mut self.before[whole.clone()];
+        for (&r, range) in self.active.iter().zip(self.starts.windows(2)) {
+            let mut depth = self.depth[r as usize];
+            for i in range[0] - start..range[1] - start {
                 before[i] = depth;
                 depth += tau[i];
-                if median.is_none() && depth > std::f32::consts::LN_2 {
-                    median = Some(self.t[i]);
+                if before[i] <= std::f32::consts::LN_2 && depth > std::f32::consts::LN_2 {
+                    self.sums[r as usize].median = Some(self.t[start + i]);
                 }
             }
-            let transmittance = if range[0] == range[1] { 1.0 } else { exp(-depth) };
-            self.sums.push(RaySum { transmittance, median, ..RaySum::default() });
+            self.depth[r as usize] = depth;
         }
         before[count..].fill(0.0);
-        let (transmittance, weight) = (fit(&mut self.transmittance, n), fit(&mut self.weight, n));
-        weights(before, tau, transmittance, weight);
-        self.kept.clear();
-        self.kept_starts.clear();
-        for range in self.starts.windows(2) {
-            self.kept_starts.push(self.kept.len());
-            self.kept.extend((range[0]..range[1]).filter(|&i| transmittance[i] > FAINT && weight[i] > FAINT).map(|i| i as u32));
+        weights(before, tau, &mut self.transmittance[whole.clone()], &mut self.weight[whole]);
+        for (&r, range) in self.active.iter().zip(self.starts.windows(2)) {
+            for i in range[0]..range[1] {
+                if self.transmittance[i] > FAINT && self.weight[i] > FAINT {
+                    self.kept.push(i as u32);
+                    self.kept_ray.push(r);
+                }
+            }
         }
-        self.kept_starts.push(self.kept.len());
-        self.shade(field, rays, n);
+        self.rounds.push(round);
+        let (next, depth) = (&self.next, &self.depth);
+        self.active.retain(|&r| next[r as usize] != DONE && depth[r as usize] < DARK);
+    }
+
+    /// Finds each ray's samples among those that count.
+    fn order(&mut self, rays: usize) {
+        self.ray_starts.clear();
+        self.ray_starts.resize(rays + 1, 0);
+        for &r in &self.kept_ray {
+            self.ray_starts[r as usize + 1] += 1;
+        }
+        for r in 0..rays {
+            self.ray_starts[r + 1] += self.ray_starts[r];
+        }
+        self.along.clear();
+        self.along.resize(self.kept.len(), 0);
+        // Filled from each ray's start, which thereby becomes its end: the next ray's start.
+        for (k, &r) in self.kept_ray.iter().enumerate() {
+            let place = &mut self.ray_starts[r as usize];
+            self.along[*place] = k as u32;
+            *place += 1;
+        }
+        self.ray_starts.rotate_right(1);
+        self.ray_starts[0] = 0;
     }
 
     /// Colours of the samples that count, and each ray's sums.
-    fn shade(&mut self, field: &Field, rays: &[UnitRay], n: usize) {
+    fn shade(&mut self, field: &Field, rays: &[UnitRay]) {
         let m = self.kept.len().next_multiple_of(LANES);
         let input = fit(&mut self.colour_in, COLOUR_INPUTS * m);
-        gather(
-            &self.kept,
-            &self.density[n.min(self.density.len())..],
-            n,
-            DENSITY_OUTPUTS - 1,
-            &mut input[..(DENSITY_OUTPUTS - 1) * m],
-            m,
-        );
-        let directions = &mut input[(DENSITY_OUTPUTS - 1) * m..];
-        for (ray, range) in rays.iter().zip(self.kept_starts.windows(2)) {
-            if range[0] < range[1] {
-                let basis = spherical_harmonics(ray.direction);
-                for k in 0..BASIS {
-                    directions[k * m + range[0]..k * m + range[1]].fill(basis[k]);
-                }
+        gather(&self.rounds, &self.kept, &self.density, DENSITY_OUTPUTS, 1, &mut input[..(DENSITY_OUTPUTS - 1) * m], m);
+        self.bases.clear();
+        self.bases.extend(rays.iter().map(|r| spherical_harmonics(r.direction)));
+        for (k, row) in input[(DENSITY_OUTPUTS - 1) * m..].chunks_exact_mut(m.max(1)).enumerate() {
+            for (value, &r) in row.iter_mut().zip(&self.kept_ray) {
+                *value = self.bases[r as usize][k];
             }
-        }
-        for k in 0..BASIS {
-            directions[k * m + self.kept.len()..(k + 1) * m].fill(0.0);
+            row[self.kept.len()..].fill(0.0);
         }
         let [first, second, third] = field.layers.colour;
         let [hidden1, hidden2] = &mut self.colour_hidden;
@@ -191,9 +278,9 @@ impl Chunk {
         let colour = fit(&mut self.colour, 3 * m);
         multiply(&field.network[third.range()], hidden2, colour, third.inputs, third.outputs, m, After::Linear);
         sigmoids(colour);
-        for (sum, range) in self.sums.iter_mut().zip(self.kept_starts.windows(2)) {
-            for k in range[0]..range[1] {
-                let i = self.kept[k] as usize;
+        for (sum, range) in self.sums.iter_mut().zip(self.ray_starts.windows(2)) {
+            for &k in &self.along[range[0]..range[1]] {
+                let (k, i) = (k as usize, self.kept[k as usize] as usize);
                 let w = self.weight[i];
                 for c in 0..3 {
                     sum.colour[c] = w.mul_add(colour[c * m + k], sum.colour[c]);
@@ -220,7 +307,6 @@ impl Chunk {
             return;
         }
         let m = count.next_multiple_of(LANES);
-        let n = self.t.len().next_multiple_of(LANES);
         let [g1, g2, g3] = &mut self.gradient;
         let widest = field.layers.all().iter().map(|l| l.inputs.max(l.outputs)).max().unwrap_or(0);
         let (a, b) = (fit(g1, widest * m), fit(g2, widest * m));
@@ -230,15 +316,16 @@ impl Chunk {
         for c in 0..3 {
             a[c * m + count..(c + 1) * m].fill(0.0);
         }
-        let longest = self.kept_starts.windows(2).map(|r| r[1] - r[0]).max().unwrap_or(0);
-        let along = fit(g3, 3 * longest);
+        let longest = self.ray_starts.windows(2).map(|r| r[1] - r[0]).max().unwrap_or(0);
+        let along = fit(g3, 4 * longest);
         let (shade, rest) = along.split_at_mut(longest);
-        let (transmittance, weight) = rest.split_at_mut(longest);
-        for (r, range) in self.kept_starts.windows(2).enumerate() {
+        let (transmittance, rest) = rest.split_at_mut(longest);
+        let (weight, by_depth) = rest.split_at_mut(longest);
+        for (r, range) in self.ray_starts.windows(2).enumerate() {
             let (g, background) = (colour_gradients[r], backgrounds[r]);
-            let len = range[1] - range[0];
-            for (j, k) in (range[0]..range[1]).enumerate() {
-                let i = self.kept[k] as usize;
+            let places = &self.along[range[0]..range[1]];
+            for (j, &k) in places.iter().enumerate() {
+                let (k, i) = (k as usize, self.kept[k as usize] as usize);
                 (transmittance[j], weight[j]) = (self.transmittance[i], self.weight[i]);
                 shade[j] = 0.0;
                 for c in 0..3 {
@@ -249,13 +336,11 @@ impl Chunk {
             }
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
-            optical_depth_gradients(
-                &shade[..len],
-                &transmittance[..len],
-                &weight[..len],
-                behind,
-                &mut tau_gradient[range[0]..range[1]],
-            );
+            let len = places.len();
+            optical_depth_gradients(&shade[..len], &transmittance[..len], &weight[..len], behind, &mut by_depth[..len]);
+            for (&k, &gradient) in places.iter().zip(&by_depth[..len]) {
+                tau_gradient[k as usize] = gradient;
+            }
         }
 
         let [first, second, third] = field.layers.colour;
@@ -273,18 +358,21 @@ impl Chunk {
 
         // Row 0 is the raw density; rows 1.. are the colour network's inputs, whose direction part ends here.
         let density = &mut *a;
-        for k in 0..count {
-            let i = self.kept[k] as usize;
-            let slope = if self.density[i] < MAX_RAW { self.tau[i] } else { 0.0 };
-            density[k] = tau_gradient[k] * slope;
+        let raw = |round: &Round, i: u32| self.density[DENSITY_OUTPUTS * round.start + (i as usize - round.start)];
+        for (round, range) in kept_ranges(&self.rounds, count) {
+            for k in range {
+                let i = self.kept[k];
+                let slope = if raw(round, i) < MAX_RAW { self.tau[i as usize] } else { 0.0 };
+                density[k] = tau_gradient[k] * slope;
+            }
         }
         density[count..m].fill(0.0);
         density[m..DENSITY_OUTPUTS * m].copy_from_slice(&b[..(DENSITY_OUTPUTS - 1) * m]);
         let [first, second] = field.layers.density;
         let features = fit(&mut self.kept_features, first.inputs * m);
-        gather(&self.kept, &self.features, n, first.inputs, features, m);
+        gather(&self.rounds, &self.kept, &self.features, first.inputs, 0, features, m);
         let hidden = fit(&mut self.kept_hidden, first.outputs * m);
-        gather(&self.kept, &self.hidden, n, first.outputs, hidden, m);
+        gather(&self.rounds, &self.kept, &self.hidden, first.outputs, 0, hidden, m);
         back(second, hidden, After::Gate(hidden), density, b);
         back(first, features, After::Linear, b, density);
 
@@ -296,14 +384,24 @@ impl Chunk {
     }
 }
 
-/// Copies the kept samples' columns of `rows` rows (stride `n`) to rows of stride `m`; what pads them is 0.
-fn gather(kept: &[u32], from: &[f32], n: usize, rows: usize, to: &mut [f32], m: usize) {
-    for r in 0..rows {
-        let source = &from[r * n..];
-        let target = &mut to[r * m..(r + 1) * m];
-        for (value, &i) in target.iter_mut().zip(kept) {
-            *value = source[i as usize];
+/// Each round and the places of its samples in the list of those that count.
+fn kept_ranges(rounds: &[Round], count: usize) -> impl Iterator<Item = (&Round, std::ops::Range<usize>)> {
+    let ends = rounds.iter().skip(1).map(|r| r.kept).chain([count]);
+    rounds.iter().zip(ends).map(|(round, end)| (round, round.kept..end))
+}
+
+/// Copies the kept samples' columns out of the rounds, whose `rows` rows lie in `from`, to rows of stride `m`, leaving out the
+/// first `skipped` rows; what pads the result is 0.
+fn gather(rounds: &[Round], kept: &[u32], from: &[f32], rows: usize, skipped: usize, to: &mut [f32], m: usize) {
+    for (round, range) in kept_ranges(rounds, kept.len()) {
+        for (row, target) in (skipped..rows).zip(to.chunks_exact_mut(m.max(1))) {
+            let source = &from[rows * round.start + row * round.n..][..round.n];
+            for (value, &i) in target[range.clone()].iter_mut().zip(&kept[range.clone()]) {
+                *value = source[i as usize - round.start];
+            }
         }
+    }
+    for target in to.chunks_exact_mut(m.max(1)) {
         target[kept.len()..].fill(0.0);
     }
 }
@@ -311,16 +409,15 @@ fn gather(kept: &[u32], from: &[f32], n: usize, rows: usize, to: &mut [f32], m: 
 impl Chunk {
     /// Samples marched in the last forward pass.
     pub(crate) fn samples(&self) -> usize {
-        self.t.len()
+        self.samples
     }
 }
 
 #[cfg(test)]
 impl Chunk {
-    /// Sample positions of each ray, and which of them got a colour.
-    pub(crate) fn marched_and_kept(&self) -> (Vec<Vec<[f32; 3]>>, Vec<Vec<bool>>) {
-        let ranges = self.starts.windows(2).map(|r| r[0]..r[1]);
-        let kept = |i: usize| self.kept.binary_search(&(i as u32)).is_ok();
-        (ranges.clone().map(|r| self.marched[r].to_vec()).collect(), ranges.map(|r| r.map(kept).collect()).collect())
+    /// Positions of each ray's samples that count, from front to back.
+    pub(crate) fn kept_positions(&self) -> Vec<Vec<[f32; 3]>> {
+        let at = |&k: &u32| self.marched[self.kept[k as usize] as usize];
+        self.ray_starts.windows(2).map(|r| self.along[r[0]..r[1]].iter().map(at).collect()).collect()
     }
 }

@@ -3,7 +3,8 @@
 //! A level whose vertices fit its table is stored densely; a finer one is hashed (Müller et al. 2022, "Instant neural graphics
 //! primitives", eq. 4), and collisions are left to the networks.
 
-use crate::simd::{LANES, kernel};
+use crate::math::floor;
+use crate::simd::{LANES, Quad as _, kernel};
 
 /// Features a vertex.
 pub(crate) const FEATURES: usize = 4;
@@ -54,15 +55,16 @@ struct Corners {
 #[inline(always)]
 fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
     let resolution = level.resolution as f32;
-    let last = level.resolution as i32 - 1;
+    let last = resolution - 1.0;
     let mut cell = [[0u32; LANES]; 3];
     let mut fraction = [[0.0f32; LANES]; 3];
     for axis in 0..3 {
         for l in 0..LANES {
             let at = p[axis][l].max(0.0).min(1.0) * resolution;
-            let c = (at as i32).min(last);
-            cell[axis][l] = c as u32;
-            fraction[axis][l] = at - c as f32;
+            // A position on the far face belongs to the last cell: 0.5 keeps the product inside it.
+            let (whole, c) = floor(at.min(last + 0.5));
+            cell[axis][l] = c;
+            fraction[axis][l] = at - whole;
         }
     }
     let side = level.resolution + 1;
@@ -96,24 +98,20 @@ kernel! {
         let mut around = Corners::new();
         let mut s = 0;
         while s < n {
-            let p = [0, 1, 2].map(|axis| -> &[f32; LANES] { positions[axis * n + s..][..LANES].try_into().expect("whole vectors") });
-            corners(level, p, &mut around);
-            let mut block = [[0.0f32; LANES]; FEATURES];
+            let (p, _) = positions[s..].as_chunks::<LANES>();
+            corners(level, [&p[0], &p[n / LANES], &p[2 * n / LANES]], &mut around);
+            let mut block = [[0.0f32; FEATURES]; LANES];
             for l in 0..LANES {
-                let mut sum = [0.0f32; FEATURES];
+                let mut sum = L::Quad::splat(0.0);
                 for c in 0..8 {
-                    let entry = &table[around.index[c][l] as usize];
-                    let w = around.weight[c][l];
-                    for k in 0..FEATURES {
-                        sum[k] = entry[k].mul_add(w, sum[k]);
-                    }
+                    let entry = L::Quad::load(&table[around.index[c][l] as usize]);
+                    sum = entry.mul_add(L::Quad::splat(around.weight[c][l]), sum);
                 }
-                for k in 0..FEATURES {
-                    block[k][l] = sum[k];
-                }
+                sum.store(&mut block[l]);
             }
             for k in 0..FEATURES {
-                features[k * n + s..][..LANES].copy_from_slice(&block[k]);
+                let row: [f32; LANES] = std::array::from_fn(|l| block[l][k]);
+                features[k * n + s..][..LANES].copy_from_slice(&row);
             }
             s += LANES;
         }
@@ -134,12 +132,10 @@ kernel! {
             }
             corners(level, [&p[0], &p[1], &p[2]], &mut around);
             for (l, d) in gradients.iter().enumerate() {
+                let d = L::Quad::load(d);
                 for c in 0..8 {
                     let entry = &mut gradient[around.index[c][l] as usize];
-                    let w = around.weight[c][l];
-                    for k in 0..FEATURES {
-                        entry[k] = d[k].mul_add(w, entry[k]);
-                    }
+                    d.mul_add(L::Quad::splat(around.weight[c][l]), L::Quad::load(entry)).store(entry);
                 }
             }
         }

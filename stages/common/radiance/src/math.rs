@@ -7,7 +7,8 @@ pub(crate) fn exp(x: f32) -> f32 {
     let x = x.max(-87.0).min(87.0);
     // Adding and taking away 1.5·2^23 rounds to the nearest whole number.
     const ROUND: f32 = 12_582_912.0;
-    let k = x.mul_add(std::f32::consts::LOG2_E, ROUND) - ROUND;
+    let rounded = x.mul_add(std::f32::consts::LOG2_E, ROUND);
+    let k = rounded - ROUND;
     let r = k.mul_add(-0.693_359_4, x);
     let r = k.mul_add(2.121_944_4e-4, r);
     let mut p = 1.987_569_1e-4f32;
@@ -17,7 +18,17 @@ pub(crate) fn exp(x: f32) -> f32 {
     p = p.mul_add(r, 1.666_666_5e-1);
     p = p.mul_add(r, 5.000_000_3e-1);
     let e = (p * r).mul_add(r, r) + 1.0;
-    e * f32::from_bits(((k as i32 + 127) << 23) as u32)
+    // The low bits of `rounded` are k; a cast would saturate, and so not vectorise.
+    e * f32::from_bits(rounded.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
+}
+
+/// The whole number not above x, for x in 0..=2^22, as a number and as an integer. A cast would saturate, and so not vectorise.
+#[inline(always)]
+pub(crate) fn floor(x: f32) -> (f32, u32) {
+    const ROUND: f32 = 8_388_608.0;
+    let nearest = (x + ROUND) - ROUND;
+    let floor = if nearest > x { nearest - 1.0 } else { nearest };
+    (floor, (floor + ROUND).to_bits() - ROUND.to_bits())
 }
 
 /// 1 - e^(-x) for x ≥ 0, without losing small x to cancellation.
@@ -46,6 +57,13 @@ pub(crate) fn sigmoid(x: f32) -> f32 {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn floor_is_the_whole_part() {
+        for x in (0..200_000).map(|i| i as f32 * 0.021).chain([0.0, 0.5, 1.0, 1.5, 2.5, 4096.0, 4_194_303.5]) {
+            assert_eq!(floor(x), (x.floor(), x as u32), "{x}");
+        }
+    }
 
     proptest! {
         #[test]

@@ -1,102 +1,132 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
 use crate::ray::UnitRay;
+use crate::simd::kernel;
 
 /// Cells along each axis.
 pub(crate) const GRID: usize = 128;
-/// Cells along each axis of a block; empty blocks are skipped whole.
-const BLOCK: usize = 8;
-const BLOCKS: usize = GRID / BLOCK;
+/// A word holds 4³ of what is below it: cells in a brick, bricks in a block.
+const SIDE: usize = 4;
+/// Bricks and blocks along each axis.
+const BRICKS: usize = GRID / SIDE;
+const BLOCKS: usize = BRICKS / SIDE;
+
+/// Which word of a level and which bit in it belong to a place.
+#[inline(always)]
+fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
+    let word = x / SIDE + words * (y / SIDE + words * (z / SIDE));
+    (word, x % SIDE + SIDE * (y % SIDE + SIDE * (z % SIDE)))
+}
 
 /// A slowly decaying maximum of the density seen in each cell, and the cells where it counts.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Occupancy {
     pub(crate) density: Vec<f32>,
-    bits: Vec<u64>,
+    /// A bit a cell, and a bit a brick that isn't empty.
+    bricks: Vec<u64>,
     blocks: Vec<u64>,
 }
 
 impl Occupancy {
     /// Everything may be occupied.
     pub(crate) fn full() -> Self {
-        let mut full = Self { density: vec![0.0; GRID * GRID * GRID], bits: Vec::new(), blocks: Vec::new() };
+        let mut full = Self { density: vec![0.0; GRID * GRID * GRID], bricks: Vec::new(), blocks: Vec::new() };
         full.set(|_| true);
         full
     }
 
+    /// Whether a cell may hold something. Cells are counted with x fastest.
     pub(crate) fn is_occupied(&self, cell: usize) -> bool {
-        self.bits[cell / 64] >> (cell % 64) & 1 == 1
+        let (word, bit) = place([cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)], BRICKS);
+        self.bricks[word] >> bit & 1 == 1
     }
 
-    /// Sets every cell anew. x runs fastest.
+    /// Sets every cell anew.
     pub(crate) fn set(&mut self, occupied: impl Fn(usize) -> bool) {
-        self.bits = vec![0; GRID * GRID * GRID / 64];
-        self.blocks = vec![0; (BLOCKS * BLOCKS * BLOCKS).div_ceil(64)];
+        self.bricks = vec![0; BRICKS * BRICKS * BRICKS];
+        self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
         for cell in 0..GRID * GRID * GRID {
             if occupied(cell) {
-                self.bits[cell / 64] |= 1 << (cell % 64);
-                let (x, y, z) = (cell % GRID / BLOCK, cell / GRID % GRID / BLOCK, cell / (GRID * GRID) / BLOCK);
-                let block = x + BLOCKS * (y + BLOCKS * z);
-                self.blocks[block / 64] |= 1 << (block % 64);
+                let at = [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)];
+                let (word, bit) = place(at, BRICKS);
+                self.bricks[word] |= 1 << bit;
+                let (word, bit) = place(at.map(|c| c / SIDE), BLOCKS);
+                self.blocks[word] |= 1 << bit;
             }
         }
     }
 
     /// Cells that are occupied, in order.
     pub(crate) fn cells(&self) -> impl Iterator<Item = usize> + '_ {
-        self.bits.iter().enumerate().flat_map(|(word, &bits)| {
-            let mut left = bits;
-            std::iter::from_fn(move || {
-                (left != 0).then(|| {
-                    let bit = left.trailing_zeros() as usize;
-                    left &= left - 1;
-                    word * 64 + bit
-                })
-            })
-        })
+        (0..GRID * GRID * GRID).filter(|&cell| self.is_occupied(cell))
     }
 
     /// Cells as bytes, 1 where occupied, for a file.
     pub(crate) fn to_bytes(&self) -> Vec<u8> {
         (0..GRID * GRID * GRID).map(|cell| u8::from(self.is_occupied(cell))).collect()
     }
+}
 
-    /// Distances of a ray's samples: at enter + (k + offset)·step wherever the cell is occupied.
-    pub(crate) fn march(&self, ray: &UnitRay, step: f32, offset: f32, mut sample: impl FnMut(f32, [f32; 3])) {
-        let inverse = ray.direction.map(|d| 1.0 / d);
+/// Where a ray's march stands: the number of its next step; [`DONE`] once it has left the box.
+pub(crate) const DONE: u32 = u32::MAX;
+
+kernel! {
+    /// Marches on: at most `most` more samples of each of the `active` rays, wherever a cell is occupied, at distances
+    /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends distances and positions; `starts` gets
+    /// the first sample of each active ray, and the end.
+    pub(crate) fn march<L>(
+        occupancy: &Occupancy, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
+        t: &mut Vec<f32>, positions: &mut Vec<[f32; 3]>, starts: &mut Vec<usize>,
+    ) {
         let last = GRID as f32 - 1.0;
-        let mut k = 0u32;
-        loop {
-            let t = (k as f32 + offset).mul_add(step, ray.enter);
-            if t >= ray.leave {
-                return;
-            }
-            let p: [f32; 3] = std::array::from_fn(|i| ray.direction[i].mul_add(t, ray.origin[i]));
-            let cell = p.map(|x| (x * GRID as f32).max(0.0).min(last) as usize);
-            let block = cell.map(|c| c / BLOCK);
-            let block_index = block[0] + BLOCKS * (block[1] + BLOCKS * block[2]);
-            let (low, size) = if self.blocks[block_index / 64] >> (block_index % 64) & 1 == 0 {
-                (block.map(|b| b * BLOCK), BLOCK)
-            } else if !self.is_occupied(cell[0] + GRID * (cell[1] + GRID * cell[2])) {
-                (cell, 1)
-            } else {
-                sample(t, p);
-                k += 1;
-                continue;
-            };
-            // Where the ray leaves this empty cell or block; at least one step on.
-            let mut exit = f32::INFINITY;
-            for i in 0..3 {
-                let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
-                let until = (face - ray.origin[i]) * inverse[i];
-                if ray.direction[i] != 0.0 && until < exit {
-                    exit = until;
+        let per_step = 1.0 / step;
+        for &r in active {
+            starts.push(t.len());
+            let (ray, offset) = (&rays[r as usize], offsets[r as usize]);
+            let inverse = ray.direction.map(|d| 1.0 / d);
+            let mut k = next[r as usize];
+            let mut left = most;
+            while left > 0 {
+                let at = (k as f32 + offset).mul_add(step, ray.enter);
+                if at >= ray.leave {
+                    k = DONE;
+                    break;
                 }
+                let p: [f32; 3] = std::array::from_fn(|i| ray.direction[i].mul_add(at, ray.origin[i]));
+                let cell = p.map(|x| (x * GRID as f32).max(0.0).min(last) as i32 as usize);
+                let brick = cell.map(|c| c / SIDE);
+                let (block_word, brick_bit) = place(brick, BLOCKS);
+                let (brick_word, cell_bit) = place(cell, BRICKS);
+                let bricks = occupancy.blocks[block_word];
+                let (low, size) = if bricks == 0 {
+                    (brick.map(|b| b / SIDE * (SIDE * SIDE)), SIDE * SIDE)
+                } else if bricks >> brick_bit & 1 == 0 {
+                    (brick.map(|b| b * SIDE), SIDE)
+                } else if occupancy.bricks[brick_word] >> cell_bit & 1 == 0 {
+                    (cell, 1)
+                } else {
+                    t.push(at);
+                    positions.push(p);
+                    k += 1;
+                    left -= 1;
+                    continue;
+                };
+                // Where the ray leaves this empty cell or block; at least one step on.
+                let mut exit = f32::INFINITY;
+                for i in 0..3 {
+                    let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
+                    let until = (face - ray.origin[i]) * inverse[i];
+                    if ray.direction[i] != 0.0 && until < exit {
+                        exit = until;
+                    }
+                }
+                let onwards = (exit - ray.enter).mul_add(per_step, -offset).ceil();
+                // `as` saturates: an exit that is NaN or infinite moves on by one step.
+                k = (k + 1).max(if onwards.is_finite() { onwards as u32 } else { 0 });
             }
-            let next = ((exit - ray.enter) / step - offset).ceil();
-            // `as` saturates: an exit that is NaN or infinite moves on by one step.
-            k = (k + 1).max(if next.is_finite() { next as u32 } else { 0 });
+            next[r as usize] = k;
         }
+        starts.push(t.len());
     }
 }
 
@@ -123,7 +153,11 @@ mod tests {
                 .fold(f32::INFINITY, f32::min);
             let ray = UnitRay { origin, direction, enter: 0.0, leave };
             let mut found = Vec::new();
-            occupancy.march(&ray, step, 0.3, |t, _| found.push(t));
+            // In parts, as the renderer does.
+            let (mut next, mut positions) = ([0], Vec::new());
+            while next[0] != DONE {
+                march(&occupancy, &[ray], &[0.3], step, 5, &[0], &mut next, &mut found, &mut positions, &mut Vec::new());
+            }
             let all = (0..2000).map(|k| (k as f32 + 0.3).mul_add(step, 0.0)).take_while(|t| *t < leave);
             let expected: Vec<f32> = all
                 .filter(|&t| {

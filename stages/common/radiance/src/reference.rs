@@ -6,6 +6,7 @@ use crate::chunk::{Chunk, FeatureGradients};
 use crate::field::{Architecture, COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
+use crate::occupancy::march;
 use crate::random::Draws;
 use crate::ray::{Ray, clip};
 use crate::simd::LANES;
@@ -113,7 +114,18 @@ fn fused_passes_equal_the_plain_ones() {
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
     chunk.forward(&field, &clipped, &[0.5; 20]);
-    let (samples, kept) = chunk.marched_and_kept();
+    // All samples of each ray, marched at once.
+    let samples: Vec<Vec<[f32; 3]>> = (0..rays.len())
+        .map(|r| {
+            let mut positions = Vec::new();
+            let (step, mut next) = (field.step(), vec![0; rays.len()]);
+            let one = [r as u32];
+            march(&field.occupancy, &clipped, &[0.5; 20], step, 999, &one, &mut next, &mut vec![], &mut positions, &mut vec![]);
+            positions
+        })
+        .collect();
+    let kept: Vec<Vec<bool>> =
+        samples.iter().zip(chunk.kept_positions()).map(|(all, kept)| all.iter().map(|p| kept.contains(p)).collect()).collect();
     assert!(samples.iter().map(Vec::len).sum::<usize>() > 100);
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let mut judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
@@ -174,6 +186,44 @@ fn fused_passes_equal_the_plain_ones() {
             norm.sqrt()
         );
     }
+}
+
+/// Rays that end where it is dark see what the whole rays would, but for the share of light that was left.
+#[test]
+fn stopping_early_loses_no_more_than_the_light_that_was_left() {
+    let (mut field, rays) = example();
+    // Dense: most rays are dark after a few samples.
+    let [_, second] = field.layers.density;
+    field.network[second.range()].iter_mut().step_by(second.outputs).for_each(|w| *w = 6.0);
+    let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
+    let mut chunk = Chunk::default();
+    chunk.forward(&field, &clipped, &[0.5; 20]);
+    let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
+    let judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
+    let mut stopped = 0;
+    for (r, sum) in chunk.sums.iter().enumerate() {
+        let (mut positions, mut next) = (Vec::new(), vec![0; rays.len()]);
+        let one = [r as u32];
+        march(
+            &field.occupancy,
+            &clipped,
+            &[0.5; 20],
+            field.step(),
+            999,
+            &one,
+            &mut next,
+            &mut vec![],
+            &mut positions,
+            &mut vec![],
+        );
+        stopped += usize::from(sum.transmittance < 1e-4);
+        let exact = judge.ray(&rays[r], &positions, &vec![true; positions.len()]);
+        for c in 0..3 {
+            let ours = f64::from(sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]));
+            assert!((ours - exact[c]).abs() < 1e-3, "ray {r}: {ours} {}", exact[c]);
+        }
+    }
+    assert!(stopped > 5, "{stopped} rays ended in the dark");
 }
 
 #[test]

@@ -69,8 +69,38 @@ pub fn set_family(family: Family) {
     }
 }
 
+/// Four `f32`: the features of a vertex.
+pub(crate) trait Quad: Copy {
+    fn splat(value: f32) -> Self;
+    fn load(from: &[f32; 4]) -> Self;
+    fn store(self, to: &mut [f32; 4]);
+    /// self · factor + addend, rounded once.
+    fn mul_add(self, factor: Self, addend: Self) -> Self;
+}
+
+impl Quad for [f32; 4] {
+    #[inline(always)]
+    fn splat(value: f32) -> Self {
+        [value; 4]
+    }
+    #[inline(always)]
+    fn load(from: &[f32; 4]) -> Self {
+        *from
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [f32; 4]) {
+        *to = self;
+    }
+    #[inline(always)]
+    fn mul_add(self, factor: Self, addend: Self) -> Self {
+        std::array::from_fn(|i| self[i].mul_add(factor[i], addend[i]))
+    }
+}
+
 /// Sixteen `f32`.
 pub(crate) trait Lanes: Copy {
+    /// Four of the same family.
+    type Quad: Quad;
     /// Whether 24 of them fit into registers at once.
     const WIDE: bool;
     fn splat(value: f32) -> Self;
@@ -89,6 +119,7 @@ pub(crate) trait Lanes: Copy {
 pub(crate) struct Portable([f32; LANES]);
 
 impl Lanes for Portable {
+    type Quad = [f32; 4];
     const WIDE: bool = false;
     #[inline(always)]
     fn splat(value: f32) -> Self {
@@ -127,12 +158,39 @@ pub(crate) mod x86 {
 
     use std::arch::x86_64::*;
 
-    use super::{LANES, Lanes};
+    use super::{LANES, Lanes, Quad};
+
+    #[derive(Clone, Copy)]
+    pub(crate) struct Four(__m128);
+
+    impl Quad for Four {
+        #[inline(always)]
+        fn splat(value: f32) -> Self {
+            // SAFETY: the caller runs with AVX2 or AVX-512 (module docs).
+            Self(unsafe { _mm_set1_ps(value) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32; 4]) -> Self {
+            // SAFETY: four floats are there; the caller runs with AVX2 or AVX-512.
+            Self(unsafe { _mm_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32; 4]) {
+            // SAFETY: four floats are there; the caller runs with AVX2 or AVX-512.
+            unsafe { _mm_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn mul_add(self, factor: Self, addend: Self) -> Self {
+            // SAFETY: the caller runs with FMA.
+            Self(unsafe { _mm_fmadd_ps(self.0, factor.0, addend.0) })
+        }
+    }
 
     #[derive(Clone, Copy)]
     pub(crate) struct Avx512(__m512);
 
     impl Lanes for Avx512 {
+        type Quad = Four;
         const WIDE: bool = true;
         #[inline(always)]
         fn splat(value: f32) -> Self {
@@ -175,6 +233,7 @@ pub(crate) mod x86 {
     pub(crate) struct Avx2([__m256; 2]);
 
     impl Lanes for Avx2 {
+        type Quad = Four;
         const WIDE: bool = false;
         #[inline(always)]
         fn splat(value: f32) -> Self {

@@ -23,6 +23,9 @@ pub trait Supervision: Sync {
     fn cast(&self, group: u64, rays: &mut [Ray]);
     /// The group's loss, given its rays' colours; writes the loss's gradient by each colour.
     fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
+    /// Is given each group's colours again after a step that went well, in the order of the groups: for a supervision that keeps
+    /// what was rendered.
+    fn remember(&mut self, _group: u64, _colours: &[[f32; 3]]) {}
 }
 
 /// How to train.
@@ -109,6 +112,7 @@ struct Moments {
 /// What a shard leaves for the sums.
 #[derive(Default)]
 struct Shard {
+    colours: Vec<[f32; 3]>,
     features: FeatureGradients,
     network: Vec<f32>,
     loss: f64,
@@ -187,7 +191,7 @@ impl Trainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &impl Supervision) -> Result<Option<StepReport>, TrainingError> {
+    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
         let group = supervision.rays_per_group();
         let left = self.options.rays.saturating_sub(self.rays_done(group)) as usize / group;
         if left == 0 {
@@ -204,10 +208,11 @@ impl Trainer {
 
         let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
         let first_group = self.groups;
+        let judge = &*supervision;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, field, transposed, supervision, options.seed, first_group, range, groups);
+            shard.run(&mut worker, field, transposed, judge, options.seed, first_group, range, groups);
             lock(workers).push(worker);
         });
 
@@ -231,6 +236,8 @@ impl Trainer {
             self.rate_scale *= 0.5;
         } else {
             self.apply(group);
+            let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(group));
+            (first_group..).zip(colours).for_each(|(group, colours)| supervision.remember(group, colours));
         }
         self.step += 1;
         Ok(Some(StepReport { loss, rays: groups * group, samples, skipped: fault.is_some() }))
@@ -421,6 +428,7 @@ impl Shard {
         groups: usize,
     ) {
         let group = supervision.rays_per_group();
+        self.colours.clear();
         self.features.positions.clear();
         self.features.levels.iter_mut().for_each(Vec::clear);
         self.network.resize(field.network.len(), 0.0);
@@ -456,6 +464,7 @@ impl Shard {
                 self.loss +=
                     supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
             }
+            self.colours.extend_from_slice(&worker.colours);
             worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
             worker.chunk.backward(
                 field,

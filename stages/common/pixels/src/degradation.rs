@@ -1,0 +1,42 @@
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::Filter;
+
+/// How LR pictures are made from HR ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Kernel {
+    /// Pillow's Lanczos, as the paper does.
+    Lanczos,
+    /// Pillow's bicubic.
+    Bicubic,
+    /// Pillow's box: the mean of whole pixels, premultiplied.
+    Box,
+    /// The paper code's average: colour and alpha apart, never rounded. Needs a whole scale.
+    Avg,
+}
+
+impl Kernel {
+    /// The filter it resizes with; `Avg` isn't one, but a box is nearly the same.
+    pub fn filter(self) -> Filter {
+        match self {
+            Self::Lanczos => Filter::Lanczos,
+            Self::Bicubic => Filter::Bicubic,
+            Self::Box | Self::Avg => Filter::Box,
+        }
+    }
+}
+
+/// Name of the file, beside the LR pictures, that says how they were made.
+pub const DEGRADATION_FILE: &str = "degradation.json";
+
+/// `degradation.json`: what made LR pictures of HR ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Degradation {
+    /// The kernel.
+    pub kernel: Kernel,
+    /// Width and height of the HR pictures.
+    pub hr: [u32; 2],
+}

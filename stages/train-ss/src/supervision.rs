@@ -1,0 +1,346 @@
+use pixels::{Filter, Picture, Resampling};
+use radiance::{Draws, Ray};
+use scene::{Background, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::memory::Memory;
+
+/// What an LR pixel is compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Supervision {
+    /// The mean of its sub-rays, whatever made the LR pictures: the paper's (eq. 4).
+    Average,
+    /// The same, with the LR pictures filtered once so that they look as if averaging had made them.
+    Refiltered,
+    /// What the known kernel makes of the field's own HR pixels.
+    Kernel,
+}
+
+/// Supersampling: a training pixel is drawn at random, sub-rays are cast through it, and their mean is compared with a target
+/// (mean squared error over the three channels).
+///
+/// With A the average over a pixel's sub-rays, K the operator that made the LR pictures y, and c the field's HR pixels, the
+/// target is y for `average` and y + (A - K)·Uy for `refiltered`, where U enlarges. For `kernel` it is y + (A - K)·c': c' are
+/// the HR pixels as last rendered ([`Memory`]). Where c' has caught up, A c = y + (A - K)c' says K c = y: the kernel's own
+/// equation, at the price of the average's rays (defect correction).
+pub struct Supersampling {
+    views: Vec<TrainingView>,
+    pixels: u64,
+    background: Background,
+    /// Sub-rays along x and y.
+    side: [usize; 2],
+    jitter: bool,
+    seed: u64,
+    memory: Option<Memory>,
+}
+
+struct TrainingView {
+    picture: Picture,
+    /// Number of pixels in the views before this one.
+    before: u64,
+    origin: [f32; 3],
+    /// Direction of image position (0, 0), and what one pixel to the right or down adds; not of unit length.
+    corner: [f64; 3],
+    right: [f64; 3],
+    down: [f64; 3],
+}
+
+/// How to supersample.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SupersamplingOptions {
+    /// What is compared.
+    pub supervision: Supervision,
+    /// Size of the HR pictures that the field is to render, over that of the LR ones, per axis.
+    pub scale: [f64; 2],
+    /// The filter that made the LR pictures.
+    pub filter: Filter,
+    /// Whether a sub-ray passes anywhere in its share of the pixel instead of at its centre.
+    pub jitter: bool,
+    /// Seed of what is drawn.
+    pub seed: u64,
+}
+
+/// Purposes of draws.
+const PIXEL: u64 = 100;
+const BACKGROUND: u64 = 101;
+const JITTER: u64 = 102;
+
+/// Above this (254.5 in 8 bits) an LR sample may have been clipped, and below its counterpart.
+const SATURATED: f32 = 254.5 / 255.0;
+
+impl Supersampling {
+    /// Supervision by pictures that match the views: RGB over the background, or premultiplied RGBA where that is open.
+    pub fn new(views: &Views, pictures: Vec<Picture>, options: &SupersamplingOptions) -> Self {
+        let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
+        let operator = |picture: &Picture| {
+            let (low, high) = ((picture.width, picture.height), (fine(picture.width, 0), fine(picture.height, 1)));
+            (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
+        };
+        let smallest = |i: usize, length: fn(&Picture) -> usize| pictures.iter().map(|p| fine(length(p), i)).min().unwrap_or(1);
+        let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
+        let side = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
+        let mut memory = None;
+        let mut pixels = 0;
+        let mut ready = Vec::with_capacity(pictures.len());
+        for (view, mut picture) in views.views.iter().zip(pictures) {
+            match options.supervision {
+                Supervision::Average => {}
+                Supervision::Refiltered => {
+                    let (enlarge, shrink) = operator(&picture);
+                    picture = refiltered(&picture, &enlarge, &shrink);
+                }
+                Supervision::Kernel => {
+                    let (enlarge, shrink) = operator(&picture);
+                    memory.get_or_insert_with(|| Memory::new(side)).add(&enlarge.apply(&picture), shrink);
+                }
+            }
+            let before = pixels;
+            pixels += (picture.width * picture.height) as u64;
+            let (k, r) = (view.camera.intrinsics, view.camera.rotation());
+            let corner = r * glam::DVec3::new(-k.cx / k.fx, k.cy / k.fy, -1.0);
+            ready.push(TrainingView {
+                picture,
+                before,
+                origin: view.camera.centre().as_vec3().to_array(),
+                corner: corner.to_array(),
+                right: (r.x_axis / k.fx).to_array(),
+                down: (-r.y_axis / k.fy).to_array(),
+            });
+        }
+        let (jitter, seed) = (options.jitter, options.seed);
+        Self { views: ready, pixels, background: views.background, side, jitter, seed, memory }
+    }
+
+    /// Sub-rays of an LR pixel, along x and y.
+    pub fn side(&self) -> [usize; 2] {
+        self.side
+    }
+
+    /// The field's HR pixels as last rendered, where the supervision keeps them.
+    pub(crate) fn memory(&self) -> Option<&Memory> {
+        self.memory.as_ref()
+    }
+
+    /// The same, to be restored.
+    pub(crate) fn memory_mut(&mut self) -> Option<&mut Memory> {
+        self.memory.as_mut()
+    }
+
+    /// The view and pixel that a group trains on.
+    fn pixel(&self, group: u64) -> (usize, usize) {
+        let at = Draws::new(self.seed, PIXEL, group).below(self.pixels);
+        let view = self.views.partition_point(|v| v.before <= at) - 1;
+        (view, (at - self.views[view].before) as usize)
+    }
+
+    /// What lies behind a group's rays: with an open background another colour each time, so that opacity is learnt.
+    fn behind(&self, group: u64) -> [f32; 3] {
+        if self.background == Background::Alpha {
+            let mut draws = Draws::new(self.seed, BACKGROUND, group);
+            [0, 1, 2].map(|_| draws.uniform())
+        } else {
+            [self.background.shown(); 3]
+        }
+    }
+}
+
+/// The picture as averaging would have made it: y + (A - K)·Uy, with A the average over LR pixels.
+fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> Picture {
+    let fine = enlarge.apply(picture);
+    let average = Resampling::new(Filter::Box, (fine.width, fine.height), (picture.width, picture.height));
+    let mut out = average.apply(&fine);
+    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&fine).data) {
+        *value += y - ky;
+    }
+    out
+}
+
+impl radiance::Supervision for Supersampling {
+    fn rays_per_group(&self) -> usize {
+        self.side[0] * self.side[1]
+    }
+
+    fn cast(&self, group: u64, rays: &mut [Ray]) {
+        let (index, pixel) = self.pixel(group);
+        let view = &self.views[index];
+        let background = self.behind(group);
+        let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
+        let mut draws = Draws::new(self.seed, JITTER, group);
+        let mut offset = || if self.jitter { f64::from(draws.uniform()) } else { 0.5 };
+        // Where the sub-rays begin, and how far apart they are, in LR pixels.
+        let (start, apart) = match &self.memory {
+            Some(memory) => memory.block_in_pixels(index, x, y),
+            None => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
+        };
+        for (k, ray) in rays.iter_mut().enumerate() {
+            let (a, b) = (k % self.side[0], k / self.side[0]);
+            let u = start[0] + (a as f64 + offset()) * apart[0];
+            let v = start[1] + (b as f64 + offset()) * apart[1];
+            let d: [f64; 3] = std::array::from_fn(|i| view.corner[i] + u * view.right[i] + v * view.down[i]);
+            let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
+            *ray = Ray { origin: view.origin, direction: d.map(|x| (x / length) as f32), background };
+        }
+    }
+
+    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        let (index, pixel) = self.pixel(group);
+        let picture = &self.views[index].picture;
+        let sample = &picture.data[pixel * picture.channels..][..picture.channels];
+        let share = 1.0 / colours.len() as f32;
+        let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
+        let correction = self.memory.as_ref().map(|m| m.correction(index, pixel % picture.width, pixel / picture.width));
+        let mut loss = 0.0;
+        for c in 0..3 {
+            let target = if picture.channels == 4 { sample[c] + (1.0 - sample[3]) * behind[c] } else { sample[c] };
+            let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
+            let mut residual = mean - target;
+            if let Some(correction) = &correction {
+                residual += correction[c];
+                // What was clipped says only that the true value is at least, or at most, this.
+                if (target >= SATURATED && residual > 0.0) || (target <= 1.0 - SATURATED && residual < 0.0) {
+                    residual = 0.0;
+                }
+            }
+            loss += f64::from(residual) * f64::from(residual) / 3.0;
+            for gradient in gradients.iter_mut() {
+                gradient[c] = residual * share * (2.0 / 3.0);
+            }
+        }
+        loss
+    }
+
+    fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
+        let (index, pixel) = self.pixel(group);
+        let width = self.views[index].picture.width;
+        if let Some(memory) = &mut self.memory {
+            memory.remember(index, pixel % width, pixel / width, colours);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::Supervision as _;
+    use scene::{Bounds, Camera, Intrinsics, View};
+
+    use super::*;
+
+    fn options(supervision: Supervision, scale: [f64; 2]) -> SupersamplingOptions {
+        SupersamplingOptions { supervision, scale, filter: Filter::Lanczos, jitter: false, seed: 9 }
+    }
+
+    fn fine_picture(width: usize, height: usize) -> Picture {
+        let sample = |i: usize| (60 + (i * 37 + i / 7 * 11) % 130) as f32 / 255.0;
+        Picture::new(width, height, 3, (0..width * height * 3).map(sample).collect())
+    }
+
+    fn example(supervision: Supervision, scale: [f64; 2], picture: Option<Picture>) -> (Supersampling, Camera) {
+        let camera = Camera {
+            name: "a".into(),
+            intrinsics: Intrinsics { width: 5, height: 4, fx: 6.0, fy: 7.0, cx: 2.4, cy: 2.1 },
+            camera_to_world: [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]],
+        };
+        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0 };
+        let views = Views::new(Background::White, bounds, vec![View::camera_only(camera.clone())]);
+        let picture = picture.unwrap_or_else(|| Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
+        (Supersampling::new(&views, vec![picture], &options(supervision, scale)), camera)
+    }
+
+    /// The sub-rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
+    #[test]
+    fn sub_rays_are_the_finer_cameras_pixel_rays() {
+        let cases = [
+            (Supervision::Average, [3.0, 3.0]),
+            (Supervision::Kernel, [3.0, 3.0]),
+            (Supervision::Kernel, [2.8, 1.5]),
+            (Supervision::Kernel, [1.2, 1.25]),
+        ];
+        for (kind, scale) in cases {
+            let (supersampling, camera) = example(kind, scale, None);
+            let size = [(5.0 * scale[0]).round(), (4.0 * scale[1]).round()];
+            let fine = camera.resized(size[0] as u32, size[1] as u32);
+            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
+            let mut seen = vec![false; (size[0] * size[1]) as usize];
+            for group in 0..200 {
+                supersampling.cast(group, &mut rays);
+                for ray in &rays {
+                    let pixel = (0..seen.len()).find(|i| {
+                        let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
+                        let expected = fine.ray(x, y).direction.as_vec3().to_array();
+                        (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
+                    });
+                    seen[pixel.unwrap_or_else(|| panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray"))] = true;
+                }
+            }
+            assert!(seen.iter().all(|s| *s), "{kind:?} {scale:?}: every HR pixel is seen");
+        }
+    }
+
+    #[test]
+    fn gradient_is_that_of_the_loss() {
+        for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
+            let (supersampling, _) = example(kind, [2.0, 2.0], None);
+            let colours: Vec<[f32; 3]> = (0..4).map(|k| [0.1 * k as f32, 0.5, 0.9]).collect();
+            let mut gradients = vec![[0.0; 3]; 4];
+            supersampling.judge(7, &colours, &mut gradients);
+            for k in 0..4 {
+                for c in 0..3 {
+                    let mut moved = colours.clone();
+                    let mut scrap = vec![[0.0; 3]; 4];
+                    moved[k][c] += 0.01;
+                    let up = supersampling.judge(7, &moved, &mut scrap);
+                    moved[k][c] -= 0.02;
+                    let numeric = (up - supersampling.judge(7, &moved, &mut scrap)) / 0.02;
+                    assert!((f64::from(gradients[k][c]) - numeric).abs() < 1e-5, "{kind:?}");
+                }
+            }
+        }
+    }
+
+    /// Once the field renders the true HR picture, the kernel's loss is 0; the average's isn't.
+    #[test]
+    fn only_the_kernel_is_content_with_the_truth() {
+        let truth = fine_picture(10, 8);
+        let low = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
+        let loss = |kind| {
+            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(low.clone()));
+            let mut total = 0.0;
+            // Twice, so that the memory has caught up.
+            for group in (0..400).chain(0..400) {
+                let pixel = supersampling.pixel(group).1;
+                let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
+                let colours: Vec<[f32; 3]> =
+                    (0..4).map(|k| std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])).collect();
+                total = if group == 0 { 0.0 } else { total };
+                total += supersampling.judge(group, &colours, &mut [[0.0; 3]; 4]);
+                supersampling.remember(group, &colours);
+            }
+            total / 400.0
+        };
+        assert!(loss(Supervision::Kernel) < 1e-9, "{}", loss(Supervision::Kernel));
+        assert!(loss(Supervision::Average) > 1e-5, "{}", loss(Supervision::Average));
+    }
+
+    /// A clipped sample says no more than that the true value lies beyond.
+    #[test]
+    fn what_was_clipped_is_no_residual() {
+        let white = Picture::new(5, 4, 3, vec![1.0; 60]);
+        let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
+        // A dark neighbourhood makes the prediction of the bright pixel overshoot.
+        (0..400).for_each(|group| supersampling.remember(group, &[[0.2; 3]; 4]));
+        let mut gradients = [[0.0; 3]; 4];
+        let loss = supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients);
+        assert_eq!((loss, gradients), (0.0, [[0.0; 3]; 4]));
+        assert!(supersampling.judge(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
+    }
+
+    #[test]
+    fn every_pixel_is_drawn() {
+        let (supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
+        let mut seen = [false; 20];
+        (0..400).for_each(|g| seen[supersampling.pixel(g).1] = true);
+        assert!(seen.iter().all(|s| *s));
+    }
+}
