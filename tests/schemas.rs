@@ -36,6 +36,8 @@ fn schemas_are_current() {
         ("field", of::<radiance::FieldFile>()),
         ("training", of::<train_ss::TrainingLog>()),
         ("metrics", of::<eval::Metrics>()),
+        ("results", of::<Vec<report::ResultRow>>()),
+        ("degradation", of::<pixels::Degradation>()),
     ] {
         all.insert(format!("{name}.json"), schema);
     }

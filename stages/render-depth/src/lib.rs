@@ -18,6 +18,10 @@ pub struct Params {
     /// Width of the views; heights follow the cameras' aspect. Without it: the cameras' own size.
     #[schemars(range(min = 1, max = 65536))]
     pub size: Option<u32>,
+    /// Sub-rays along each side of a pixel: it shows the mean of their colours, as a camera's pixel does, and a depth that one of
+    /// them has.
+    #[schemars(range(min = 1, max = 8))]
+    pub sub_rays: u32,
     /// Which depth goes into `Z`.
     pub depth: Depth,
     /// Writes the distance along the ray, too, as channel `distance`.
@@ -26,7 +30,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: None, depth: Depth::Expected, ray_distance: false }
+        Self { size: None, sub_rays: 2, depth: Depth::Expected, ray_distance: false }
     }
 }
 
@@ -138,27 +142,51 @@ impl Job<'_> {
     fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> Vec<u8> {
         let width = self.camera.intrinsics.width as usize;
         let background = [self.background.shown(); 3];
-        let (rays, to_z): (Vec<Ray>, Vec<f32>) = (0..rows * width)
+        let n = self.params.sub_rays as usize;
+        let (rays, to_z): (Vec<Ray>, Vec<f32>) = (0..rows * width * n * n)
             .map(|i| {
-                let ray = self.camera.ray((i % width) as f64 + 0.5, (first + i / width) as f64 + 0.5);
+                let (pixel, sub) = (i / (n * n), i % (n * n));
+                let within = |k: usize| (k as f64 + 0.5) / n as f64;
+                let u = (pixel % width) as f64 + within(sub % n);
+                let v = (first + pixel / width) as f64 + within(sub / n);
+                let ray = self.camera.ray(u, v);
                 let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
                 (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
-        let pixels = self.field.render(&rays);
-        for ((pixel, to_z), sample) in pixels.iter().zip(to_z).zip(samples.chunks_exact_mut(channels)) {
-            sample[..3].copy_from_slice(&pixel.premultiplied);
-            sample[3] = pixel.opacity;
-            let distance = match self.params.depth {
-                Depth::Expected => pixel.depth,
-                Depth::Median => pixel.median_depth,
-            };
+        let rendered = self.field.render(&rays);
+        let share = 1.0 / (n * n) as f32;
+        let mut preview = Vec::with_capacity(3 * rows * width);
+        let subs = rendered.chunks_exact(n * n).zip(to_z.chunks_exact(n * n));
+        for ((subs, to_z), sample) in subs.zip(samples.chunks_exact_mut(channels)) {
+            let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(of).sum::<f32>() * share;
+            for c in 0..3 {
+                sample[c] = mean(&|p| p.premultiplied[c]);
+            }
+            sample[3] = mean(&|p| p.opacity);
+            let (distance, to_z) = self.depth(subs, to_z);
             sample[4] = distance * to_z;
             if let Some(last) = sample.get_mut(5) {
                 *last = distance;
             }
+            preview.extend((0..3).map(|c| to_u8(mean(&|p| p.colour[c]))));
         }
-        pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect()
+        preview
+    }
+
+    /// The middle one of the sub-rays' distances, and its z-depth per distance: a mean would invent a surface between two.
+    fn depth(&self, subs: &[radiance::Pixel], to_z: &[f32]) -> (f32, f32) {
+        let distance = |p: &radiance::Pixel| match self.params.depth {
+            Depth::Expected => p.depth,
+            Depth::Median => p.median_depth,
+        };
+        let mut found = [(0.0f32, 0.0f32); 64];
+        let found = &mut found[..subs.len()];
+        for ((slot, p), &z) in found.iter_mut().zip(subs).zip(to_z) {
+            *slot = (distance(p), z);
+        }
+        found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+        found[(found.len() - 1) / 2]
     }
 }
 

@@ -1,16 +1,20 @@
-//! `report`: the record of a run as one self-contained HTML page: no file beside it, no network.
+//! `report`: the record of a run as one self-contained HTML page: no network, nothing it needs beside it.
 //!
 //! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it shows times and hashes.
 //!
 //! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes and times.
 //! * `pictures`: views and depth as embedded PNG data.
+//! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 
 mod page;
 mod pictures;
+mod results;
 
 use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+pub use results::{ResultRow, StageResult};
 
 /// Parameters of `report`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -49,6 +53,6 @@ impl Stage for Report {
         run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
         let html = page::page(&run, params.views as usize)?;
         std::fs::write(context.output_path("index.html")?, html.into_string())?;
-        Ok(())
+        context.write_json("results.json", &results::results(&run)?)
     }
 }

@@ -1,11 +1,11 @@
 use std::path::Path;
 
-use anyhow::Context as _;
 use artifact::{RunInput, RunNode, RunRecord};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use serde_json::Value;
 
 use crate::pictures::{colour, data_uri, depth, read_views, uri_of};
+use crate::results::metrics;
 
 const STYLE: &str = "
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
@@ -27,9 +27,7 @@ struct Point<'a> {
 pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
     let mut points = Vec::new();
     for (index, node) in run.nodes.iter().enumerate().filter(|(_, n)| n.kind == "metrics") {
-        let path = node.folder.join("metrics.json");
-        let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-        points.push(Point { node, metrics: serde_json::from_slice(&bytes).with_context(|| path.display().to_string())?, index });
+        points.push(Point { node, metrics: metrics(node)?, index });
     }
     let galleries = points.iter().map(|p| gallery(run, p, views)).collect::<anyhow::Result<Vec<_>>>()?;
     Ok(html! {

@@ -105,7 +105,8 @@ impl Default for Params {
 }
 
 impl Params {
-    fn architecture(&self) -> Architecture {
+    /// What field they ask for.
+    pub fn architecture(&self) -> Architecture {
         Architecture {
             levels: self.levels,
             coarsest: self.coarsest,
@@ -116,7 +117,8 @@ impl Params {
         }
     }
 
-    fn options(&self) -> TrainingOptions {
+    /// How they ask for it to be trained.
+    pub fn options(&self) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
             batch: self.batch as usize,
@@ -210,7 +212,7 @@ impl Stage for TrainSs {
 }
 
 /// LR pictures as the supervision wants them: over the background, or RGBA premultiplied where it is open.
-fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Picture>> {
+pub fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Picture>> {
     let read = |view: &scene::View| -> anyhow::Result<Picture> {
         let name = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name));
         let path = input.path(name.bad_input("scene")?);
@@ -234,7 +236,7 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
 }
 
 /// What the field is compared with, by the parameters and by what the input says of its own making.
-fn supervision(
+pub fn supervision(
     input: &artifact::GivenInput,
     params: &Params,
     views: &Views,

@@ -48,28 +48,73 @@ impl Memory {
         ([i as f64 * apart[0], j as f64 * apart[1]], apart)
     }
 
-    /// (K - A)·c' at an LR pixel: what to add to the mean of its fresh sub-rays to predict the LR pixel.
-    pub(crate) fn correction(&self, view: usize, x: usize, y: usize) -> [f32; 3] {
-        let [i, j] = self.block(view, x, y);
+    /// How far, in LR pixels, the kernels reach to either side of a block.
+    const REACH: usize = 3;
+
+    /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else as remembered, and what they
+    /// ask of the block: writes Kᵀ·residual for each colour, and returns the residual of the pixel itself. `judge` gets a
+    /// prediction and its target, for each channel, and gives the residual.
+    pub(crate) fn pull(
+        &self,
+        view: usize,
+        [x, y]: [usize; 2],
+        colours: &[[f32; 3]],
+        targets: &Picture,
+        judge: impl Fn(f32, f32) -> f32,
+        pulls: &mut [[f32; 3]],
+    ) -> [f32; 3] {
+        let [left, top] = self.block(view, x, y);
+        let [columns, rows] = self.side;
         let view = &self.views[view];
-        let rows = view.rendered.chunks_exact(3 * view.width);
-        let ((left, across), (top, down)) = (view.operator.x.run(x), view.operator.y.run(y));
-        let mut sum = [0.0f32; 3];
-        for (row, wy) in rows.clone().skip(top).zip(down) {
-            let mut along = [0.0f32; 3];
-            for (pixel, wx) in row[3 * left..].as_chunks::<3>().0.iter().zip(across) {
-                (0..3).for_each(|c| along[c] += wx * f32::from(pixel[c]));
+        let (across, down) = (&view.operator.x, &view.operator.y);
+        let near = |at: usize, end: usize| at.saturating_sub(Self::REACH)..(at + Self::REACH + 1).min(end);
+        let (xs, ys) = (near(x, across.outputs()), near(y, down.outputs()));
+        // Remembered rows, filtered along x for the columns of the neighbourhood: each row serves all of its LR rows.
+        const MOST: usize = 2 * Memory::REACH + 1;
+        let mut sums = [[[0.0f32; 3]; MOST]; MOST];
+        let first_row = down.run(ys.start).0;
+        let last_row = down.run(ys.end - 1).0 + down.run(ys.end - 1).1.len();
+        for (j, row) in (first_row..last_row).zip(view.rendered[3 * view.width * first_row..].chunks_exact(3 * view.width)) {
+            let mut filtered = [[0.0f32; 3]; MOST];
+            for (qx, sum) in xs.clone().zip(&mut filtered) {
+                let (first, weights) = across.run(qx);
+                for (pixel, w) in row[3 * first..].as_chunks::<3>().0.iter().zip(weights) {
+                    (0..3).for_each(|c| sum[c] += w * f32::from(pixel[c]));
+                }
             }
-            (0..3).for_each(|c| sum[c] += wy * along[c]);
-        }
-        let mut block = [0u32; 3];
-        for row in rows.skip(j).take(self.side[1]) {
-            for pixel in row[3 * i..].as_chunks::<3>().0.iter().take(self.side[0]) {
-                (0..3).for_each(|c| block[c] += u32::from(pixel[c]));
+            // What is fresh replaces what was remembered.
+            if let Some(b) = j.checked_sub(top).filter(|b| *b < rows) {
+                for (a, fresh) in colours[b * columns..(b + 1) * columns].iter().enumerate() {
+                    let old = &row[3 * (left + a)..];
+                    for (qx, sum) in xs.clone().zip(&mut filtered) {
+                        let w = across.weight(qx, left + a);
+                        (0..3).for_each(|c| sum[c] += w * (255.0 * fresh[c] - f32::from(old[c])));
+                    }
+                }
+            }
+            for (qy, sums) in ys.clone().zip(&mut sums) {
+                let w = down.weight(qy, j);
+                if w != 0.0 {
+                    sums.iter_mut().flatten().zip(filtered.as_flattened()).for_each(|(sum, v)| *sum += w * v);
+                }
             }
         }
-        let count = (self.side[0] * self.side[1]) as f32;
-        std::array::from_fn(|c| (sum[c] - block[c] as f32 / count) / 255.0)
+        pulls.fill([0.0; 3]);
+        let mut own = [0.0; 3];
+        for (qy, sums) in ys.zip(&sums) {
+            for (qx, sum) in xs.clone().zip(sums) {
+                let target = &targets.data[3 * (qy * targets.width + qx)..];
+                let residual: [f32; 3] = std::array::from_fn(|c| judge(sum[c] / 255.0, target[c]));
+                if [qx, qy] == [x, y] {
+                    own = residual;
+                }
+                for (k, pull) in pulls.iter_mut().enumerate() {
+                    let w = across.weight(qx, left + k % columns) * down.weight(qy, top + k / columns);
+                    (0..3).for_each(|c| pull[c] += w * residual[c]);
+                }
+            }
+        }
+        own
     }
 
     /// Remembers the fresh sub-rays of an LR pixel.
@@ -117,41 +162,52 @@ mod tests {
         Picture::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    /// With the HR picture in it, the memory and fresh sub-rays that agree predict what the kernel makes of it; at any scale.
+    /// Residuals and pulls are K·c - y and Kᵀ·(K·c - y) of the whole pictures, at any scale, also where the block is news.
     #[test]
-    fn predicts_what_the_kernel_makes() {
-        for ((low, high), side) in
-            [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))].map(
-                |(low, high): ((usize, usize), (usize, usize))| ((low, high), [high.0.div_ceil(low.0), high.1.div_ceil(low.1)]),
-            )
-        {
-            let fine = picture(high.0, high.1);
+    fn pulls_are_the_operators_own() {
+        for (low, high) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
+            let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
             let operator = Resampling::new(Filter::Lanczos, high, low);
-            let expected = operator.apply(&fine);
+            let fine = picture(high.0, high.1);
+            let targets = picture(low.0, low.1);
             let mut memory = Memory::new(side);
-            memory.add(&fine, operator);
+            memory.add(&fine, operator.clone());
             for y in 0..low.1 {
                 for x in 0..low.0 {
                     let [i, j] = memory.block(0, x, y);
-                    let fresh: Vec<[f32; 3]> = (0..side[0] * side[1])
-                        .map(|k| (i + k % side[0]) + (j + k / side[0]) * high.0)
-                        .map(|p| std::array::from_fn(|c| fine.data[3 * p + c]))
-                        .collect();
-                    let correction = memory.correction(0, x, y);
+                    let mut hybrid = fine.clone();
+                    let fresh: Vec<[f32; 3]> =
+                        (0..side[0] * side[1]).map(|k| [0.2 + 0.1 * k as f32 / side[0] as f32, 0.5, 0.7]).collect();
+                    let at = |k: usize| 3 * ((j + k / side[0]) * high.0 + i + k % side[0]);
+                    fresh.iter().enumerate().for_each(|(k, f)| hybrid.data[at(k)..at(k) + 3].copy_from_slice(f));
+                    let mut residual = operator.apply(&hybrid);
+                    residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
+                    let expected = operator.adjoint(&residual);
+                    let mut pulls = vec![[9.0; 3]; fresh.len()];
+                    let own = memory.pull(0, [x, y], &fresh, &targets, |p, t| p - t, &mut pulls);
                     for c in 0..3 {
-                        let mean = fresh.iter().map(|f| f[c]).sum::<f32>() / fresh.len() as f32;
-                        let predicted = mean + correction[c];
-                        assert!((predicted - expected.data[3 * (y * low.0 + x) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y})");
+                        assert!((own[c] - residual.data[3 * (y * low.0 + x) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y})");
+                        for (k, pull) in pulls.iter().enumerate() {
+                            assert!((pull[c] - expected.data[at(k) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y}) {k}");
+                        }
                     }
-                    memory.remember(0, x, y, &fresh);
                 }
             }
-            // All that was remembered was there already.
-            assert_eq!(
-                memory.parts().next().unwrap(),
-                Picture::to_rgba8(&fine).data.chunks(4).flat_map(|p| p[..3].to_vec()).collect::<Vec<_>>()
-            );
         }
+    }
+
+    #[test]
+    fn remembers_what_it_is_told() {
+        let mut memory = Memory::new([2, 2]);
+        memory.add(&picture(8, 6), Resampling::new(Filter::Box, (8, 6), (4, 3)));
+        memory.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
+        let bytes: Vec<u8> = memory.parts().flatten().copied().collect();
+        assert_eq!(memory.len(), bytes.len());
+        assert_eq!(bytes[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
+        let mut other = Memory::new([2, 2]);
+        other.add(&picture(8, 6), Resampling::new(Filter::Box, (8, 6), (4, 3)));
+        other.restore(&bytes);
+        assert!(other.parts().eq(memory.parts()));
     }
 
     /// Every HR pixel belongs to some block, so none is left unseen.

@@ -39,6 +39,12 @@ impl AxisTaps {
         (self.firsts[i], &self.weights[i * self.length..(i + 1) * self.length])
     }
 
+    /// What an input weighs in an output.
+    pub fn weight(&self, output: usize, input: usize) -> f32 {
+        let (first, weights) = self.run(output);
+        input.checked_sub(first).and_then(|k| weights.get(k)).copied().unwrap_or(0.0)
+    }
+
     /// Number of outputs.
     pub fn outputs(&self) -> usize {
         self.firsts.len()

@@ -411,6 +411,11 @@ impl Chunk {
     pub(crate) fn samples(&self) -> usize {
         self.samples
     }
+
+    /// Samples that got a colour in the last forward pass.
+    pub(crate) fn coloured(&self) -> usize {
+        self.kept.len()
+    }
 }
 
 #[cfg(test)]

@@ -206,6 +206,16 @@ impl Field {
         self.occupancy.cells().count() as f64 / (GRID * GRID * GRID) as f64
     }
 
+    /// Numbers in the grid.
+    pub fn grid_len(&self) -> usize {
+        self.grid.len()
+    }
+
+    /// Multiplications of the networks for one sample, forward; backward takes twice as many.
+    pub fn network_multiplications(&self) -> usize {
+        self.layers.all().iter().map(|l| l.inputs * l.outputs).sum()
+    }
+
     /// Whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())

@@ -2,6 +2,7 @@
 //!
 //! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
+//! * [`Passes`]: one forward and backward pass alone, for benchmarks.
 //! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
 //!
 //! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, colour
@@ -29,6 +30,7 @@ mod grid;
 mod math;
 mod mlp;
 mod occupancy;
+mod passes;
 mod random;
 mod ray;
 #[cfg(test)]
@@ -39,6 +41,7 @@ mod trainer;
 
 pub use field::{Architecture, Field, FieldError, Pixel};
 pub use field_file::{FIELD_FILE, FieldFile, FieldKind};
+pub use passes::Passes;
 pub use random::{Draws, uniform};
 pub use ray::Ray;
 pub use simd::{Family, set_family};

@@ -1,0 +1,53 @@
+use crate::chunk::{Chunk, FeatureGradients};
+use crate::field::{CHUNK_RAYS, Field};
+use crate::ray::{Ray, clip};
+use crate::simd::LANES;
+
+/// One worker's forward and backward pass without an optimiser: what benchmarks measure.
+#[derive(Debug)]
+pub struct Passes {
+    chunk: Chunk,
+    transposed: Vec<f32>,
+    lanes: Vec<f32>,
+    into: FeatureGradients,
+}
+
+impl Passes {
+    /// Buffers for a field.
+    pub fn new(field: &Field) -> Self {
+        let mut transposed = vec![0.0; field.network.len()];
+        field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
+        let lanes = vec![0.0; field.network.len() * LANES];
+        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default() }
+    }
+
+    /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every colour, as far as the list that
+    /// a trainer scatters. Returns the samples marched and those that got a colour.
+    pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
+        let mut samples = [0; 2];
+        self.into.positions.clear();
+        self.into.levels.iter_mut().for_each(Vec::clear);
+        for rays in rays.chunks(CHUNK_RAYS) {
+            let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
+            self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
+            samples[0] += self.chunk.samples();
+            samples[1] += self.chunk.coloured();
+            if backward {
+                let backgrounds = [[1.0; 3]; CHUNK_RAYS];
+                let gradients = [[1.0; 3]; CHUNK_RAYS];
+                self.chunk.backward(field, &self.transposed, &gradients, &backgrounds, &mut self.lanes, &mut self.into);
+            }
+        }
+        samples
+    }
+
+    /// Adds the last backward pass's gradients to a table of the grid's size.
+    ///
+    /// # Panics
+    /// When the table has another size.
+    pub fn scatter(&self, field: &Field, table: &mut [f32]) {
+        for (level, gradients) in field.levels.iter().zip(&self.into.levels) {
+            crate::grid::scatter(level, &mut table[level.range()], &self.into.positions, gradients);
+        }
+    }
+}

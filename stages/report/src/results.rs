@@ -1,0 +1,62 @@
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::Context as _;
+use artifact::{RunNode, RunRecord};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+/// `results.json`: the page's figures for scripts, one row a point of the sweep.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ResultRow {
+    /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
+    pub point: String,
+    /// Means over the views: `psnr`, `ssim`, `lpips` where weights were given, `depth` where there is truth.
+    pub mean: Value,
+    /// Number of views.
+    pub views: usize,
+    /// Every stage that the figures came through.
+    pub stages: BTreeMap<String, StageResult>,
+}
+
+/// What a stage did for a row.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct StageResult {
+    /// All its parameters.
+    pub parameters: Map<String, Value>,
+    /// How long it took when it ran.
+    pub seconds: f64,
+    /// Threads it had.
+    pub threads: usize,
+    /// The artifact's folder.
+    pub folder: PathBuf,
+}
+
+/// A `metrics` node's file.
+pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
+    let path = node.folder.join("metrics.json");
+    let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
+    serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
+}
+
+pub(crate) fn results(run: &RunRecord) -> anyhow::Result<Vec<ResultRow>> {
+    let rows = run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").map(|(index, node)| {
+        let metrics = metrics(node)?;
+        let stages = run.ancestors(index).into_iter().chain([index]).map(|i| {
+            let node = &run.nodes[i];
+            let (seconds, threads) = (node.seconds, node.threads);
+            let result = StageResult { parameters: node.parameters.clone(), seconds, threads, folder: node.folder.clone() };
+            (node.stage.clone(), result)
+        });
+        Ok(ResultRow {
+            point: node.point.clone(),
+            mean: metrics["mean"].clone(),
+            views: metrics["views"].as_array().map_or(0, Vec::len),
+            stages: stages.collect(),
+        })
+    });
+    rows.collect()
+}

@@ -1,0 +1,239 @@
+//! `make bench`: what the engine costs, and that cost over what the machine can do, measured side by side in one run.
+//!
+//! `SCENE=DIR` is a scene that `prep` made (×2, 100 px in the Makefile), `OUT=FILE` gets rows of JSON `{name, value, unit}`,
+//! `RAYS=N` sets the length of the measured training (default 12 million).
+
+use std::hint::black_box;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use artifact::GivenInput;
+use radiance::{Architecture, Field, Passes, Ray, Supervision as _, Trainer};
+use scene::{Bounds, Camera, Views};
+use serde::Serialize;
+use train_ss::Params;
+
+#[derive(Serialize)]
+struct Row {
+    name: String,
+    value: f64,
+    unit: &'static str,
+}
+
+#[derive(Default)]
+struct Rows(Vec<Row>);
+
+impl Rows {
+    fn add(&mut self, name: impl Into<String>, value: f64, unit: &'static str) {
+        let row = Row { name: name.into(), value, unit };
+        println!("{:<52} {:>14.1} {unit}", row.name, row.value);
+        self.0.push(row);
+    }
+
+    fn value(&self, name: &str) -> f64 {
+        self.0.iter().find(|r| r.name == name).map_or(f64::NAN, |r| r.value)
+    }
+}
+
+fn main() -> anyhow::Result<()> {
+    let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+    let mut rows = Rows::default();
+    let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
+    println!("load before: {}", load.trim());
+    rows.add("threads", rayon::current_num_threads() as f64, "");
+    rows.add("sgemm_gflops", sgemm(), "GFLOP/s");
+    rows.add("sgemm_gflops_one_core", one_core(sgemm), "GFLOP/s");
+    rows.add("memory_bandwidth", bandwidth(), "GB/s");
+    passes(&mut rows);
+    if let Some(scene) = variable("SCENE") {
+        let rays = variable("RAYS").map_or(Ok(12_000_000), |r| r.parse())?;
+        training(&mut rows, Path::new(&scene), rays)?;
+        // Again, so that a machine that slowed down in between is seen.
+        rows.add("sgemm_gflops_after", sgemm(), "GFLOP/s");
+    } else {
+        println!("skipped: no SCENE, so nothing was trained or rendered");
+    }
+    rows.add("peak_rss_mib", peak_memory(), "MiB");
+    if let Some(out) = variable("OUT").map(PathBuf::from) {
+        artifact::write_json(&out, &rows.0)?;
+        println!("wrote {}", out.display());
+    }
+    Ok(())
+}
+
+/// The best of several runs: noise only ever adds time.
+fn best(runs: usize, mut run: impl FnMut()) -> f64 {
+    let once = |_| {
+        let start = Instant::now();
+        run();
+        start.elapsed().as_secs_f64()
+    };
+    (0..runs).map(once).fold(f64::INFINITY, f64::min)
+}
+
+fn one_core<T: Send>(run: impl FnOnce() -> T + Send) -> T {
+    rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool of one thread").install(run)
+}
+
+/// f32 matrix products, one on each core at once.
+fn sgemm() -> f64 {
+    const N: usize = 768;
+    let threads = rayon::current_num_threads();
+    let mut work: Vec<[Vec<f32>; 3]> = (0..threads).map(|_| [0.5, 0.25, 0.0].map(|v| vec![v; N * N])).collect();
+    let seconds = best(8, || {
+        rayon::scope(|scope| {
+            for [a, b, c] in &mut work {
+                // SAFETY: three matrices of N·N floats, row by row.
+                scope.spawn(|_| unsafe {
+                    matrixmultiply::sgemm(
+                        N,
+                        N,
+                        N,
+                        1.0,
+                        a.as_ptr(),
+                        N as isize,
+                        1,
+                        b.as_ptr(),
+                        N as isize,
+                        1,
+                        0.0,
+                        c.as_mut_ptr(),
+                        N as isize,
+                        1,
+                    );
+                });
+            }
+        });
+    });
+    black_box(&work);
+    (2 * N * N * N * threads) as f64 / seconds / 1e9
+}
+
+/// a = b + 3·c over arrays far larger than the caches.
+fn bandwidth() -> f64 {
+    use rayon::prelude::*;
+    const N: usize = 1 << 25;
+    let (mut a, b, c) = (vec![0.0f32; N], vec![1.0f32; N], vec![2.0f32; N]);
+    let seconds = best(5, || {
+        let parts = a.par_chunks_mut(1 << 16).zip(b.par_chunks(1 << 16)).zip(c.par_chunks(1 << 16));
+        parts.for_each(|((a, b), c)| a.iter_mut().zip(b).zip(c).for_each(|((a, b), c)| *a = b + 3.0 * c));
+    });
+    black_box(&a);
+    (3 * 4 * N) as f64 / seconds / 1e9
+}
+
+/// Rays of a camera that looks at the unit box.
+fn rays(count: usize) -> Vec<Ray> {
+    let side = (count as f64).sqrt() as usize;
+    let at = |i: usize| {
+        let (x, y) = ((i % side) as f32 / side as f32 - 0.5, (i / side) as f32 / side as f32 - 0.5);
+        let length = (x * x + y * y + 4.0).sqrt();
+        Ray { origin: [0.1, -0.2, 4.0], direction: [x / length, y / length, -2.0 / length], background: [1.0; 3] }
+    };
+    (0..side * side).map(at).collect()
+}
+
+/// One core through a field of faint fog: every sample gets a colour.
+fn passes(rows: &mut Rows) {
+    let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0 };
+    let default = Architecture::default();
+    let variants = [
+        ("", Architecture { levels: 8, log2_entries: 17, hidden: 32, ..default }),
+        ("_64_wide", Architecture { levels: 8, log2_entries: 17, hidden: 64, ..default }),
+        ("_2_19_entries", Architecture { levels: 8, log2_entries: 19, hidden: 32, ..default }),
+        ("_256_steps", Architecture { levels: 8, log2_entries: 17, hidden: 32, steps: 256, ..default }),
+    ];
+    for (name, architecture) in variants {
+        let field = Field::new(architecture, bounds, 1);
+        let rays = rays(4096);
+        let mut passes = Passes::new(&field);
+        let mut table = vec![0.0; field.grid_len()];
+        let [marched, coloured] = passes.run(&field, &rays, false);
+        let per_sample = |seconds: f64| seconds / marched as f64 * 1e9;
+        let forward = per_sample(best(5, || drop(black_box(passes.run(&field, &rays, false)))));
+        let both = per_sample(best(5, || {
+            passes.run(&field, &rays, true);
+            passes.scatter(&field, &mut table);
+        }));
+        black_box(&table);
+        rows.add(format!("forward_ns_per_sample{name}"), forward, "ns");
+        rows.add(format!("forward_backward_ns_per_sample{name}"), both, "ns");
+        if name.is_empty() {
+            rows.add("coloured_share", 100.0 * coloured as f64 / marched as f64, "%");
+            let flops = (3 * 2 * field.network_multiplications()) as f64;
+            rows.add("networks_gflops_of_forward_backward", flops / both, "GFLOP/s");
+            rows.add("networks_share_of_sgemm_one_core", 100.0 * flops / both / rows.value("sgemm_gflops_one_core"), "%");
+            // Eight corners of four floats a level: read forward, read and written backward.
+            let bytes = (architecture.levels * 8 * 16 * 3) as f64;
+            rows.add("grid_traffic_of_forward_backward", bytes / both, "GB/s");
+        }
+    }
+}
+
+/// A whole training with its warm-up, then rendering, at one and all threads and several sizes.
+fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
+    let input = GivenInput::open("scene", &scene.join("train"))?;
+    let views = Views::read(&input)?;
+    let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
+        let pictures = train_ss::read_pictures(&input, &views)?;
+        let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
+        let mut trainer = Trainer::new(Field::new(params.architecture(), views.bounds, params.seed), params.options());
+        let (start, mut samples) = (Instant::now(), 0);
+        while let Some(report) = trainer.step(&mut supervision)? {
+            samples += report.samples;
+        }
+        let done = trainer.rays_done(supervision.rays_per_group()) as f64;
+        let speed = done / start.elapsed().as_secs_f64();
+        rows.add(format!("train_rays_per_s{name}"), speed, "rays/s");
+        rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");
+        rows.add(format!("train_rays_per_s_per_gflops{name}"), speed / rows.value("sgemm_gflops"), "rays/GFLOP");
+        Ok(trainer.field().clone())
+    };
+    let params = Params { rays, ..Params::default() };
+    let field = run(&params, rows, "")?;
+    let short = Params { rays: rays / 6, ..params.clone() };
+    run(&short, rows, "_first_sixth")?;
+    one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
+    for scale in [1.0, 4.0] {
+        let scaled = Params { supersample: Some(scale), ..short.clone() };
+        run(&scaled, rows, &format!("_first_sixth_x{scale}"))?;
+    }
+
+    let truth = Views::read(&GivenInput::open("cameras", &scene.join("cameras"))?)?;
+    let cameras: Vec<Camera> = truth.views.iter().take(10).map(|v| v.camera.clone()).collect();
+    let own = cameras[0].intrinsics.width;
+    let mut render = |name: String, width: u32, one: bool| {
+        let all: Vec<Vec<Ray>> =
+            cameras.iter().map(|c| camera_rays(&c.resized(width, c.intrinsics.height * width / own))).collect();
+        let count: usize = all.iter().map(Vec::len).sum();
+        let go = || {
+            let start = Instant::now();
+            all.iter().for_each(|rays| drop(black_box(field.render(rays))));
+            start.elapsed().as_secs_f64()
+        };
+        let seconds = if one { one_core(go) } else { go().min(go()) };
+        rows.add(name, count as f64 / seconds, "rays/s");
+    };
+    render("render_rays_per_s".into(), own, false);
+    render("render_rays_per_s_one_core".into(), own, true);
+    render("render_rays_per_s_half_size".into(), own / 2, false);
+    render("render_rays_per_s_twice_the_size".into(), own * 2, false);
+    let (speed, gflops) = (rows.value("render_rays_per_s"), rows.value("sgemm_gflops"));
+    rows.add("render_rays_per_s_per_gflops", speed / gflops, "rays/GFLOP");
+    Ok(())
+}
+
+fn camera_rays(camera: &Camera) -> Vec<Ray> {
+    let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
+    let ray = |i: usize| {
+        let ray = camera.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
+        Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+    };
+    (0..width * height).map(ray).collect()
+}
+
+fn peak_memory() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+    line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok()).unwrap_or(f64::NAN) / 1024.0
+}
