@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep clean goldens
+.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff bench clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -56,6 +56,28 @@ comma := ,
 list = $(subst $() $(),$(comma),$(strip $(1)))
 sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos box" SCALE="2" LR="50 100"
 	@$(NERF_SR) run --out out/sweep -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr=$(call list,$(LR))
+
+SCENES ?= lego chair
+PROTOCOLS ?= 100x2 100x4 200x2 200x4
+SUPERVISION ?= average kernel
+quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
+	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
+	  --out $(or $(OUT),out/quality.json)
+
+ablation: build ## What each part brings and costs, on withheld training views
+	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/ablation.json)
+
+tradeoff: build ## PSNR against training time, on withheld training views
+	@python3 scripts/ablation.py tradeoff --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/tradeoff.json)
+
+BENCH_SCENE := out/bench/scene
+bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)
+	@rm -rf out/bench && mkdir -p out/bench
+	@if [ -d $(DATA)/nerf_synthetic/lego ]; then ln -s $(abspath $(DATA))/nerf_synthetic/lego out/bench/data; \
+	  else target/release/demo-scene --output out/bench/data; fi
+	@echo '{"lr": 100, "scale": 2, "test_views": 10}' > out/bench/prep.json
+	@target/release/prep --params out/bench/prep.json --input dataset=out/bench/data --output $(BENCH_SCENE)
+	@SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) cargo bench --quiet -p train-ss --bench bench
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py

@@ -150,7 +150,9 @@ fn passes(rows: &mut Rows) {
         let mut table = vec![0.0; field.grid_len()];
         let [marched, coloured] = passes.run(&field, &rays, false);
         let per_sample = |seconds: f64| seconds / marched as f64 * 1e9;
-        let forward = per_sample(best(5, || drop(black_box(passes.run(&field, &rays, false)))));
+        let forward = per_sample(best(5, || {
+            black_box(passes.run(&field, &rays, false));
+        }));
         let both = per_sample(best(5, || {
             passes.run(&field, &rays, true);
             passes.scatter(&field, &mut table);
@@ -195,7 +197,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     run(&short, rows, "_first_sixth")?;
     one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
     for scale in [1.0, 4.0] {
-        let scaled = Params { supersample: Some(scale), ..short.clone() };
+        let scaled = Params { supersample: scale, ..short.clone() };
         run(&scaled, rows, &format!("_first_sixth_x{scale}"))?;
     }
 

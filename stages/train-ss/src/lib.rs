@@ -27,10 +27,11 @@ pub use supervision::{Supersampling, SupersamplingOptions, Supervision};
 pub struct Params {
     /// Which field.
     pub field: FieldKind,
-    /// HR pixels along each side of an LR pixel, the paper's s; 1 is plain NeRF. It needn't be whole: sub-rays are cast for the
-    /// next whole number. Without it: the scale at which the LR images were made.
+    /// Sub-rays along each side of an LR pixel, the paper's s; 1 is plain NeRF. It needn't be the scale at which views will be
+    /// rendered: few sub-rays leave more of the budget for other pixels. For `kernel`, the HR pixels along each side; where that
+    /// isn't whole, sub-rays are cast for the next whole number.
     #[schemars(range(min = 1.0, max = 16.0))]
-    pub supersample: Option<f64>,
+    pub supersample: f64,
     /// What an LR pixel is compared with.
     pub supervision: Supervision,
     /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
@@ -44,10 +45,13 @@ pub struct Params {
     /// Samples a step aims at while space is full of fog and rays are expensive.
     #[schemars(range(min = 1024, max = 16_777_216))]
     pub samples: u32,
-    /// Highest learning rate.
+    /// Highest learning rate of the grid.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub rate: f64,
-    /// Learning rate at the end, as a share of the highest; it falls exponentially.
+    /// Highest learning rate of the networks.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub network_rate: f64,
+    /// Learning rates at the end, as a share of the highest; they fall exponentially.
     #[schemars(range(min = 1e-6, max = 1.0))]
     pub final_rate: f64,
     /// Weight decay of the grid.
@@ -83,13 +87,14 @@ impl Default for Params {
         let grid = Architecture::default();
         Self {
             field: FieldKind::Grid,
-            supersample: None,
+            supersample: 2.0,
             supervision: Supervision::Average,
             jitter: false,
             rays: 30_000_000,
-            batch: 4_096,
-            samples: 131_072,
-            rate: 1e-2,
+            batch: 2_048,
+            samples: 32_768,
+            rate: 4e-2,
+            network_rate: 1e-2,
             final_rate: 0.02,
             grid_decay: 0.0,
             network_decay: 1e-6,
@@ -124,6 +129,7 @@ impl Params {
             batch: self.batch as usize,
             samples: self.samples as usize,
             rate: self.rate,
+            network_rate: self.network_rate,
             final_rate: self.final_rate,
             warm_up: 100,
             grid_decay: self.grid_decay as f32,
@@ -253,15 +259,9 @@ pub fn supervision(
             "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
         return Err(Failure::Usage(message.to_owned()).into());
     }
-    let lr = views.views[0].camera.intrinsics;
-    let scale = |i: usize, lr: u32| match (params.supersample, made) {
-        (Some(s), _) => s,
-        (None, Some(d)) => (f64::from(d.hr[i]) / f64::from(lr)).clamp(1.0, 16.0),
-        (None, None) => 2.0,
-    };
     let options = SupersamplingOptions {
         supervision: params.supervision,
-        scale: [scale(0, lr.width), scale(1, lr.height)],
+        scale: [params.supersample; 2],
         filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
         jitter: params.jitter,
         seed: params.seed,

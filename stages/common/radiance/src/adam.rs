@@ -22,29 +22,37 @@ impl AdamStep {
     }
 }
 
+/// Which blocks of 16 numbers a step has touched: one bit each.
+pub(crate) type Touched = [u64];
+
 kernel! {
     /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came near learns nothing from
-    /// it). Clears the gradient. Lengths are equal multiples of 16.
-    pub(crate) fn adam<L>(step: &AdamStep, weights: &mut [f32], gradients: &mut [f32], first: &mut [f32], second: &mut [f32]) {
-        let blocks = weights.as_chunks_mut::<LANES>().0.iter_mut()
-            .zip(gradients.as_chunks_mut::<LANES>().0)
-            .zip(first.as_chunks_mut::<LANES>().0)
-            .zip(second.as_chunks_mut::<LANES>().0);
-        for (((w, g), m), v) in blocks {
-            if g.iter().fold(0u32, |any, x| any | x.to_bits()) << 1 == 0 {
-                continue;
-            }
-            for i in 0..LANES {
-                let touched = g[i] != 0.0;
-                let gradient = step.decay.mul_add(w[i], g[i]);
-                let m1 = (m[i] - gradient).mul_add(step.beta1, gradient);
-                let square = gradient * gradient;
-                let v1 = (v[i] - square).mul_add(step.beta2, square);
-                let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), w[i]);
-                m[i] = if touched { m1 } else { m[i] };
-                v[i] = if touched { v1 } else { v[i] };
-                w[i] = if touched { w1 } else { w[i] };
-                g[i] = 0.0;
+    /// it). Looks only at the blocks that were touched, and clears their gradients and marks. Lengths are equal multiples of 16.
+    pub(crate) fn adam<L>(
+        step: &AdamStep, touched: &mut Touched, weights: &mut [f32], gradients: &mut [f32], first: &mut [f32], second: &mut [f32],
+    ) {
+        let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0, gradients.as_chunks_mut::<LANES>().0);
+        let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
+        for (word, marks) in touched.iter_mut().enumerate() {
+            while *marks != 0 {
+                let block = 64 * word + marks.trailing_zeros() as usize;
+                *marks &= *marks - 1;
+                if block >= weights.len() {
+                    break;
+                }
+                let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block], &mut second[block]);
+                for i in 0..LANES {
+                    let touched = g[i] != 0.0;
+                    let gradient = step.decay.mul_add(w[i], g[i]);
+                    let m1 = (m[i] - gradient).mul_add(step.beta1, gradient);
+                    let square = gradient * gradient;
+                    let v1 = (v[i] - square).mul_add(step.beta2, square);
+                    let w1 = (-step.rate).mul_add(m1 / (v1.sqrt() + step.epsilon), w[i]);
+                    m[i] = if touched { m1 } else { m[i] };
+                    v[i] = if touched { v1 } else { v[i] };
+                    w[i] = if touched { w1 } else { w[i] };
+                    g[i] = 0.0;
+                }
             }
         }
     }
@@ -71,7 +79,8 @@ mod tests {
                     e[0] -= 0.01 * mh / (vh.sqrt() + 1e-15);
                 }
             }
-            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut w, &mut g, &mut m, &mut v);
+            let mut touched = [u64::MAX];
+            adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut touched, &mut w, &mut g, &mut m, &mut v);
             assert!(g.iter().all(|&g| g == 0.0));
         }
         for (i, (w, e)) in w.iter().zip(&exact).enumerate() {

@@ -34,7 +34,7 @@ pub struct Architecture {
 
 impl Default for Architecture {
     fn default() -> Self {
-        Self { levels: 8, coarsest: 16, finest: 256, log2_entries: 17, hidden: 32, steps: 512 }
+        Self { levels: 8, coarsest: 16, finest: 256, log2_entries: 17, hidden: 64, steps: 512 }
     }
 }
 

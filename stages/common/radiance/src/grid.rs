@@ -3,11 +3,14 @@
 //! A level whose vertices fit its table is stored densely; a finer one is hashed (Müller et al. 2022, "Instant neural graphics
 //! primitives", eq. 4), and collisions are left to the networks.
 
+use crate::adam::Touched;
 use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
 
 /// Features a vertex.
 pub(crate) const FEATURES: usize = 4;
+/// Entries in a block that the optimiser takes at once.
+const PER_BLOCK: usize = LANES / FEATURES;
 
 /// One level.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,6 +26,11 @@ pub(crate) struct Level {
 }
 
 impl Level {
+    /// Words that mark its blocks.
+    pub(crate) fn marks(&self) -> usize {
+        self.entries.div_ceil(64 * PER_BLOCK)
+    }
+
     pub(crate) fn range(&self) -> std::ops::Range<usize> {
         self.offset..self.offset + self.entries * FEATURES
     }
@@ -119,8 +127,10 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each sample's feature gradient to the eight entries it came from, in sample order.
-    pub(crate) fn scatter<L>(level: &Level, gradient: &mut [f32], positions: &[[f32; 3]], feature_gradients: &[[f32; FEATURES]]) {
+    /// Adds each sample's feature gradient to the eight entries it came from, in sample order, and marks what it touched.
+    pub(crate) fn scatter<L>(
+        level: &Level, gradient: &mut [f32], touched: &mut Touched, positions: &[[f32; 3]], feature_gradients: &[[f32; FEATURES]],
+    ) {
         let (gradient, _) = gradient.as_chunks_mut::<FEATURES>();
         let mut around = Corners::new();
         for (positions, gradients) in positions.chunks(LANES).zip(feature_gradients.chunks(LANES)) {
@@ -134,7 +144,9 @@ kernel! {
             for (l, d) in gradients.iter().enumerate() {
                 let d = L::Quad::load(d);
                 for c in 0..8 {
-                    let entry = &mut gradient[around.index[c][l] as usize];
+                    let index = around.index[c][l] as usize;
+                    touched[index / (64 * PER_BLOCK)] |= 1 << (index / PER_BLOCK % 64);
+                    let entry = &mut gradient[index];
                     d.mul_add(L::Quad::splat(around.weight[c][l]), L::Quad::load(entry)).store(entry);
                 }
             }
@@ -192,7 +204,12 @@ mod tests {
             let mut out = vec![0.0; FEATURES * n];
             encode(&level, &table, &rows(&p), &mut out, n);
             let mut gradient = vec![0.0; table.len()];
-            scatter(&level, &mut gradient, &p, &d);
+            let mut touched = vec![0; level.marks()];
+            scatter(&level, &mut gradient, &mut touched, &p, &d);
+            for (block, numbers) in gradient.chunks(LANES).enumerate() {
+                let marked = touched[block / 64] >> (block % 64) & 1 == 1;
+                assert!(marked || numbers.iter().all(|g| *g == 0.0), "block {block} isn't marked");
+            }
             let left: f64 = (0..n)
                 .flat_map(|s| (0..4).map(move |k| (s, k)))
                 .map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k]))

@@ -10,6 +10,7 @@ pub struct Passes {
     transposed: Vec<f32>,
     lanes: Vec<f32>,
     into: FeatureGradients,
+    touched: Vec<u64>,
 }
 
 impl Passes {
@@ -18,7 +19,8 @@ impl Passes {
         let mut transposed = vec![0.0; field.network.len()];
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
         let lanes = vec![0.0; field.network.len() * LANES];
-        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default() }
+        let marks = field.levels.iter().map(|l| l.marks()).max().unwrap_or(0);
+        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default(), touched: vec![0; marks] }
     }
 
     /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every colour, as far as the list that
@@ -45,9 +47,10 @@ impl Passes {
     ///
     /// # Panics
     /// When the table has another size.
-    pub fn scatter(&self, field: &Field, table: &mut [f32]) {
+    pub fn scatter(&mut self, field: &Field, table: &mut [f32]) {
         for (level, gradients) in field.levels.iter().zip(&self.into.levels) {
-            crate::grid::scatter(level, &mut table[level.range()], &self.into.positions, gradients);
+            let touched = &mut self.touched[..level.marks()];
+            crate::grid::scatter(level, &mut table[level.range()], touched, &self.into.positions, gradients);
         }
     }
 }

@@ -37,8 +37,10 @@ pub struct TrainingOptions {
     pub batch: usize,
     /// Samples a step aims at; while space is still full of fog, steps have fewer rays.
     pub samples: usize,
-    /// Learning rate at its highest.
+    /// Learning rate of the grid at its highest.
     pub rate: f64,
+    /// Learning rate of the networks at its highest.
+    pub network_rate: f64,
     /// Learning rate at the end, as a share of the highest.
     pub final_rate: f64,
     /// Steps of linear warm-up.
@@ -91,6 +93,9 @@ pub struct Trainer {
     first: Moments,
     second: Moments,
     gradients: Moments,
+    /// Blocks of each level's gradient that aren't 0.
+    touched: Vec<Vec<u64>>,
+    touched_network: Vec<u64>,
     transposed: Vec<f32>,
     /// Cells that may be occupied at all.
     hull: Option<Vec<bool>>,
@@ -141,6 +146,8 @@ impl Trainer {
             first: zeros(),
             second: zeros(),
             gradients: zeros(),
+            touched: field.levels.iter().map(|l| vec![0; l.marks()]).collect(),
+            touched_network: vec![0; field.network.len().div_ceil(64 * LANES)],
             transposed: vec![0.0; field.network.len()],
             hull: None,
             step: 0,
@@ -261,11 +268,14 @@ impl Trainer {
         let options = &self.options;
         let progress = (self.groups * group as u64) as f64 / options.rays.max(1) as f64;
         let warm = ((self.step + 1) as f64 / options.warm_up.max(1) as f64).min(1.0);
-        let rate = options.rate * self.rate_scale * warm * options.final_rate.powf(progress.min(1.0));
-        let grid_step = AdamStep::new(self.step + 1, rate, options.grid_decay);
-        let network_step = AdamStep::new(self.step + 1, rate, options.network_decay);
+        let schedule = self.rate_scale * warm * options.final_rate.powf(progress.min(1.0));
+        let grid_step = AdamStep::new(self.step + 1, options.rate * schedule, options.grid_decay);
+        let network_step = AdamStep::new(self.step + 1, options.network_rate * schedule, options.network_decay);
+        // All of a network is touched, always.
+        self.touched_network.fill(u64::MAX);
         adam(
             &network_step,
+            &mut self.touched_network,
             &mut self.field.network,
             &mut self.gradients.network,
             &mut self.first.network,
@@ -276,23 +286,23 @@ impl Trainer {
         let mut work = Vec::with_capacity(self.field.levels.len());
         let mut grids =
             (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
-        for (i, level) in self.field.levels.iter().enumerate() {
+        for ((i, level), touched) in self.field.levels.iter().enumerate().zip(&mut self.touched) {
             let len = level.entries * crate::grid::FEATURES;
             let (w, rest_w) = grids.0.split_at_mut(len);
             let (g, rest_g) = grids.1.split_at_mut(len);
             let (m, rest_m) = grids.2.split_at_mut(len);
             let (v, rest_v) = grids.3.split_at_mut(len);
             grids = (rest_w, rest_g, rest_m, rest_v);
-            work.push((i, level, w, g, m, v));
+            work.push((i, level, touched, w, g, m, v));
         }
         // The finest levels cost most: begin with them.
-        work.into_par_iter().rev().with_max_len(1).for_each(|(i, level, w, g, m, v)| {
+        work.into_par_iter().rev().with_max_len(1).for_each(|(i, level, touched, w, g, m, v)| {
             for shard in shards {
                 if let Some(gradients) = shard.features.levels.get(i) {
-                    scatter(level, g, &shard.features.positions, gradients);
+                    scatter(level, g, touched, &shard.features.positions, gradients);
                 }
             }
-            adam(&grid_step, w, g, m, v);
+            adam(&grid_step, touched, w, g, m, v);
         });
     }
 

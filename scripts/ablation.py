@@ -1,0 +1,113 @@
+#!/usr/bin/env python3
+"""What each part brings and costs: `make ablation`, and PSNR against training time: `make tradeoff`.
+
+Both train on scenes with training views withheld (scripts/hold-out.py) and score those, so that choices made by these tables
+don't look at test views. What is in the store isn't run again. OUT gets one JSON array; a Markdown table is printed, and for
+`tradeoff` a curve is drawn beside OUT as SVG.
+"""
+
+import argparse
+import math
+import pathlib
+import subprocess
+import sys
+
+import cells
+
+# A part, and the parameters that take it away or put something else in its place.
+PARTS = [
+    ("as it is", []),
+    ("supervision: refiltered", ["supervision=refiltered"]),
+    ("supervision: kernel", ["supervision=kernel"]),
+    ("no supersampling", ["supersample=1"]),
+    ("3×3 sub-rays", ["supersample=3"]),
+    ("jittered sub-rays", ["jitter=true"]),
+    ("one ray a rendered pixel", ["sub_rays=1"]),
+    ("3×3 rays a rendered pixel", ["sub_rays=3"]),
+    ("networks 32 wide", ["hidden=32"]),
+    ("tables of 2^15", ["log2_entries=15"]),
+    ("tables of 2^19", ["log2_entries=19"]),
+    ("finest level 512", ["finest=512"]),
+    ("grid rate 1e-2", ["rate=0.01"]),
+    ("network rate 4e-2", ["network_rate=0.04"]),
+    ("4,096 rays a step", ["batch=4096"]),
+    ("1,024 rays a step", ["batch=1024"]),
+    ("131,072 samples a step in fog", ["samples=131072"]),
+    ("256 steps along the diagonal", ["train-ss.steps=256"]),
+    ("grid decay 1e-6", ["grid_decay=0.000001"]),
+    ("alpha supervision", ["background=alpha"]),
+    ("alpha hull", ["hull=alpha"]),
+]
+# Rays of the curve's points: about 15 seconds to 20 minutes on two cores.
+CURVE = [1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 48_000_000, 96_000_000, 192_000_000]
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("table", choices=["ablation", "tradeoff"])
+parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_synthetic/SCENE (or SCENE)")
+parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
+parser.add_argument("--protocol", default="100x2", help="LR width x scale")
+parser.add_argument("--rays", type=int, default=12_000_000, help="rays of each training of the ablation")
+parser.add_argument("--out", type=pathlib.Path, required=True)
+parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
+options = parser.parse_args()
+
+lr, scale = options.protocol.split("x")
+base = [f"lr={lr}", f"prep.scale={scale}"]
+if options.table == "ablation":
+    variants = [(name, [*base, f"rays={options.rays}", *settings]) for name, settings in PARTS]
+else:
+    variants = [(f"{rays / 1e6:g} M rays", [*base, f"rays={rays}"]) for rays in CURVE]
+
+scenes = []
+for scene in options.scenes:
+    held_out = options.out.parent / "held-out" / scene
+    source = cells.dataset(options.data, scene)
+    script = pathlib.Path(__file__).with_name("hold-out.py")
+    subprocess.run([sys.executable, script, source, held_out], check=True, stdout=subprocess.DEVNULL)
+    scenes.append(held_out)
+
+rows = []
+for name, settings in variants:
+    for scene in scenes:
+        page = options.out.parent / options.table / scene.name
+        rows.append({"variant": name, "scene": scene.name} | cells.run(options.nerf_sr, page, scene, settings))
+        cells.write(options.out, rows)
+
+
+def means(name: str) -> dict:
+    return cells.mean([row for row in rows if row["variant"] == name])
+
+
+first = means(variants[0][0])
+print(f"Withheld training views of {', '.join(s.name for s in scenes)}, {options.protocol}, means:\n")
+print("| variant | PSNR | against the first | SSIM | training | samples a ray | rendering |")
+print("| --- | --- | --- | --- | --- | --- | --- |")
+for name, _ in variants:
+    row = means(name)
+    print(
+        f"| {name} | {row['psnr']:.2f} | {row['psnr'] - first['psnr']:+.2f} | {row['ssim']:.4f} | {row['train_s']:.0f} s "
+        f"| {row['samples_per_ray']:.1f} | {row['render_s']:.1f} s |"
+    )
+
+if options.table == "tradeoff":
+    points = [(means(name)["train_s"], means(name)["psnr"]) for name, _ in variants]
+    low, high = math.floor(min(p for _, p in points)), math.ceil(max(p for _, p in points))
+    left, right = math.log2(min(t for t, _ in points)), math.log2(max(t for t, _ in points))
+    x = lambda t: 60 + 560 * (math.log2(t) - left) / max(right - left, 1e-9)
+    y = lambda p: 330 - 300 * (p - low) / max(high - low, 1e-9)
+    parts = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 660 390" font-family="sans-serif" font-size="13">']
+    parts.append('<rect width="660" height="390" fill="white"/>')
+    for p in range(low, high + 1):
+        parts.append(f'<path d="M60 {y(p):.1f}H620" stroke="#ddd"/><text x="52" y="{y(p) + 4:.1f}" text-anchor="end">{p}</text>')
+    for (t, _), (name, _) in zip(points, variants):
+        label = f"{t:.0f} s" if t < 90 else f"{t / 60:.1f} min"
+        parts.append(f'<text x="{x(t):.1f}" y="352" text-anchor="middle">{label}</text>')
+    line = " ".join(f"{x(t):.1f},{y(p):.1f}" for t, p in points)
+    parts.append(f'<polyline points="{line}" fill="none" stroke="#1b6ca8" stroke-width="2"/>')
+    for t, p in points:
+        parts.append(f'<circle cx="{x(t):.1f}" cy="{y(p):.1f}" r="4" fill="#1b6ca8"/>')
+        parts.append(f'<text x="{x(t):.1f}" y="{y(p) - 9:.1f}" text-anchor="middle">{p:.2f}</text>')
+    parts.append('<text x="340" y="378" text-anchor="middle">training time (log)</text><text x="60" y="18">PSNR, dB</text></svg>')
+    drawing = options.out.with_suffix(".svg")
+    drawing.write_text("\n".join(parts) + "\n")
+    print(f"\nThe curve: {drawing}")

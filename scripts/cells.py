@@ -1,0 +1,52 @@
+"""What the measuring scripts share: one run of the pipeline, and its figures. Not a program."""
+
+import json
+import pathlib
+import subprocess
+import sys
+
+
+def dataset(data: pathlib.Path, scene: str) -> pathlib.Path:
+    """The folder of a scene: DATA/nerf_synthetic/SCENE or DATA/SCENE."""
+    for folder in (data / "nerf_synthetic" / scene, data / scene):
+        if folder.is_dir():
+            return folder
+    sys.exit(f"no scene {scene} in {data}: set DATA=DIR to a folder that has it")
+
+
+def run(nerf_sr: str, page: pathlib.Path, scene: pathlib.Path, settings: list[str], weights: pathlib.Path | None = None) -> dict:
+    """Runs the pipeline alone (so that times mean something), or takes it from the store, and reads the one row it gives."""
+    command = [nerf_sr, "run", "-j", "1", "--out", page, "-i", f"dataset={scene}"]
+    if weights and weights.is_dir():
+        command += ["-i", f"weights={weights}"]
+    command += [word for setting in settings for word in ("-p", setting)]
+    print("==", *settings, flush=True)
+    done = subprocess.run([str(word) for word in command])
+    if done.returncode != 0:
+        sys.exit(done.returncode)
+    (row,) = json.loads((page / "report" / "results.json").read_text())
+    train, render = row["stages"]["train-ss"], row["stages"]["render-depth"]
+    log = json.loads((pathlib.Path(train["folder"]) / "training.json").read_text())
+    return {
+        "psnr": row["mean"]["psnr"],
+        "ssim": row["mean"]["ssim"],
+        "lpips": row["mean"].get("lpips"),
+        "train_s": train["seconds"],
+        "render_s": render["seconds"],
+        "rays_per_s": log["rays"] / train["seconds"],
+        "samples_per_ray": log["samples_per_ray"],
+    }
+
+
+def mean(rows: list[dict]) -> dict:
+    """Means of what are numbers in all rows."""
+    keys = [key for key in rows[0] if all(isinstance(row[key], (int, float)) for row in rows)]
+    return {key: sum(row[key] for row in rows) / len(rows) for key in keys}
+
+
+def write(out: pathlib.Path, rows: list[dict]) -> None:
+    """Writes rows whole or not at all."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".partial")
+    partial.write_text(json.dumps(rows, indent=2) + "\n")
+    partial.replace(out)
