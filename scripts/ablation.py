@@ -34,6 +34,8 @@ PARTS = [
     ("1,024 rays a step", ["batch=1024"]),
     ("131,072 samples a step in fog", ["samples=131072"]),
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
+    ("no weight averaging", ["averaging=0"]),
+    ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
     ("grid decay 1e-6", ["grid_decay=0.000001"]),
     ("alpha supervision", ["background=alpha"]),
     ("alpha hull", ["hull=alpha"]),

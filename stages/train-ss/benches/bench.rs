@@ -179,7 +179,8 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let pictures = train_ss::read_pictures(&input, &views)?;
         let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
-        let mut trainer = Trainer::new(Field::new(params.architecture(), views.bounds, params.seed), params.options());
+        let architecture = params.architecture(views.views[0].camera.intrinsics.width);
+        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), params.options());
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
@@ -189,7 +190,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         rows.add(format!("train_rays_per_s{name}"), speed, "rays/s");
         rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");
         rows.add(format!("train_rays_per_s_per_gflops{name}"), speed / rows.value("sgemm_gflops"), "rays/GFLOP");
-        Ok(trainer.field().clone())
+        Ok(trainer.finish())
     };
     let params = Params { rays, ..Params::default() };
     let field = run(&params, rows, "")?;

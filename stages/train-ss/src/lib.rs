@@ -54,6 +54,9 @@ pub struct Params {
     /// Learning rates at the end, as a share of the highest; they fall exponentially.
     #[schemars(range(min = 1e-6, max = 1.0))]
     pub final_rate: f64,
+    /// Share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
+    #[schemars(range(min = 0.0, max = 0.999))]
+    pub averaging: f64,
     /// Weight decay of the grid.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub grid_decay: f64,
@@ -66,12 +69,13 @@ pub struct Params {
     /// Cells along an axis of the coarsest level.
     #[schemars(range(min = 2, max = 512))]
     pub coarsest: u32,
-    /// Cells along an axis of the finest level.
+    /// Cells along an axis of the finest level. Without it: 2.56 for every LR pixel across, at least `coarsest`.
     #[schemars(range(min = 2, max = 4096))]
-    pub finest: u32,
-    /// Base-2 logarithm of the most entries in a level.
+    pub finest: Option<u32>,
+    /// Base-2 logarithm of the most entries in a level. Without it: 17 for 256 cells along the finest level's axis, and two more
+    /// for every doubling of those, since surfaces grow with the square.
     #[schemars(range(min = 8, max = 22))]
-    pub log2_entries: u32,
+    pub log2_entries: Option<u32>,
     /// Width of the networks' hidden layers.
     #[schemars(range(min = 16, max = 128))]
     pub hidden: u32,
@@ -95,13 +99,14 @@ impl Default for Params {
             samples: 32_768,
             rate: 4e-2,
             network_rate: 1e-2,
-            final_rate: 0.02,
+            final_rate: 0.25,
+            averaging: 0.97,
             grid_decay: 0.0,
             network_decay: 1e-6,
             levels: grid.levels,
             coarsest: grid.coarsest,
-            finest: grid.finest,
-            log2_entries: grid.log2_entries,
+            finest: None,
+            log2_entries: None,
             hidden: grid.hidden,
             steps: grid.steps,
             seed: 0,
@@ -110,13 +115,16 @@ impl Default for Params {
 }
 
 impl Params {
-    /// What field they ask for.
-    pub fn architecture(&self) -> Architecture {
+    /// What field they ask for, with LR images of a width.
+    pub fn architecture(&self, lr_width: u32) -> Architecture {
+        let by_width = (2.56 * f64::from(lr_width)).round().clamp(64.0, 2048.0) as u32;
+        let finest = self.finest.unwrap_or(by_width.max(self.coarsest));
+        let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
         Architecture {
             levels: self.levels,
             coarsest: self.coarsest,
-            finest: self.finest,
-            log2_entries: self.log2_entries,
+            finest,
+            log2_entries: self.log2_entries.unwrap_or(by_finest),
             hidden: self.hidden,
             steps: self.steps,
         }
@@ -132,6 +140,7 @@ impl Params {
             network_rate: self.network_rate,
             final_rate: self.final_rate,
             warm_up: 100,
+            averaging: self.averaging as f32,
             grid_decay: self.grid_decay as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,
@@ -180,29 +189,26 @@ impl Stage for TrainSs {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        if params.coarsest > params.finest {
-            let message = format!("parameter coarsest: {} is above finest = {}", params.coarsest, params.finest);
+        if let Some(finest) = params.finest.filter(|f| *f < params.coarsest) {
+            let message = format!("parameter coarsest: {} is above finest = {finest}", params.coarsest);
             return Err(Failure::Usage(message).into());
         }
         let input = context.input("scene")?;
         let views = Views::read(input)?;
         let pictures = read_pictures(input, &views)?;
         let mut supervision = supervision(input, params, &views, pictures)?;
-        let mut trainer = Trainer::new(Field::new(params.architecture(), views.bounds, params.seed), params.options());
+        let architecture = params.architecture(views.views[0].camera.intrinsics.width);
+        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), params.options());
         if let Some(hull) = &views.hull {
             trainer.limit_to_hull(&read_hull(&input.path(hull))?);
         }
         let log = train(context, params, &mut trainer, &mut supervision)?;
-        if !trainer.field().is_finite() {
-            return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", trainer.steps())).into());
+        let field = trainer.finish();
+        if !field.is_finite() {
+            return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", log.steps)).into());
         }
-        trainer.field().write(&context.output_path("field.safetensors")?).context("cannot write the field")?;
-        let file = FieldFile {
-            field: params.field,
-            architecture: params.architecture(),
-            bounds: views.bounds,
-            background: views.background,
-        };
+        field.write(&context.output_path("field.safetensors")?).context("cannot write the field")?;
+        let file = FieldFile { field: params.field, architecture, bounds: views.bounds, background: views.background };
         context.write_json(FIELD_FILE, &file)?;
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);

@@ -45,6 +45,8 @@ pub struct TrainingOptions {
     pub final_rate: f64,
     /// Steps of linear warm-up.
     pub warm_up: u64,
+    /// Share of the weights' running average that is kept at each of its steps; 0 for no average.
+    pub averaging: f32,
     /// Weight decay of the grid's entries.
     pub grid_decay: f32,
     /// Weight decay of the networks.
@@ -86,6 +88,10 @@ const OCCUPANCY_EVERY: u64 = 16;
 /// Until this step every cell is looked at.
 const OCCUPANCY_WARM_UP: u64 = 256;
 
+/// Steps between those of the weights' average, and the share of the rays after which it begins.
+const AVERAGE_EVERY: u64 = 16;
+const AVERAGE_FROM: f64 = 0.7;
+
 /// Trains a [`Field`] by Adam.
 pub struct Trainer {
     field: Field,
@@ -93,6 +99,8 @@ pub struct Trainer {
     first: Moments,
     second: Moments,
     gradients: Moments,
+    /// Running average of the weights, once there is one.
+    average: Option<Moments>,
     /// Blocks of each level's gradient that aren't 0.
     touched: Vec<Vec<u64>>,
     touched_network: Vec<u64>,
@@ -146,6 +154,7 @@ impl Trainer {
             first: zeros(),
             second: zeros(),
             gradients: zeros(),
+            average: None,
             touched: field.levels.iter().map(|l| vec![0; l.marks()]).collect(),
             touched_network: vec![0; field.network.len().div_ceil(64 * LANES)],
             transposed: vec![0.0; field.network.len()],
@@ -180,6 +189,15 @@ impl Trainer {
         let mask: Vec<bool> = (0..GRID * GRID * GRID).into_par_iter().map(kept).collect();
         self.field.occupancy.set(|cell| mask[cell]);
         self.hull = Some(mask);
+    }
+
+    /// The trained field: with the average of its weights, where one was kept.
+    pub fn finish(self) -> Field {
+        let mut field = self.field;
+        if let Some(average) = self.average {
+            (field.grid, field.network) = (average.grid, average.network);
+        }
+        field
     }
 
     /// The field as it is now.
@@ -243,6 +261,7 @@ impl Trainer {
             self.rate_scale *= 0.5;
         } else {
             self.apply(group);
+            self.average(group);
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(group));
             (first_group..).zip(colours).for_each(|(group, colours)| supervision.remember(group, colours));
         }
@@ -306,6 +325,21 @@ impl Trainer {
         });
     }
 
+    /// Late in the training, takes the weights into their average (Polyak): what is left of the steps' noise evens out.
+    fn average(&mut self, group: usize) {
+        let late = self.rays_done(group) as f64 > AVERAGE_FROM * self.options.rays as f64;
+        if self.options.averaging == 0.0 || !late || !self.step.is_multiple_of(AVERAGE_EVERY) {
+            return;
+        }
+        let field = &self.field;
+        let average = self.average.get_or_insert_with(|| Moments { grid: field.grid.clone(), network: field.network.clone() });
+        let new = 1.0 - self.options.averaging;
+        let pairs = [(&mut average.grid, &field.grid), (&mut average.network, &field.network)];
+        for (average, now) in pairs {
+            average.par_iter_mut().with_min_len(1 << 16).zip(now).for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
+        }
+    }
+
     /// Looks at the density of cells and decides anew which may hold something.
     fn update_occupancy(&mut self) {
         const DECAY: f32 = 0.95;
@@ -362,9 +396,11 @@ impl Trainer {
         .flat_map(|v| v.to_le_bytes())
         .collect();
         let occupied = self.field.occupancy.to_bytes();
-        write_tensors(
-            path,
-            &[
+        let average = self.average.iter();
+        let average =
+            average.flat_map(|a| [("average.grid", Tensor::F32(&a.grid)), ("average.network", Tensor::F32(&a.network))]);
+        let tensors: Vec<_> = average
+            .chain([
                 ("counters", Tensor::U8(&counters)),
                 ("density", Tensor::F32(&self.field.occupancy.density)),
                 ("first.grid", Tensor::F32(&self.first.grid)),
@@ -374,8 +410,9 @@ impl Trainer {
                 ("occupied", Tensor::U8(&occupied)),
                 ("second.grid", Tensor::F32(&self.second.grid)),
                 ("second.network", Tensor::F32(&self.second.network)),
-            ],
-        )
+            ])
+            .collect();
+        write_tensors(path, &tensors)
     }
 
     /// The step a checkpoint was written at.
@@ -387,6 +424,13 @@ impl Trainer {
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_counters(path, |tensors, counters| {
             let field = &mut self.field;
+            let averaged = tensors.names().iter().any(|n| *n == "average.grid");
+            self.average =
+                averaged.then(|| Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] });
+            if let Some(average) = &mut self.average {
+                read_f32(tensors, "average.grid", &mut average.grid)?;
+                read_f32(tensors, "average.network", &mut average.network)?;
+            }
             for (name, into) in [
                 ("density", &mut field.occupancy.density),
                 ("first.grid", &mut self.first.grid),
