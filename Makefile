@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff bench clean goldens
+.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff seeds bench clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -69,6 +69,9 @@ ablation: build ## What each part brings and costs, on withheld training views
 
 tradeoff: build ## PSNR against training time, on withheld training views
 	@python3 scripts/ablation.py tradeoff --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/tradeoff.json)
+
+seeds: build ## Ten seeds on the demo scene: the spread of the PSNR
+	@python3 scripts/ablation.py seeds --rays 6000000 --out $(or $(OUT),out/seeds.json)
 
 BENCH_SCENE := out/bench/scene
 bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)

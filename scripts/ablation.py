@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""What each part brings and costs: `make ablation`, and PSNR against training time: `make tradeoff`.
+"""What each part brings and costs: `make ablation`; PSNR against training time: `make tradeoff`; ten seeds: `make seeds`.
 
-Both train on scenes with training views withheld (scripts/hold-out.py) and score those, so that choices made by these tables
-don't look at test views. What is in the store isn't run again. OUT gets one JSON array; a Markdown table is printed, and for
-`tradeoff` a curve is drawn beside OUT as SVG.
+The first two train on scenes with training views withheld (scripts/hold-out.py) and score those, so that choices made by these
+tables don't look at test views; `seeds` takes the demo scene. What is in the store isn't run again. OUT gets one JSON array; a
+Markdown table is printed, and for `tradeoff` a curve is drawn beside OUT as SVG.
 """
 
 import argparse
 import math
 import pathlib
+import statistics
 import subprocess
 import sys
 
@@ -44,11 +45,12 @@ PARTS = [
 CURVE = [1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 48_000_000, 96_000_000, 192_000_000]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("table", choices=["ablation", "tradeoff"])
-parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_synthetic/SCENE (or SCENE)")
+parser.add_argument("table", choices=["ablation", "tradeoff", "seeds"])
+parser.add_argument("--data", type=pathlib.Path, help="folder with nerf_synthetic/SCENE (or SCENE)")
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
 parser.add_argument("--protocol", default="100x2", help="LR width x scale")
 parser.add_argument("--rays", type=int, default=12_000_000, help="rays of each training of the ablation")
+parser.add_argument("--variants", type=int, help="only the first so many rows")
 parser.add_argument("--out", type=pathlib.Path, required=True)
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
 options = parser.parse_args()
@@ -57,22 +59,29 @@ lr, scale = options.protocol.split("x")
 base = [f"lr={lr}", f"prep.scale={scale}"]
 if options.table == "ablation":
     variants = [(name, [*base, f"rays={options.rays}", *settings]) for name, settings in PARTS]
-else:
+elif options.table == "tradeoff":
     variants = [(f"{rays / 1e6:g} M rays", [*base, f"rays={rays}"]) for rays in CURVE]
+else:
+    variants = [(f"seed {seed}", [f"train-ss.seed={seed}", f"rays={options.rays}"]) for seed in range(10)]
 
-scenes = []
-for scene in options.scenes:
+variants = variants[: options.variants]
+
+# The scenes' folders; none for the demo scene.
+scenes: dict[str, pathlib.Path | None] = {"demo": None} if options.table == "seeds" else {}
+for scene in [] if options.table == "seeds" else options.scenes:
+    if not options.data:
+        parser.error("--data is needed")
     held_out = options.out.parent / "held-out" / scene
     source = cells.dataset(options.data, scene)
     script = pathlib.Path(__file__).with_name("hold-out.py")
     subprocess.run([sys.executable, script, source, held_out], check=True, stdout=subprocess.DEVNULL)
-    scenes.append(held_out)
+    scenes[scene] = held_out
 
 rows = []
 for name, settings in variants:
-    for scene in scenes:
-        page = options.out.parent / options.table / scene.name
-        rows.append({"variant": name, "scene": scene.name} | cells.run(options.nerf_sr, page, scene, settings))
+    for scene, folder in scenes.items():
+        page = options.out.parent / options.table / scene
+        rows.append({"variant": name, "scene": scene} | cells.run(options.nerf_sr, page, folder, settings))
         cells.write(options.out, rows)
 
 
@@ -81,7 +90,10 @@ def means(name: str) -> dict:
 
 
 first = means(variants[0][0])
-print(f"Withheld training views of {', '.join(s.name for s in scenes)}, {options.protocol}, means:\n")
+if options.table == "seeds":
+    print("The demo scene's test views:\n")
+else:
+    print(f"Withheld training views of {', '.join(scenes)}, {options.protocol}, means:\n")
 print("| variant | PSNR | against the first | SSIM | training | samples a ray | rendering |")
 print("| --- | --- | --- | --- | --- | --- | --- |")
 for name, _ in variants:
@@ -90,6 +102,11 @@ for name, _ in variants:
         f"| {name} | {row['psnr']:.2f} | {row['psnr'] - first['psnr']:+.2f} | {row['ssim']:.4f} | {row['train_s']:.0f} s "
         f"| {row['samples_per_ray']:.1f} | {row['render_s']:.1f} s |"
     )
+
+if options.table == "seeds":
+    scores = [row["psnr"] for row in rows]
+    spread = statistics.stdev(scores) if len(scores) > 1 else 0.0
+    print(f"\nPSNR over seeds: {statistics.mean(scores):.2f} ± {spread:.2f} dB, from {min(scores):.2f} to {max(scores):.2f}")
 
 if options.table == "tradeoff":
     points = [(means(name)["train_s"], means(name)["psnr"]) for name, _ in variants]

@@ -14,9 +14,20 @@ def dataset(data: pathlib.Path, scene: str) -> pathlib.Path:
     sys.exit(f"no scene {scene} in {data}: set DATA=DIR to a folder that has it")
 
 
-def run(nerf_sr: str, page: pathlib.Path, scene: pathlib.Path, settings: list[str], weights: pathlib.Path | None = None) -> dict:
-    """Runs the pipeline alone (so that times mean something), or takes it from the store, and reads the one row it gives."""
-    command = [nerf_sr, "run", "-j", "1", "--out", page, "-i", f"dataset={scene}"]
+def run(
+    nerf_sr: str,
+    page: pathlib.Path,
+    scene: pathlib.Path | None,
+    settings: list[str],
+    weights: pathlib.Path | None = None,
+) -> dict:
+    """Runs the pipeline alone (so that times mean something), or takes it from the store, and reads the one row it gives.
+
+    Without a scene the pipeline's own is taken: the demo scene.
+    """
+    command = [nerf_sr, "run", "-j", "1", "--out", page]
+    if scene:
+        command += ["-i", f"dataset={scene}"]
     if weights and weights.is_dir():
         command += ["-i", f"weights={weights}"]
     command += [word for setting in settings for word in ("-p", setting)]

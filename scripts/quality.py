@@ -32,8 +32,9 @@ def cell(scene: str, protocol: str, supervision: str) -> dict:
     rays = RAYS.get(protocol, OTHER_RAYS)
     # Far above the trained resolution the field is smooth within a pixel, and one ray shows it all.
     sub_rays = 2 if float(scale) < 3 else 1
-    settings = [f"lr={lr}", f"prep.scale={scale}", f"supervision={supervision}", f"rays={rays}", f"sub_rays={sub_rays}"]
-    settings += options.set
+    settings = {"lr": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "sub_rays": sub_rays}
+    settings |= dict(setting.split("=", 1) for setting in options.set)
+    settings = [f"{name}={value}" for name, value in settings.items()]
     folder = cells.dataset(options.data, scene)
     row = cells.run(options.nerf_sr, page, folder, settings, options.data / "weights")
     return {"scene": scene, "protocol": protocol, "supervision": supervision} | row

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use common::{Finished, Project, stage, stage_command};
 
-/// Long enough for several checkpoints, the first after about a second.
-const PARAMS: &str = r#"{"rays": 600000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
+/// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
+const PARAMS: &str = r#"{"supervision": "kernel", "rays": 600000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
 
 fn scene(project: &Project) -> std::path::PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));

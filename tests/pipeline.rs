@@ -163,12 +163,71 @@ fn every_option_goes_through() {
         &["-p", "supersample=3", "-p", "depth=median", "-p", "ray_distance=true"],
         &["-p", "lr=20", "-p", "scale=1.5", "-p", "references=2", "-p", "test_views=2"],
         &["-p", "lr=24", "-p", "scale=1", "-p", "supersample=1"],
+        &["-p", "supervision=refiltered"],
+        &["-p", "supervision=kernel"],
+        &["-p", "lr=32", "-p", "scale=1.5", "-p", "supersample=1.5", "-p", "supervision=kernel"],
+        &["-p", "lr=16", "-p", "scale=3", "-p", "supersample=3", "-p", "kernel=bicubic", "-p", "supervision=kernel"],
+        &["-p", "lr=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "supervision=kernel"],
+        &["-p", "lr=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "kernel=box", "-p", "sub_rays=1", "-p", "averaging=0"],
     ] {
         let run = project.ok(&[&["run"], options].concat());
         let psnr: f64 = run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
         assert!((17.0..40.0).contains(&psnr), "{options:?}: {run}");
         assert!(run.contains("depth error"), "{run}");
     }
+}
+
+/// `make quality` and its like: cells come out as JSON rows, a second call runs nothing, and a mistake is one line.
+#[test]
+fn tables_are_made_of_cells() {
+    let project = Project::tiny();
+    project.replace("default: [eval]", "default: [report]");
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + "  report:\n    inputs: {run: eval}\n"));
+    project.ok(&["run", "demo-scene"]);
+    let dataset = project.object(&project.output_of("demo-scene", &[])[0]);
+    std::fs::create_dir_all(project.path("data")).unwrap();
+    std::os::unix::fs::symlink(&dataset, project.path("data/demo")).unwrap();
+    let scripts = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
+    let call = |script: &str, arguments: &[&str]| {
+        let runner = common::bin("nerf-sr");
+        let output = std::process::Command::new("python3")
+            .arg(scripts.join(script))
+            .args(arguments)
+            .args(["--data", "data", "--nerf-sr", runner.to_str().unwrap()])
+            .current_dir(project.path("."))
+            .output()
+            .unwrap();
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        (output.status.code(), text(&output.stdout), text(&output.stderr))
+    };
+    let rows =
+        |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
+    let quality = ["--scenes", "demo", "--protocols", "24x2", "12x4", "--out", "out/quality.json", "--set", "rays=60000"];
+    let (code, stdout, stderr) = call("quality.py", &quality);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(stdout.contains("| 12x4 | demo | kernel |"), "{stdout}");
+    let made = rows("out/quality.json");
+    assert_eq!(made.len(), 4);
+    for row in &made {
+        for name in ["psnr", "ssim", "train_s", "render_s", "rays_per_s"] {
+            assert!(row[name].as_f64().is_some_and(|v| v > 0.0), "{name}: {row}");
+        }
+        assert!(["scene", "protocol", "supervision"].iter().all(|name| row[name].is_string()), "{row}");
+    }
+    let (_, again, _) = call("quality.py", &quality);
+    assert!(!again.contains("running") && again.contains("| 24x2 | demo | average |"), "{again}");
+    assert_eq!(rows("out/quality.json"), made);
+
+    let tradeoff = ["tradeoff", "--scenes", "demo", "--protocol", "24x2", "--variants", "2", "--out", "out/tradeoff.json"];
+    let (code, stdout, stderr) = call("ablation.py", &tradeoff);
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(stdout.contains("| 3 M rays |"), "{stdout}");
+    assert_eq!(rows("out/tradeoff.json").len(), 2);
+    assert!(std::fs::read_to_string(project.path("out/tradeoff.svg")).unwrap().ends_with("</svg>\n"));
+
+    let (code, _, stderr) = call("quality.py", &["--scenes", "nowhere"]);
+    assert_eq!((code, stderr.trim()), (Some(1), "no scene nowhere in data: set DATA=DIR to a folder that has it"));
 }
 
 /// A field renders at any size, and pictures need not be square.

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use artifact::GivenInput;
-use radiance::{Architecture, Field, Passes, Ray, Supervision as _, Trainer};
+use radiance::{Architecture, Field, Passes, Ray, Trainer};
 use scene::{Bounds, Camera, Views};
 use serde::Serialize;
 use train_ss::Params;
@@ -185,7 +185,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
         }
-        let done = trainer.rays_done(supervision.rays_per_group()) as f64;
+        let done = trainer.rays_done() as f64;
         let speed = done / start.elapsed().as_secs_f64();
         rows.add(format!("train_rays_per_s{name}"), speed, "rays/s");
         rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");

@@ -32,6 +32,10 @@ pub struct Params {
     /// isn't whole, sub-rays are cast for the next whole number.
     #[schemars(range(min = 1.0, max = 16.0))]
     pub supersample: f64,
+    /// Share of the rays during which fewer sub-rays are cast: one, then two a side and so on, doubling up to `supersample`. Coarse
+    /// pixels teach the rough shape from more views in the same time.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub coarse: f64,
     /// What an LR pixel is compared with.
     pub supervision: Supervision,
     /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
@@ -92,6 +96,7 @@ impl Default for Params {
         Self {
             field: FieldKind::Grid,
             supersample: 2.0,
+            coarse: 0.3,
             supervision: Supervision::Average,
             jitter: false,
             rays: 30_000_000,
@@ -269,6 +274,7 @@ pub fn supervision(
         supervision: params.supervision,
         scale: [params.supersample; 2],
         filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
+        coarse: params.coarse,
         jitter: params.jitter,
         seed: params.seed,
     };
@@ -292,11 +298,9 @@ fn train(
     trainer: &mut Trainer,
     supervision: &mut Supersampling,
 ) -> anyhow::Result<TrainingLog> {
-    use radiance::Supervision as _;
-    let group = supervision.rays_per_group();
-    let total = params.rays / group as u64 * group as u64;
-    if total == 0 {
-        let message = format!("parameter rays: {} is less than the {group} of one pixel", params.rays);
+    let (total, group) = (params.rays, supervision.side().iter().product::<usize>());
+    if total < group as u64 {
+        let message = format!("parameter rays: {total} is less than the {group} of one pixel");
         return Err(Failure::Usage(message).into());
     }
     let mut checkpoints = Checkpoints::new(context.work());
@@ -315,10 +319,10 @@ fn train(
             context
                 .say(format!("step {}: something wasn't finite; the step was thrown away and the rate halved", trainer.steps()));
         }
-        let rays = trainer.rays_done(group);
+        let rays = trainer.rays_done();
         curve.add(&report, rays, total);
         progress.set(rays, &curve.note());
         checkpoints.write_when_due(trainer, supervision, &curve).context("cannot write the checkpoint")?;
     }
-    Ok(curve.finish(trainer.steps(), trainer.rays_done(group)))
+    Ok(curve.finish(trainer.steps(), trainer.rays_done()))
 }

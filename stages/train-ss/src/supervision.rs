@@ -28,8 +28,10 @@ pub struct Supersampling {
     views: Vec<TrainingView>,
     pixels: u64,
     background: Background,
-    /// Sub-rays along x and y.
+    /// Sub-rays along x and y, when all are cast and now.
+    full: [usize; 2],
     side: [usize; 2],
+    coarse: f64,
     jitter: bool,
     seed: u64,
     memory: Option<Memory>,
@@ -55,6 +57,8 @@ pub struct SupersamplingOptions {
     pub scale: [f64; 2],
     /// The filter that made the LR pictures.
     pub filter: Filter,
+    /// Share of the training during which fewer sub-rays are cast.
+    pub coarse: f64,
     /// Whether a sub-ray passes anywhere in its share of the pixel instead of at its centre.
     pub jitter: bool,
     /// Seed of what is drawn.
@@ -79,7 +83,7 @@ impl Supersampling {
         };
         let smallest = |i: usize, length: fn(&Picture) -> usize| pictures.iter().map(|p| fine(length(p), i)).min().unwrap_or(1);
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
-        let side = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
+        let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
         let mut memory = None;
         let mut pixels = 0;
         let mut ready = Vec::with_capacity(pictures.len());
@@ -92,7 +96,7 @@ impl Supersampling {
                 }
                 Supervision::Kernel => {
                     let (enlarge, shrink) = operator(&picture);
-                    memory.get_or_insert_with(|| Memory::new(side)).add(&enlarge.apply(&picture), shrink);
+                    memory.get_or_insert_with(|| Memory::new(full)).add(&enlarge.apply(&picture), shrink);
                 }
             }
             let before = pixels;
@@ -108,13 +112,18 @@ impl Supersampling {
                 down: (-r.y_axis / k.fy).to_array(),
             });
         }
-        let (jitter, seed) = (options.jitter, options.seed);
-        Self { views: ready, pixels, background: views.background, side, jitter, seed, memory }
+        let SupersamplingOptions { coarse, jitter, seed, .. } = *options;
+        Self { views: ready, pixels, background: views.background, full, side: full, coarse, jitter, seed, memory }
     }
 
-    /// Sub-rays of an LR pixel, along x and y.
+    /// Sub-rays of an LR pixel along x and y, once all are cast.
     pub fn side(&self) -> [usize; 2] {
-        self.side
+        self.full
+    }
+
+    /// The memory, where the kernel is what counts by now.
+    fn kernel(&self) -> Option<&Memory> {
+        self.memory.as_ref().filter(|_| self.side == self.full)
     }
 
     /// The field's HR pixels as last rendered, where the supervision keeps them.
@@ -163,6 +172,15 @@ fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> P
 }
 
 impl radiance::Supervision for Supersampling {
+    fn begin(&mut self, done: f64) {
+        self.side = self.full;
+        if done < self.coarse {
+            let doublings = self.full[0].max(self.full[1]).next_power_of_two().trailing_zeros();
+            let now = 1 << (done / self.coarse * f64::from(doublings)) as u32;
+            self.side = self.full.map(|n| n.min(now));
+        }
+    }
+
     fn rays_per_group(&self) -> usize {
         self.side[0] * self.side[1]
     }
@@ -175,7 +193,7 @@ impl radiance::Supervision for Supersampling {
         let mut draws = Draws::new(self.seed, JITTER, group);
         let mut offset = || if self.jitter { f64::from(draws.uniform()) } else { 0.5 };
         // Where the sub-rays begin, and how far apart they are, in LR pixels.
-        let (start, apart) = match &self.memory {
+        let (start, apart) = match self.kernel() {
             Some(memory) => memory.block_in_pixels(index, x, y),
             None => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
         };
@@ -195,7 +213,7 @@ impl radiance::Supervision for Supersampling {
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
         let share = 1.0 / colours.len() as f32;
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
-        if let Some(memory) = &self.memory {
+        if let Some(memory) = self.kernel() {
             let at = [pixel % picture.width, pixel / picture.width];
             let own = memory.pull(index, at, colours, picture, unclipped_residual, gradients);
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= 2.0 / 3.0);
@@ -217,7 +235,7 @@ impl radiance::Supervision for Supersampling {
     fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
         let (index, pixel) = self.pixel(group);
         let width = self.views[index].picture.width;
-        if let Some(memory) = &mut self.memory {
+        if let Some(memory) = self.memory.as_mut().filter(|_| self.side == self.full) {
             memory.remember(index, pixel % width, pixel / width, colours);
         }
     }
@@ -231,7 +249,7 @@ mod tests {
     use super::*;
 
     fn options(supervision: Supervision, scale: [f64; 2]) -> SupersamplingOptions {
-        SupersamplingOptions { supervision, scale, filter: Filter::Lanczos, jitter: false, seed: 9 }
+        SupersamplingOptions { supervision, scale, filter: Filter::Lanczos, coarse: 0.0, jitter: false, seed: 9 }
     }
 
     fn fine_picture(width: usize, height: usize) -> Picture {
@@ -345,6 +363,20 @@ mod tests {
         assert_eq!(supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients), 0.0);
         assert!(supersampling.judge(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
+    }
+
+    /// 1, 2, 4 … sub-rays a side, each for an equal part of the coarse share, and then all.
+    #[test]
+    fn sub_rays_double_until_all_are_cast() {
+        let rays_at = |scale: f64, done: f64| {
+            let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
+            supersampling.coarse = 0.3;
+            supersampling.begin(done);
+            supersampling.rays_per_group()
+        };
+        for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
+            assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
+        }
     }
 
     #[test]

@@ -17,7 +17,9 @@ use crate::simd::LANES;
 /// Where a trainer's rays come from and how their colours are judged. Rays come in groups that are judged together: the s×s
 /// sub-rays of an LR pixel.
 pub trait Supervision: Sync {
-    /// Rays in a group.
+    /// Is told before every step which share of the training's rays is done, from which alone its groups may change.
+    fn begin(&mut self, _done: f64) {}
+    /// Rays in a group of this step.
     fn rays_per_group(&self) -> usize;
     /// Casts the rays of a group. `group` counts from 0 over the whole training: draw from it alone.
     fn cast(&self, group: u64, rays: &mut [Ray]);
@@ -109,6 +111,7 @@ pub struct Trainer {
     hull: Option<Vec<bool>>,
     step: u64,
     groups: u64,
+    rays: u64,
     samples_per_ray: f64,
     rate_scale: f64,
     last_fault: Option<u64>,
@@ -161,6 +164,7 @@ impl Trainer {
             hull: None,
             step: 0,
             groups: 0,
+            rays: 0,
             samples_per_ray: full,
             rate_scale: 1.0,
             last_fault: None,
@@ -210,15 +214,21 @@ impl Trainer {
         self.step
     }
 
-    /// Rays cast so far, with groups of a size.
-    pub fn rays_done(&self, rays_per_group: usize) -> u64 {
-        self.groups * rays_per_group as u64
+    /// Rays cast so far.
+    pub fn rays_done(&self) -> u64 {
+        self.rays
+    }
+
+    /// Share of all rays that were cast.
+    fn done(&self) -> f64 {
+        (self.rays as f64 / self.options.rays.max(1) as f64).min(1.0)
     }
 
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
+        supervision.begin(self.done());
         let group = supervision.rays_per_group();
-        let left = self.options.rays.saturating_sub(self.rays_done(group)) as usize / group;
+        let left = self.options.rays.saturating_sub(self.rays) as usize / group;
         if left == 0 {
             return Ok(None);
         }
@@ -232,12 +242,12 @@ impl Trainer {
         }
 
         let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
-        let first_group = self.groups;
+        let (first_group, first_ray) = (self.groups, self.rays);
         let judge = &*supervision;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, field, transposed, judge, options.seed, first_group, range, groups);
+            shard.run(&mut worker, field, transposed, judge, options.seed, (first_group, first_ray), range, groups);
             lock(workers).push(worker);
         });
 
@@ -249,6 +259,7 @@ impl Trainer {
             }
         }
         self.groups += groups as u64;
+        self.rays += (groups * group) as u64;
         self.samples_per_ray = samples as f64 / (groups * group) as f64;
         let fault = self.fault(loss);
         if let Some(tensor) = fault {
@@ -260,8 +271,8 @@ impl Trainer {
             self.last_fault = Some(self.step);
             self.rate_scale *= 0.5;
         } else {
-            self.apply(group);
-            self.average(group);
+            self.apply();
+            self.average();
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(group));
             (first_group..).zip(colours).for_each(|(group, colours)| supervision.remember(group, colours));
         }
@@ -283,11 +294,11 @@ impl Trainer {
         }
     }
 
-    fn apply(&mut self, group: usize) {
+    fn apply(&mut self) {
         let options = &self.options;
-        let progress = (self.groups * group as u64) as f64 / options.rays.max(1) as f64;
+        let progress = self.done();
         let warm = ((self.step + 1) as f64 / options.warm_up.max(1) as f64).min(1.0);
-        let schedule = self.rate_scale * warm * options.final_rate.powf(progress.min(1.0));
+        let schedule = self.rate_scale * warm * options.final_rate.powf(progress);
         let grid_step = AdamStep::new(self.step + 1, options.rate * schedule, options.grid_decay);
         let network_step = AdamStep::new(self.step + 1, options.network_rate * schedule, options.network_decay);
         // All of a network is touched, always.
@@ -326,8 +337,8 @@ impl Trainer {
     }
 
     /// Late in the training, takes the weights into their average (Polyak): what is left of the steps' noise evens out.
-    fn average(&mut self, group: usize) {
-        let late = self.rays_done(group) as f64 > AVERAGE_FROM * self.options.rays as f64;
+    fn average(&mut self) {
+        let late = self.done() > AVERAGE_FROM;
         if self.options.averaging == 0.0 || !late || !self.step.is_multiple_of(AVERAGE_EVERY) {
             return;
         }
@@ -388,6 +399,7 @@ impl Trainer {
         let counters: Vec<u8> = [
             self.step,
             self.groups,
+            self.rays,
             self.samples_per_ray.to_bits(),
             self.rate_scale.to_bits(),
             self.last_fault.map_or(u64::MAX, |s| s),
@@ -445,19 +457,20 @@ impl Trainer {
             let occupied = read_u8(tensors, "occupied", GRID * GRID * GRID)?;
             field.occupancy.set(|cell| occupied[cell] != 0);
             (self.step, self.groups) = (counters[0], counters[1]);
-            (self.samples_per_ray, self.rate_scale) = (f64::from_bits(counters[2]), f64::from_bits(counters[3]));
-            self.last_fault = (counters[4] != u64::MAX).then_some(counters[4]);
+            self.rays = counters[2];
+            (self.samples_per_ray, self.rate_scale) = (f64::from_bits(counters[3]), f64::from_bits(counters[4]));
+            self.last_fault = (counters[5] != u64::MAX).then_some(counters[5]);
             Ok(())
         })
     }
 }
 
-/// Opens a checkpoint and reads its five counters.
+/// Opens a checkpoint and reads its six counters.
 fn read_counters<T>(path: &Path, then: impl FnOnce(&SafeTensors<'_>, &[u64]) -> Result<T, String>) -> Result<T, FieldError> {
     let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
     let read = || {
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
-        let counters = read_u8(&tensors, "counters", 40)?;
+        let counters = read_u8(&tensors, "counters", 48)?;
         let counters: Vec<u64> = counters.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect();
         then(&tensors, &counters)
     };
@@ -477,7 +490,7 @@ impl Shard {
         transposed: &[f32],
         supervision: &impl Supervision,
         seed: u64,
-        first_group: u64,
+        (first_group, first_ray): (u64, u64),
         range: std::ops::Range<usize>,
         groups: usize,
     ) {
@@ -505,9 +518,9 @@ impl Shard {
             worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
             worker.backgrounds.clear();
             worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-            let first_ray = (first_group + here.start as u64) * group as u64;
+            let ray = first_ray + (here.start * group) as u64;
             worker.offsets.clear();
-            worker.offsets.extend((0..rays as u64).map(|r| uniform(seed, 4, first_ray + r)));
+            worker.offsets.extend((0..rays as u64).map(|r| uniform(seed, 4, ray + r)));
             worker.chunk.forward(field, &worker.clipped, &worker.offsets);
             self.samples += worker.chunk.samples();
             for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
