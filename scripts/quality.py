@@ -12,7 +12,7 @@ import pathlib
 import cells
 
 # Rays of a training: more where there is more to see. All else is the stages' defaults.
-RAYS = {"100x2": 30_000_000, "100x4": 36_000_000, "200x2": 44_000_000, "200x4": 48_000_000}
+RAYS = {"100x2": 48_000_000, "100x4": 60_000_000, "200x2": 44_000_000, "200x4": 48_000_000}
 OTHER_RAYS = 40_000_000
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
