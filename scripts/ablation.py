@@ -18,10 +18,11 @@ import cells
 # A part, and the parameters that take it away or put something else in its place.
 PARTS = [
     ("as it is", []),
+    ("supervision: average", ["supervision=average"]),
     ("supervision: refiltered", ["supervision=refiltered"]),
-    ("supervision: kernel", ["supervision=kernel"]),
     ("no supersampling", ["supersample=1"]),
     ("3×3 sub-rays", ["supersample=3"]),
+    ("all sub-rays from the start", ["coarse=0"]),
     ("jittered sub-rays", ["jitter=true"]),
     ("one ray a rendered pixel", ["sub_rays=1"]),
     ("3×3 rays a rendered pixel", ["sub_rays=3"]),
@@ -38,7 +39,7 @@ PARTS = [
     ("no weight averaging", ["averaging=0"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
     ("grid decay 1e-6", ["grid_decay=0.000001"]),
-    ("alpha supervision", ["background=alpha"]),
+    ("alpha supervision, averaged", ["background=alpha"]),
     ("alpha hull", ["hull=alpha"]),
 ]
 # Rays of the curve's points: about 15 seconds to 20 minutes on two cores.
@@ -49,7 +50,7 @@ parser.add_argument("table", choices=["ablation", "tradeoff", "seeds"])
 parser.add_argument("--data", type=pathlib.Path, help="folder with nerf_synthetic/SCENE (or SCENE)")
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
 parser.add_argument("--protocol", default="100x2", help="LR width x scale")
-parser.add_argument("--rays", type=int, default=12_000_000, help="rays of each training of the ablation")
+parser.add_argument("--rays", type=int, default=30_000_000, help="rays of each training of the ablation")
 parser.add_argument("--variants", type=int, help="only the first so many rows")
 parser.add_argument("--out", type=pathlib.Path, required=True)
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")

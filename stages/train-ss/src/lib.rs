@@ -36,8 +36,9 @@ pub struct Params {
     /// pixels teach the rough shape from more views in the same time.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub coarse: f64,
-    /// What an LR pixel is compared with.
-    pub supervision: Supervision,
+    /// What an LR pixel is compared with. Without it: `kernel` where the scene says what made it and has a background, else
+    /// `average`.
+    pub supervision: Option<Supervision>,
     /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
     pub jitter: bool,
     /// Rays to train with, sub-rays counted each.
@@ -97,7 +98,7 @@ impl Default for Params {
             field: FieldKind::Grid,
             supersample: 2.0,
             coarse: 0.3,
-            supervision: Supervision::Average,
+            supervision: None,
             jitter: false,
             rays: 30_000_000,
             batch: 2_048,
@@ -261,17 +262,20 @@ pub fn supervision(
 ) -> anyhow::Result<Supersampling> {
     let known = input.path(DEGRADATION_FILE).exists();
     let made: Option<Degradation> = if known { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
-    if params.supervision != Supervision::Average && made.is_none() {
+    let is_open = views.background == scene::Background::Alpha;
+    let best = if made.is_some() && !is_open { Supervision::Kernel } else { Supervision::Average };
+    let supervision = params.supervision.unwrap_or(best);
+    if supervision != Supervision::Average && made.is_none() {
         let message = format!("parameter supervision: the scene has no {DEGRADATION_FILE} that names its kernel; choose average");
         return Err(Failure::Usage(message).into());
     }
-    if params.supervision == Supervision::Kernel && views.background == scene::Background::Alpha {
+    if supervision == Supervision::Kernel && is_open {
         let message =
             "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
         return Err(Failure::Usage(message.to_owned()).into());
     }
     let options = SupersamplingOptions {
-        supervision: params.supervision,
+        supervision,
         scale: [params.supersample; 2],
         filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
         coarse: params.coarse,
