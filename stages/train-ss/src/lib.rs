@@ -220,8 +220,8 @@ impl Stage for TrainSs {
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         context.write_summary(&format!(
             "{}×{} sub-rays: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
-            supervision.side()[0],
-            supervision.side()[1],
+            supervision.full_side()[0],
+            supervision.full_side()[1],
             log.rays as f64 / 1e6,
             log.steps,
             log.samples_per_ray
@@ -302,7 +302,7 @@ fn train(
     trainer: &mut Trainer,
     supervision: &mut Supersampling,
 ) -> anyhow::Result<TrainingLog> {
-    let (total, group) = (params.rays, supervision.side().iter().product::<usize>());
+    let (total, group) = (params.rays, supervision.full_side().iter().product::<usize>());
     if total < group as u64 {
         let message = format!("parameter rays: {total} is less than the {group} of one pixel");
         return Err(Failure::Usage(message).into());

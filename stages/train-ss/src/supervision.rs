@@ -117,7 +117,7 @@ impl Supersampling {
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
-    pub fn side(&self) -> [usize; 2] {
+    pub fn full_side(&self) -> [usize; 2] {
         self.full
     }
 

@@ -19,7 +19,7 @@ impl Passes {
         let mut transposed = vec![0.0; field.network.len()];
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
         let lanes = vec![0.0; field.network.len() * LANES];
-        let marks = field.levels.iter().map(|l| l.marks()).max().unwrap_or(0);
+        let marks = field.levels.iter().map(crate::grid::Level::marks).max().unwrap_or(0);
         Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default(), touched: vec![0; marks] }
     }
 

@@ -436,7 +436,7 @@ impl Trainer {
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_counters(path, |tensors, counters| {
             let field = &mut self.field;
-            let averaged = tensors.names().iter().any(|n| *n == "average.grid");
+            let averaged = tensors.names().contains(&"average.grid");
             self.average =
                 averaged.then(|| Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] });
             if let Some(average) = &mut self.average {
