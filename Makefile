@@ -44,7 +44,6 @@ lint: setup ## rustfmt, clippy; cargo-deny and typos where installed
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 
-# The figures of the README's table.
 lego: build ## Real lego 100→200, plain NeRF beside supersampling
 	@$(NERF_SR) run -j 1 --out out/lego -i dataset=$(DATA)/nerf_synthetic/lego -i weights=$(DATA)/weights \
 	  -p rays=40000000 -p supersample=1,2
