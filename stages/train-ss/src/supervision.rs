@@ -233,9 +233,12 @@ impl radiance::Supervision for Supersampling {
     }
 
     fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
+        if self.kernel().is_none() {
+            return;
+        }
         let (index, pixel) = self.pixel(group);
         let width = self.views[index].picture.width;
-        if let Some(memory) = self.memory.as_mut().filter(|_| self.side == self.full) {
+        if let Some(memory) = &mut self.memory {
             memory.remember(index, pixel % width, pixel / width, colours);
         }
     }

@@ -96,7 +96,7 @@ pub(crate) struct Chunk {
     tau_gradient: Vec<f32>,
 }
 
-/// At least `len` floats; what was in them doesn't matter.
+/// At least `len` floats, with what was in them before.
 fn fit(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
     if buffer.len() < len {
         buffer.resize(len, 0.0);
@@ -122,13 +122,6 @@ pub(crate) fn densities<'a>(chunk: &'a mut Chunk, field: &Field, positions: &[f3
     density
 }
 
-/// Grows a buffer to `len`, keeping what is in it.
-fn grow<T: Clone + Default>(buffer: &mut Vec<T>, len: usize) {
-    if buffer.len() < len {
-        buffer.resize(len, T::default());
-    }
-}
-
 impl Chunk {
     /// Features, hidden layer and density of a round's positions, `self.positions` (three rows of n).
     fn density_network(&mut self, field: &Field, round: Round) {
@@ -138,7 +131,9 @@ impl Chunk {
         }
         let positions = &self.positions[..3 * n];
         let [first, second] = field.layers.density;
-        let part = |buffer: &mut Vec<f32>, rows: usize| grow(buffer, round.range(rows).end);
+        let part = |buffer: &mut Vec<f32>, rows: usize| {
+            fit(buffer, round.range(rows).end);
+        };
         part(&mut self.features, first.inputs);
         part(&mut self.hidden, first.outputs);
         part(&mut self.density, second.outputs);
@@ -193,7 +188,7 @@ impl Chunk {
         self.samples += count;
         self.t.resize(start + n, 0.0);
         self.marched.resize(start + n, [0.0; 3]);
-        grow(&mut self.positions, 3 * n);
+        fit(&mut self.positions, 3 * n);
         for (axis, row) in self.positions[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
             for (value, p) in row.iter_mut().zip(&self.marched[start..]) {
                 *value = p[axis];
@@ -201,7 +196,7 @@ impl Chunk {
         }
         self.density_network(field, round);
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
-            grow(buffer, start + n);
+            fit(buffer, start + n);
         }
         let whole = start..start + n;
         let tau = &mut self.tau[whole.clone()];
