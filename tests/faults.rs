@@ -10,7 +10,7 @@ use std::time::Duration;
 use common::{Finished, Project, stage, stage_command};
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
-const PARAMS: &str = r#"{"supervision": "kernel", "rays": 600000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
+const PARAMS: &str = r#"{"supervision": "kernel", "members": 2, "rays": 900000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
 
 fn scene(project: &Project) -> std::path::PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));
@@ -47,7 +47,7 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
         signal(&child, "-KILL");
         child.wait().unwrap();
         assert!(!output.exists(), "a killed stage leaves no output");
-        resumed += usize::from(work.join("checkpoint.safetensors").exists());
+        resumed += usize::from(work.join("member-0/checkpoint.safetensors").exists());
     }
     assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
     if !output.exists() {
@@ -70,9 +70,9 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let finished = Finished::of(child.wait_with_output().unwrap());
     assert_eq!(finished.code, 130, "{}", finished.stderr);
     assert!(finished.stderr.contains("interrupted; run again to go on from here"), "{}", finished.stderr);
-    assert!(work.join("checkpoint.safetensors").exists() && !output.exists());
+    assert!(work.join("member-0/checkpoint.safetensors").exists() && !output.exists());
     // A checkpoint cut short is said and left out, not trusted.
-    let checkpoint = work.join("checkpoint.safetensors");
+    let checkpoint = work.join("member-0/checkpoint.safetensors");
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
     assert_eq!(stage("train-ss", PARAMS, &inputs, &output, &more).code, 0);

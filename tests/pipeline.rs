@@ -177,6 +177,35 @@ fn every_option_goes_through() {
     }
 }
 
+/// Member m of several is what seed + m gives alone, and what is rendered is their mean.
+#[test]
+fn members_are_fields_of_their_own_and_average() {
+    let project = Project::tiny();
+    let of = |stage: &str, more: &[&str]| project.object(&project.output_of(stage, more)[0]);
+    let both = ["-p", "train-ss.seed=4", "-p", "members=2", "-p", "rays=60000"];
+    let singles = [["-p", "train-ss.seed=4", "-p", "rays=30000"], ["-p", "train-ss.seed=5", "-p", "rays=30000"]];
+    project.ok(&[&["run"], &both[..]].concat());
+    let views = of("render-depth", &both);
+    let mut images = Vec::new();
+    for (m, single) in singles.iter().enumerate() {
+        project.ok(&[&["run"], &single[..]].concat());
+        let weights = |stage: &std::path::Path, m: usize| std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap();
+        assert!(weights(&of("train-ss", &both), m) == weights(&of("train-ss", single), 0), "member {m}");
+        images.push(of("render-depth", single).join("images"));
+    }
+    for entry in std::fs::read_dir(views.join("images")).unwrap() {
+        let name = entry.unwrap().file_name();
+        let read = |folder: &std::path::Path| pixels::read_exr(&folder.join(&name)).unwrap();
+        let (mean, a, b) = (read(&views.join("images")), read(&images[0]), read(&images[1]));
+        for channel in ["R", "G", "B", "A"] {
+            let samples = |image: &pixels::ExrImage| image.channel(channel).unwrap().to_vec();
+            for (m, (a, b)) in samples(&mean).iter().zip(samples(&a).iter().zip(samples(&b))) {
+                assert!((m - (a + b) / 2.0).abs() < 1e-3, "{channel}: {m} of {a} and {b}");
+            }
+        }
+    }
+}
+
 /// `make quality` and its like: cells come out as JSON rows, a second call runs nothing, and a mistake is one line.
 #[test]
 fn tables_are_made_of_cells() {

@@ -1,5 +1,8 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
+//! A field may have several members, trained apart; what they render is averaged: each errs in its own way where the pictures
+//! leave it open.
+//!
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
 
@@ -67,14 +70,14 @@ impl Stage for RenderDepth {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("field")?;
         let file: FieldFile = input.read_json(FIELD_FILE)?;
-        let field = Field::read(&input.path("field.safetensors"), file.architecture, file.bounds).bad_input("field")?;
+        let members = file.read_members(|name| input.path(name)).bad_input("field")?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
         let progress = context.progress("rendering", rows);
         let mut views = Vec::with_capacity(resized.len());
         for camera in resized {
-            let job = Job { context, params, field: &field, background: file.background, camera: &camera };
+            let job = Job { context, params, members: &members, background: file.background, camera: &camera };
             job.render(&progress)?;
             let image = format!("images/{}.exr", camera.name);
             views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
@@ -105,7 +108,7 @@ fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
 struct Job<'a> {
     context: &'a Context,
     params: &'a Params,
-    field: &'a Field,
+    members: &'a [Field],
     background: Background,
     camera: &'a Camera,
 }
@@ -154,17 +157,22 @@ impl Job<'_> {
                 (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
-        let rendered = self.field.render(&rays);
-        let share = 1.0 / (n * n) as f32;
+        let rendered: Vec<Vec<radiance::Pixel>> = self.members.iter().map(|m| m.render(&rays)).collect();
+        let share = 1.0 / (n * n * self.members.len()) as f32;
         let mut preview = Vec::with_capacity(3 * rows * width);
-        let subs = rendered.chunks_exact(n * n).zip(to_z.chunks_exact(n * n));
-        for ((subs, to_z), sample) in subs.zip(samples.chunks_exact_mut(channels)) {
+        let (mut subs, mut distances) = (Vec::new(), Vec::new());
+        for (i, sample) in samples.chunks_exact_mut(channels).enumerate() {
+            let rays = i * n * n..(i + 1) * n * n;
+            subs.clear();
+            subs.extend(rendered.iter().flat_map(|r| &r[rays.clone()]));
             let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(of).sum::<f32>() * share;
             for c in 0..3 {
                 sample[c] = mean(&|p| p.premultiplied[c]);
             }
             sample[3] = mean(&|p| p.opacity);
-            let (distance, to_z) = self.depth(subs, to_z);
+            distances.clear();
+            distances.extend(subs.iter().map(|p| self.distance(p)).zip(to_z[rays].iter().copied().cycle()));
+            let (distance, to_z) = middle(&mut distances);
             sample[4] = distance * to_z;
             if let Some(last) = sample.get_mut(5) {
                 *last = distance;
@@ -174,20 +182,18 @@ impl Job<'_> {
         preview
     }
 
-    /// The middle one of the sub-rays' distances, and its z-depth per distance: a mean would invent a surface between two.
-    fn depth(&self, subs: &[radiance::Pixel], to_z: &[f32]) -> (f32, f32) {
-        let distance = |p: &radiance::Pixel| match self.params.depth {
-            Depth::Expected => p.depth,
-            Depth::Median => p.median_depth,
-        };
-        let mut found = [(0.0f32, 0.0f32); 64];
-        let found = &mut found[..subs.len()];
-        for ((slot, p), &z) in found.iter_mut().zip(subs).zip(to_z) {
-            *slot = (distance(p), z);
+    fn distance(&self, pixel: &radiance::Pixel) -> f32 {
+        match self.params.depth {
+            Depth::Expected => pixel.depth,
+            Depth::Median => pixel.median_depth,
         }
-        found.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-        found[(found.len() - 1) / 2]
     }
+}
+
+/// The middle one of the sub-rays' distances, and its z-depth per distance: a mean would invent a surface between two.
+fn middle(distances: &mut [(f32, f32)]) -> (f32, f32) {
+    distances.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    distances[(distances.len() - 1) / 2]
 }
 
 /// Why writing a view ended early.

@@ -10,11 +10,13 @@ mod checkpoint;
 mod memory;
 mod supervision;
 
+use std::path::PathBuf;
+
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, read_premultiplied};
 use radiance::{Architecture, FIELD_FILE, Field, FieldFile, FieldKind, Trainer, TrainingError, TrainingOptions};
-use scene::Views;
+use scene::{Bounds, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -41,7 +43,11 @@ pub struct Params {
     pub supervision: Option<Supervision>,
     /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
     pub jitter: bool,
-    /// Rays to train with, sub-rays counted each.
+    /// How many fields to train apart, each with its share of the rays: what they render is averaged, and so is what each of them
+    /// makes up where the pictures leave it open. Member m is what `seed` + m gives alone.
+    #[schemars(range(min = 1, max = 16))]
+    pub members: u32,
+    /// Rays to train with, sub-rays counted each, over all members.
     #[schemars(range(min = 1))]
     pub rays: u64,
     /// Most rays in a step.
@@ -100,6 +106,7 @@ impl Default for Params {
             coarse: 0.3,
             supervision: None,
             jitter: false,
+            members: 1,
             rays: 30_000_000,
             batch: 2_048,
             samples: 32_768,
@@ -136,7 +143,14 @@ impl Params {
         }
     }
 
-    /// How they ask for it to be trained.
+    /// Parameters by which a member is trained, as if it were alone.
+    pub fn member(&self, index: u32) -> Self {
+        let members = u64::from(self.members.max(1));
+        let rays = self.rays / members + u64::from(u64::from(index) < self.rays % members);
+        Self { members: 1, rays, seed: self.seed.wrapping_add(u64::from(index)), ..self.clone() }
+    }
+
+    /// How they ask for a field to be trained.
     pub fn options(&self) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
@@ -154,7 +168,7 @@ impl Params {
     }
 }
 
-/// `training.json`: how the training went.
+/// `training.json`: how the training went, over all members one after the other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingLog {
@@ -164,8 +178,20 @@ pub struct TrainingLog {
     pub rays: u64,
     /// Mean samples a ray over the whole training.
     pub samples_per_ray: f64,
-    /// PSNR of training pixels against rays, about a hundred points.
+    /// PSNR of training pixels against rays, about a hundred points a member.
     pub curve: Vec<CurvePoint>,
+}
+
+impl TrainingLog {
+    /// Appends another training's.
+    fn add(&mut self, next: TrainingLog) {
+        let samples = self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
+        let before = self.rays;
+        self.curve.extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
+        self.steps += next.steps;
+        self.rays += next.rays;
+        self.samples_per_ray = samples / self.rays.max(1) as f64;
+    }
 }
 
 /// A point of the training curve.
@@ -201,27 +227,25 @@ impl Stage for TrainSs {
         }
         let input = context.input("scene")?;
         let views = Views::read(input)?;
-        let pictures = read_pictures(input, &views)?;
-        let mut supervision = supervision(input, params, &views, pictures)?;
         let architecture = params.architecture(views.views[0].camera.intrinsics.width);
-        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), params.options());
-        if let Some(hull) = &views.hull {
-            trainer.limit_to_hull(&read_hull(&input.path(hull))?);
+        let progress = context.progress("training", params.rays);
+        let mut log = TrainingLog::default();
+        for index in 0..params.members {
+            let member = Member::new(context, params, index)?;
+            let own = match member.finished(architecture, views.bounds) {
+                Some(own) => own,
+                None => member.train(input, &views, architecture, &progress)?,
+            };
+            log.add(own);
+            progress.set(log.rays, "");
         }
-        let log = train(context, params, &mut trainer, &mut supervision)?;
-        let field = trainer.finish();
-        if !field.is_finite() {
-            return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", log.steps)).into());
-        }
-        field.write(&context.output_path("field.safetensors")?).context("cannot write the field")?;
-        let file = FieldFile { field: params.field, architecture, bounds: views.bounds, background: views.background };
+        let Params { field, members, .. } = *params;
+        let file = FieldFile { field, members, architecture, bounds: views.bounds, background: views.background };
         context.write_json(FIELD_FILE, &file)?;
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         context.write_summary(&format!(
-            "{}×{} sub-rays: {:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
-            supervision.full_side()[0],
-            supervision.full_side()[1],
+            "{:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
             log.rays as f64 / 1e6,
             log.steps,
             log.samples_per_ray
@@ -295,38 +319,92 @@ fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {
     Ok(hull.data().to_vec())
 }
 
-/// Trains to the end, with checkpoints, progress and a curve.
-fn train(
-    context: &Context,
-    params: &Params,
-    trainer: &mut Trainer,
-    supervision: &mut Supersampling,
-) -> anyhow::Result<TrainingLog> {
-    let (total, group) = (params.rays, supervision.full_side().iter().product::<usize>());
-    if total < group as u64 {
-        let message = format!("parameter rays: {total} is less than the {group} of one pixel");
-        return Err(Failure::Usage(message).into());
-    }
-    let mut checkpoints = Checkpoints::new(context.work());
-    let mut curve = checkpoints.resume(trainer, supervision, |text| context.say(text));
-    let progress = context.progress("training", total);
-    loop {
-        if context.interrupted() {
-            checkpoints.write(trainer, supervision, &curve).context("cannot write the checkpoint")?;
-            return Err(Failure::Interrupted.into());
+/// A field that is trained alone, with its checkpoints in a folder of its own.
+struct Member<'a> {
+    context: &'a Context,
+    params: Params,
+    /// Where its weights go.
+    output: PathBuf,
+    work: Option<PathBuf>,
+    /// Rays of the members before it.
+    before: u64,
+}
+
+/// In a member's folder: its weights once it is trained, and its log, which is written last.
+const DONE_WEIGHTS: &str = "field.safetensors";
+const DONE_LOG: &str = "training.json";
+
+impl<'a> Member<'a> {
+    fn new(context: &'a Context, params: &Params, index: u32) -> anyhow::Result<Self> {
+        let output = context.output_path(&FieldFile::member(index))?;
+        let work = context.work().map(|w| w.join(format!("member-{index}")));
+        if let Some(work) = &work {
+            std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
         }
-        let report = trainer.step(supervision).map_err(|e| match e {
-            TrainingError::NotFinite { .. } => anyhow::Error::from(Failure::Numerical(e.to_string())),
-        })?;
-        let Some(report) = report else { break };
-        if report.skipped {
-            context
-                .say(format!("step {}: something wasn't finite; the step was thrown away and the rate halved", trainer.steps()));
-        }
-        let rays = trainer.rays_done();
-        curve.add(&report, rays, total);
-        progress.set(rays, &curve.note());
-        checkpoints.write_when_due(trainer, supervision, &curve).context("cannot write the checkpoint")?;
+        let before = (0..index).map(|i| params.member(i).rays).sum();
+        Ok(Self { context, params: params.member(index), output, work, before })
     }
-    Ok(curve.finish(trainer.steps(), trainer.rays_done()))
+
+    /// What an earlier run finished, if anything: its weights go to the output.
+    fn finished(&self, architecture: Architecture, bounds: Bounds) -> Option<TrainingLog> {
+        let work = self.work.as_ref()?;
+        let log = serde_json::from_slice(&std::fs::read(work.join(DONE_LOG)).ok()?).ok()?;
+        let field = Field::read(&work.join(DONE_WEIGHTS), architecture, bounds).ok()?;
+        field.write(&self.output).ok()?;
+        Some(log)
+    }
+
+    /// Trains to the end, with checkpoints, progress and a curve.
+    fn train(
+        &self,
+        input: &artifact::GivenInput,
+        views: &Views,
+        architecture: Architecture,
+        progress: &artifact::Progress,
+    ) -> anyhow::Result<TrainingLog> {
+        let (context, params) = (self.context, &self.params);
+        let mut supervision = supervision(input, params, views, read_pictures(input, views)?)?;
+        let (total, group) = (params.rays, supervision.full_side().iter().product::<usize>());
+        if total < group as u64 {
+            let message = format!("parameter rays: {total} for a field is less than the {group} of one pixel");
+            return Err(Failure::Usage(message).into());
+        }
+        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), params.options());
+        if let Some(hull) = &views.hull {
+            trainer.limit_to_hull(&read_hull(&input.path(hull))?);
+        }
+        let mut checkpoints = Checkpoints::new(self.work.as_deref());
+        let mut curve = checkpoints.resume(&mut trainer, &mut supervision, |text| context.say(text));
+        loop {
+            if context.interrupted() {
+                checkpoints.write(&trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+                return Err(Failure::Interrupted.into());
+            }
+            let report = trainer.step(&mut supervision).map_err(|e| match e {
+                TrainingError::NotFinite { .. } => anyhow::Error::from(Failure::Numerical(e.to_string())),
+            })?;
+            let Some(report) = report else { break };
+            if report.skipped {
+                context.say(format!(
+                    "step {}: something wasn't finite; the step was thrown away and the rate halved",
+                    trainer.steps()
+                ));
+            }
+            let rays = trainer.rays_done();
+            curve.add(&report, rays, total);
+            progress.set(self.before + rays, &curve.note());
+            checkpoints.write_when_due(&trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+        }
+        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        let field = trainer.finish();
+        if !field.is_finite() {
+            return Err(Failure::Numerical(format!("step {}: a parameter is not finite; lower the rate", log.steps)).into());
+        }
+        field.write(&self.output).context("cannot write the field")?;
+        if let Some(work) = &self.work {
+            field.write(&work.join(DONE_WEIGHTS)).context("cannot write the field")?;
+            artifact::write_json(&work.join(DONE_LOG), &log)?;
+        }
+        Ok(log)
+    }
 }

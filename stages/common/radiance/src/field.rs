@@ -221,7 +221,7 @@ impl Field {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())
     }
 
-    /// Writes `field.safetensors`: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest). No metadata, so bytes repeat.
+    /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest). No metadata, so bytes repeat.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
         write_tensors(
