@@ -20,6 +20,7 @@ PARTS = [
     ("as it is", []),
     ("supervision: average", ["supervision=average"]),
     ("supervision: refiltered", ["supervision=refiltered"]),
+    ("two fields, half the rays each", ["members=2"]),
     ("no supersampling", ["supersample=1"]),
     ("3×3 sub-rays", ["supersample=3"]),
     ("all sub-rays from the start", ["coarse=0"]),

@@ -1,3 +1,5 @@
+use std::sync::Arc;
+
 use pixels::{Picture, Resampling, to_u8};
 
 /// The field's HR pixels of every training view as they were last rendered, in 8 bits, and the operators that make LR pixels
@@ -15,7 +17,22 @@ struct Remembered {
     height: usize,
     /// RGB, row by row.
     rendered: Vec<u8>,
+    kernel: Arc<Kernel>,
+}
+
+/// What made LR pictures of a size, and what its residuals ask of HR pixels.
+#[derive(Debug)]
+pub(crate) struct Kernel {
     operator: Resampling,
+    /// Weights of the pseudo-inverse, transposed.
+    inverse: Resampling,
+}
+
+impl Kernel {
+    pub(crate) fn new(operator: Resampling) -> Self {
+        let inverse = operator.inverse(Memory::REACH);
+        Self { operator, inverse }
+    }
 }
 
 impl Memory {
@@ -24,9 +41,9 @@ impl Memory {
     }
 
     /// Adds the next view: an RGB picture at HR size to begin with, and what makes it an LR picture.
-    pub(crate) fn add(&mut self, picture: &Picture, operator: Resampling) {
+    pub(crate) fn add(&mut self, picture: &Picture, kernel: Arc<Kernel>) {
         let rendered = picture.data.iter().map(|&v| to_u8(v)).collect();
-        self.views.push(Remembered { width: picture.width, height: picture.height, rendered, operator });
+        self.views.push(Remembered { width: picture.width, height: picture.height, rendered, kernel });
     }
 
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
@@ -37,14 +54,17 @@ impl Memory {
             let start = (at as f64 + 0.5).mul_add(scale, -0.5 * self.side[i] as f64).round().max(0.0) as usize;
             start.min(fine.saturating_sub(self.side[i]))
         };
-        [first(0, x, view.width, view.operator.x.outputs()), first(1, y, view.height, view.operator.y.outputs())]
+        [first(0, x, view.width, view.kernel.operator.x.outputs()), first(1, y, view.height, view.kernel.operator.y.outputs())]
     }
 
     /// Where that block begins and how large an HR pixel is, in LR pixels.
     pub(crate) fn block_in_pixels(&self, view: usize, x: usize, y: usize) -> ([f64; 2], [f64; 2]) {
         let [i, j] = self.block(view, x, y);
         let view = &self.views[view];
-        let apart = [view.operator.x.outputs() as f64 / view.width as f64, view.operator.y.outputs() as f64 / view.height as f64];
+        let apart = [
+            view.kernel.operator.x.outputs() as f64 / view.width as f64,
+            view.kernel.operator.y.outputs() as f64 / view.height as f64,
+        ];
         ([i as f64 * apart[0], j as f64 * apart[1]], apart)
     }
 
@@ -52,8 +72,9 @@ impl Memory {
     const REACH: usize = 3;
 
     /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else as remembered, and what they
-    /// ask of the block: writes Kᵀ·residual for each colour, and returns the residual of the pixel itself. `judge` gets a
-    /// prediction and its target, for each channel, and gives the residual.
+    /// ask of the block: writes P·residual for each colour, where P = Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse but for the factor s², and
+    /// returns the residual of the pixel itself. `judge` gets a prediction and its target, for each channel, and gives the
+    /// residual.
     pub(crate) fn pull(
         &self,
         view: usize,
@@ -66,7 +87,7 @@ impl Memory {
         let [left, top] = self.block(view, x, y);
         let [columns, rows] = self.side;
         let view = &self.views[view];
-        let (across, down) = (&view.operator.x, &view.operator.y);
+        let (across, down, inverse) = (&view.kernel.operator.x, &view.kernel.operator.y, &view.kernel.inverse);
         let near = |at: usize, end: usize| at.saturating_sub(Self::REACH)..(at + Self::REACH + 1).min(end);
         let (xs, ys) = (near(x, across.outputs()), near(y, down.outputs()));
         // Remembered rows, filtered along x for the columns of the neighbourhood: each row serves all of its LR rows.
@@ -109,7 +130,7 @@ impl Memory {
                     own = residual;
                 }
                 for (k, pull) in pulls.iter_mut().enumerate() {
-                    let w = across.weight(qx, left + k % columns) * down.weight(qy, top + k / columns);
+                    let w = inverse.x.weight(qx, left + k % columns) * inverse.y.weight(qy, top + k / columns);
                     (0..3).for_each(|c| pull[c] += w * residual[c]);
                 }
             }
@@ -162,16 +183,17 @@ mod tests {
         Picture::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    /// Residuals and pulls are K·c - y and Kᵀ·(K·c - y) of the whole pictures, at any scale, also where the block is news.
+    /// Residuals and pulls are K·c - y and P·(K·c - y) of the whole pictures, at any scale, also where the block is news.
     #[test]
     fn pulls_are_the_operators_own() {
         for (low, high) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
             let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
             let operator = Resampling::new(Filter::Lanczos, high, low);
+            let inverse = operator.inverse(Memory::REACH);
             let fine = picture(high.0, high.1);
             let targets = picture(low.0, low.1);
             let mut memory = Memory::new(side);
-            memory.add(&fine, operator.clone());
+            memory.add(&fine, Arc::new(Kernel::new(operator.clone())));
             for y in 0..low.1 {
                 for x in 0..low.0 {
                     let [i, j] = memory.block(0, x, y);
@@ -182,7 +204,7 @@ mod tests {
                     fresh.iter().enumerate().for_each(|(k, f)| hybrid.data[at(k)..at(k) + 3].copy_from_slice(f));
                     let mut residual = operator.apply(&hybrid);
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
-                    let expected = operator.adjoint(&residual);
+                    let expected = inverse.adjoint(&residual);
                     let mut pulls = vec![[9.0; 3]; fresh.len()];
                     let own = memory.pull(0, [x, y], &fresh, &targets, |p, t| p - t, &mut pulls);
                     for c in 0..3 {
@@ -199,13 +221,13 @@ mod tests {
     #[test]
     fn remembers_what_it_is_told() {
         let mut memory = Memory::new([2, 2]);
-        memory.add(&picture(8, 6), Resampling::new(Filter::Box, (8, 6), (4, 3)));
+        memory.add(&picture(8, 6), Arc::new(Kernel::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         memory.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
         let bytes: Vec<u8> = memory.parts().flatten().copied().collect();
         assert_eq!(memory.len(), bytes.len());
         assert_eq!(bytes[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
         let mut other = Memory::new([2, 2]);
-        other.add(&picture(8, 6), Resampling::new(Filter::Box, (8, 6), (4, 3)));
+        other.add(&picture(8, 6), Arc::new(Kernel::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         other.restore(&bytes);
         assert!(other.parts().eq(memory.parts()));
     }
@@ -216,7 +238,8 @@ mod tests {
         for (low, high) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
             let side = (high as f64 / low as f64).ceil() as usize;
             let mut memory = Memory::new([side, side]);
-            memory.add(&picture(high, high), Resampling::new(Filter::Lanczos, (high, high), (low, low)));
+            let operator = Resampling::new(Filter::Lanczos, (high, high), (low, low));
+            memory.add(&picture(high, high), Arc::new(Kernel::new(operator)));
             let mut seen = vec![false; high];
             (0..low).for_each(|x| seen[memory.block(0, x, 0)[0]..][..side].fill(true));
             assert!(seen.iter().all(|s| *s), "{low} {high}");

@@ -1,10 +1,13 @@
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
 use pixels::{Filter, Picture, Resampling};
 use radiance::{Draws, Ray};
 use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::memory::Memory;
+use crate::memory::{Kernel, Memory};
 
 /// What an LR pixel is compared with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -21,9 +24,10 @@ pub enum Supervision {
 /// Supersampling: a training pixel is drawn at random, and sub-rays are cast through it.
 ///
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
-/// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises
-/// |K·c - y|² itself, where c are the HR pixels: those of the drawn LR pixel are rendered, those around it remembered
-/// ([`Memory`]), so that the whole footprint costs no more rays than the average. Each sub-ray gets its own Kᵀ·(K·c - y).
+/// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises the
+/// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
+/// rendered, those around it remembered ([`Memory`]), so that the whole footprint costs no more rays than the average. Each
+/// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
 pub struct Supersampling {
     views: Vec<TrainingView>,
     pixels: u64,
@@ -85,6 +89,7 @@ impl Supersampling {
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
         let mut memory = None;
+        let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut ready = Vec::with_capacity(pictures.len());
         for (view, mut picture) in views.views.iter().zip(pictures) {
@@ -95,8 +100,11 @@ impl Supersampling {
                     picture = refiltered(&picture, &enlarge, &shrink);
                 }
                 Supervision::Kernel => {
-                    let (enlarge, shrink) = operator(&picture);
-                    memory.get_or_insert_with(|| Memory::new(full)).add(&enlarge.apply(&picture), shrink);
+                    let (enlarge, kernel) = kernels.entry((picture.width, picture.height)).or_insert_with(|| {
+                        let (enlarge, shrink) = operator(&picture);
+                        (enlarge, Arc::new(Kernel::new(shrink)))
+                    });
+                    memory.get_or_insert_with(|| Memory::new(full)).add(&enlarge.apply(&picture), kernel.clone());
                 }
             }
             let before = pixels;

@@ -49,7 +49,62 @@ impl AxisTaps {
     pub fn outputs(&self) -> usize {
         self.firsts.len()
     }
+
+    /// Weights P = (s·K·Kᵀ)⁻¹·K of the map's pseudo-inverse K⁺ = s·Pᵀ, where s = inputs/outputs: along one axis, the smallest
+    /// change to the inputs that adds r to the outputs is K⁺·r. Shares of the whole are like K's own, so that a flat r asks as much of
+    /// every input as Kᵀ·r does; where K weakens fine detail, P makes up for it. Weights farther than `reach` outputs from an
+    /// input are left out.
+    pub fn inverse(&self, reach: usize) -> Self {
+        let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
+        // Gram matrix: banded, since a run overlaps few others.
+        let dot = |a: usize, b: usize| -> f64 {
+            let (first, weights) = self.run(a);
+            (first..).zip(weights).map(|(i, &w)| f64::from(w) * f64::from(self.weight(b, i))).sum()
+        };
+        let band = (1..n).take_while(|d| (0..n - d).any(|a| dot(a, a + d) != 0.0)).last().unwrap_or(0);
+        // Lower Cholesky factor, row by row: column a - band + k of row a is factor[a][k].
+        let mut factor = vec![vec![0.0; band + 1]; n];
+        for a in 0..n {
+            for b in a.saturating_sub(band)..=a {
+                let from = a.saturating_sub(band);
+                let product: f64 =
+                    (from..b).filter(|k| k + band >= b).map(|k| factor[a][k + band - a] * factor[b][k + band - b]).sum();
+                let rest = scale * dot(b, a) - product;
+                factor[a][b + band - a] = if a == b { (rest + RIDGE).sqrt() } else { rest / factor[b][band] };
+            }
+        }
+        let length = ((2.0 * reach as f64 * scale).ceil() as usize).min(self.inputs);
+        let (mut firsts, mut weights) = (Vec::with_capacity(n), Vec::with_capacity(n * length));
+        let mut z = vec![0.0; n];
+        for q in 0..n {
+            z.fill(0.0);
+            z[q] = 1.0;
+            for a in 0..n {
+                let sum: f64 = (a.saturating_sub(band)..a).map(|b| factor[a][b + band - a] * z[b]).sum();
+                z[a] = (z[a] - sum) / factor[a][band];
+            }
+            for a in (0..n).rev() {
+                let sum: f64 = (a + 1..n.min(a + band + 1)).map(|b| factor[b][a + band - b] * z[b]).sum();
+                z[a] = (z[a] - sum) / factor[a][band];
+            }
+            let centre = ((q as f64 + 0.5) * scale - 0.5 * length as f64).round().max(0.0) as usize;
+            let first = centre.min(self.inputs - length);
+            firsts.push(first);
+            // Beyond 2·reach nothing of z is left, and no run comes here from farther away.
+            let near = q.saturating_sub(4 * reach)..(q + 4 * reach + 1).min(n);
+            let weight = |i: usize| {
+                let apart = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();
+                let within = f64::from(u8::from(apart <= reach as f64));
+                (within * near.clone().map(|a| z[a] * f64::from(self.weight(a, i))).sum::<f64>()) as f32
+            };
+            weights.extend((first..first + length).map(weight));
+        }
+        Self { inputs: self.inputs, length, firsts, weights }
+    }
 }
+
+/// Keeps the pseudo-inverse bounded: what a kernel weakens to less than this share of power isn't asked for.
+const RIDGE: f64 = 0.02;
 
 /// A separable resampling of pictures as a linear operator: what [`resize_pillow`](crate::resize_pillow) does, without its
 /// rounding and clipping. `apply` and `adjoint` are each other's transpose.
@@ -68,6 +123,11 @@ impl Resampling {
     /// When a side is 0.
     pub fn new(filter: Filter, from: (usize, usize), to: (usize, usize)) -> Self {
         Self { x: AxisTaps::new(filter, from.0, to.0), y: AxisTaps::new(filter, from.1, to.1) }
+    }
+
+    /// [`AxisTaps::inverse`] along both axes.
+    pub fn inverse(&self, reach: usize) -> Self {
+        Self { x: self.x.inverse(reach), y: self.y.inverse(reach) }
     }
 
     /// The resampled picture.
@@ -137,6 +197,31 @@ mod tests {
             (x >> 40) as f32 / (1 << 24) as f32
         });
         Picture::new(width, height, 3, data.collect())
+    }
+
+    /// K·(s·Pᵀ) is the identity but for the ridge, for every filter that blurs no more than it must; and a flat residual asks the
+    /// same of all inputs.
+    #[test]
+    fn inverse_undoes_the_map() {
+        for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
+            for (fine, coarse) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
+                let map = AxisTaps::new(filter, fine, coarse);
+                let inverse = map.inverse(40);
+                let scale = fine as f32 / coarse as f32;
+                for a in 0..coarse {
+                    for b in 0..coarse {
+                        let entry: f32 = (0..fine).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
+                        let expected = f32::from(u8::from(a == b));
+                        assert!((entry - expected).abs() < 0.06, "{filter:?} {fine} → {coarse}: {a} {b} {entry}");
+                    }
+                }
+            }
+        }
+        let inverse = AxisTaps::new(Filter::Lanczos, 200, 100).inverse(3);
+        for i in 40..160 {
+            let flat: f32 = (0..100).map(|q| inverse.weight(q, i)).sum();
+            assert!((flat - 0.5).abs() < 0.03, "{i}: {flat}");
+        }
     }
 
     proptest! {
