@@ -56,9 +56,12 @@ pub struct Params {
     /// Samples a step aims at while space is full of fog and rays are expensive.
     #[schemars(range(min = 1024, max = 16_777_216))]
     pub samples: u32,
-    /// Highest learning rate of the grid.
+    /// Highest learning rate of the grid's coarsest level.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub rate: f64,
+    /// Learning rate of a level over that of the next coarser one: below 1 what is coarse explains the pictures first.
+    #[schemars(range(min = 0.01, max = 2.0))]
+    pub level_rate: f64,
     /// Highest learning rate of the networks.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub network_rate: f64,
@@ -111,6 +114,7 @@ impl Default for Params {
             batch: 2_048,
             samples: 32_768,
             rate: 4e-2,
+            level_rate: 1.0,
             network_rate: 1e-2,
             final_rate: 0.25,
             averaging: 0.97,
@@ -157,6 +161,7 @@ impl Params {
             batch: self.batch as usize,
             samples: self.samples as usize,
             rate: self.rate,
+            level_rate: self.level_rate,
             network_rate: self.network_rate,
             final_rate: self.final_rate,
             warm_up: 100,

@@ -22,8 +22,8 @@ impl AdamStep {
     }
 }
 
-/// Which blocks of 16 numbers a step has touched: one bit each.
-pub(crate) type Touched = [u64];
+/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read before it is set.
+pub(crate) type Touched = [u8];
 
 kernel! {
     /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came near learns nothing from
@@ -33,12 +33,15 @@ kernel! {
     ) {
         let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0, gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
-        for (word, marks) in touched.iter_mut().enumerate() {
-            while *marks != 0 {
-                let block = 64 * word + marks.trailing_zeros() as usize;
-                *marks &= *marks - 1;
-                if block >= weights.len() {
-                    break;
+        let most = touched.len().min(weights.len());
+        for start in (0..most).step_by(64) {
+            let marks = &mut touched[start..(start + 64).min(most)];
+            if marks.iter().fold(0, |any, m| any | m) == 0 {
+                continue;
+            }
+            for (block, mark) in (start..).zip(marks) {
+                if std::mem::take(mark) == 0 {
+                    continue;
                 }
                 let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block], &mut second[block]);
                 for i in 0..LANES {
@@ -79,7 +82,7 @@ mod tests {
                     e[0] -= 0.01 * mh / (vh.sqrt() + 1e-15);
                 }
             }
-            let mut touched = [u64::MAX];
+            let mut touched = [1; 2];
             adam(&AdamStep::new(t as u64, 0.01, 0.0), &mut touched, &mut w, &mut g, &mut m, &mut v);
             assert!(g.iter().all(|&g| g == 0.0));
         }

@@ -26,9 +26,9 @@ pub(crate) struct Level {
 }
 
 impl Level {
-    /// Words that mark its blocks.
-    pub(crate) fn marks(&self) -> usize {
-        self.entries.div_ceil(64 * PER_BLOCK)
+    /// Blocks that the optimiser takes at once.
+    pub(crate) fn blocks(&self) -> usize {
+        self.entries.div_ceil(PER_BLOCK)
     }
 
     pub(crate) fn range(&self) -> std::ops::Range<usize> {
@@ -145,7 +145,7 @@ kernel! {
                 let d = L::Quad::load(d);
                 for c in 0..8 {
                     let index = around.index[c][l] as usize;
-                    touched[index / (64 * PER_BLOCK)] |= 1 << (index / PER_BLOCK % 64);
+                    touched[index / PER_BLOCK] = 1;
                     let entry = &mut gradient[index];
                     d.mul_add(L::Quad::splat(around.weight[c][l]), L::Quad::load(entry)).store(entry);
                 }
@@ -204,10 +204,10 @@ mod tests {
             let mut out = vec![0.0; FEATURES * n];
             encode(&level, &table, &rows(&p), &mut out, n);
             let mut gradient = vec![0.0; table.len()];
-            let mut touched = vec![0; level.marks()];
+            let mut touched = vec![0; level.blocks()];
             scatter(&level, &mut gradient, &mut touched, &p, &d);
             for (block, numbers) in gradient.chunks(LANES).enumerate() {
-                let marked = touched[block / 64] >> (block % 64) & 1 == 1;
+                let marked = touched[block] == 1;
                 assert!(marked || numbers.iter().all(|g| *g == 0.0), "block {block} isn't marked");
             }
             let left: f64 = (0..n)

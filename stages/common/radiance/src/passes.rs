@@ -10,7 +10,7 @@ pub struct Passes {
     transposed: Vec<f32>,
     lanes: Vec<f32>,
     into: FeatureGradients,
-    touched: Vec<u64>,
+    touched: Vec<u8>,
 }
 
 impl Passes {
@@ -19,8 +19,8 @@ impl Passes {
         let mut transposed = vec![0.0; field.network.len()];
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
         let lanes = vec![0.0; field.network.len() * LANES];
-        let marks = field.levels.iter().map(crate::grid::Level::marks).max().unwrap_or(0);
-        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default(), touched: vec![0; marks] }
+        let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
+        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default(), touched: vec![0; blocks] }
     }
 
     /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every colour, as far as the list that
@@ -49,7 +49,7 @@ impl Passes {
     /// When the table has another size.
     pub fn scatter(&mut self, field: &Field, table: &mut [f32]) {
         for (level, gradients) in field.levels.iter().zip(&self.into.levels) {
-            let touched = &mut self.touched[..level.marks()];
+            let touched = &mut self.touched[..level.blocks()];
             crate::grid::scatter(level, &mut table[level.range()], touched, &self.into.positions, gradients);
         }
     }

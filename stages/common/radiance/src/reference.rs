@@ -157,7 +157,7 @@ fn fused_passes_equal_the_plain_ones() {
     drain_lanes(&mut lanes, &mut network);
     let mut grid = vec![0.0f32; field.grid.len()];
     for (level, gradients) in field.levels.iter().zip(&features.levels) {
-        scatter(level, &mut grid[level.range()], &mut vec![0; level.marks()], &features.positions, gradients);
+        scatter(level, &mut grid[level.range()], &mut vec![0; level.blocks()], &features.positions, gradients);
     }
 
     let mut difference = |which: usize, index: usize| {
@@ -242,7 +242,7 @@ fn every_family_renders_and_trains_to_equal_bits() {
         bits.extend(lanes.iter().map(|x| x.to_bits()));
         for (level, gradients) in field.levels.iter().zip(&features.levels) {
             let mut grid = vec![0.0f32; level.entries * FEATURES];
-            scatter(level, &mut grid, &mut vec![0; level.marks()], &features.positions, gradients);
+            scatter(level, &mut grid, &mut vec![0; level.blocks()], &features.positions, gradients);
             bits.extend(grid.iter().map(|x| x.to_bits()));
         }
         bits

@@ -39,8 +39,10 @@ pub struct TrainingOptions {
     pub batch: usize,
     /// Samples a step aims at; while space is still full of fog, steps have fewer rays.
     pub samples: usize,
-    /// Learning rate of the grid at its highest.
+    /// Learning rate of the grid's coarsest level at its highest.
     pub rate: f64,
+    /// Learning rate of a level over that of the next coarser one.
+    pub level_rate: f64,
     /// Learning rate of the networks at its highest.
     pub network_rate: f64,
     /// Learning rate at the end, as a share of the highest.
@@ -104,8 +106,8 @@ pub struct Trainer {
     /// Running average of the weights, once there is one.
     average: Option<Moments>,
     /// Blocks of each level's gradient that aren't 0.
-    touched: Vec<Vec<u64>>,
-    touched_network: Vec<u64>,
+    touched: Vec<Vec<u8>>,
+    touched_network: Vec<u8>,
     transposed: Vec<f32>,
     /// Cells that may be occupied at all.
     hull: Option<Vec<bool>>,
@@ -158,8 +160,8 @@ impl Trainer {
             second: zeros(),
             gradients: zeros(),
             average: None,
-            touched: field.levels.iter().map(|l| vec![0; l.marks()]).collect(),
-            touched_network: vec![0; field.network.len().div_ceil(64 * LANES)],
+            touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
+            touched_network: vec![0; field.network.len().div_ceil(LANES)],
             transposed: vec![0.0; field.network.len()],
             hull: None,
             step: 0,
@@ -299,10 +301,9 @@ impl Trainer {
         let progress = self.done();
         let warm = ((self.step + 1) as f64 / options.warm_up.max(1) as f64).min(1.0);
         let schedule = self.rate_scale * warm * options.final_rate.powf(progress);
-        let grid_step = AdamStep::new(self.step + 1, options.rate * schedule, options.grid_decay);
         let network_step = AdamStep::new(self.step + 1, options.network_rate * schedule, options.network_decay);
         // All of a network is touched, always.
-        self.touched_network.fill(u64::MAX);
+        self.touched_network.fill(1);
         adam(
             &network_step,
             &mut self.touched_network,
@@ -312,7 +313,7 @@ impl Trainer {
             &mut self.second.network,
         );
 
-        let shards = &self.shards;
+        let (shards, step) = (&self.shards, self.step + 1);
         let mut work = Vec::with_capacity(self.field.levels.len());
         let mut grids =
             (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
@@ -332,7 +333,8 @@ impl Trainer {
                     scatter(level, g, touched, &shard.features.positions, gradients);
                 }
             }
-            adam(&grid_step, touched, w, g, m, v);
+            let rate = options.rate * schedule * options.level_rate.powi(i as i32);
+            adam(&AdamStep::new(step, rate, options.grid_decay), touched, w, g, m, v);
         });
     }
 
