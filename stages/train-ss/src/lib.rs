@@ -114,7 +114,7 @@ impl Default for Params {
             batch: 2_048,
             samples: 32_768,
             rate: 4e-2,
-            level_rate: 1.0,
+            level_rate: 0.8,
             network_rate: 1e-2,
             final_rate: 0.25,
             averaging: 0.97,
