@@ -12,7 +12,7 @@ import pathlib
 import cells
 
 # Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
-BUDGET = {"100x2": (48_000_000, 1), "100x4": (60_000_000, 3), "200x2": (44_000_000, 1), "200x4": (48_000_000, 1)}
+BUDGET = {"100x2": (48_000_000, 1), "100x4": (100_000_000, 4), "200x2": (44_000_000, 1), "200x4": (48_000_000, 1)}
 OTHER_BUDGET = (40_000_000, 1)
 # `kernel` takes about an eighth more time for a ray than `average`, which therefore gets as many more rays: equal times.
 AVERAGE_RAYS = 9 / 8

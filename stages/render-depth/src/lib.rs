@@ -6,10 +6,12 @@
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
 
+use std::path::PathBuf;
+
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{Channel, PixelError, PngRows, SampleType, to_u8, write_exr};
-use radiance::{FIELD_FILE, Field, FieldFile, Ray};
+use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Ray, RayField};
 use scene::{Background, Camera, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -70,7 +72,7 @@ impl Stage for RenderDepth {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("field")?;
         let file: FieldFile = input.read_json(FIELD_FILE)?;
-        let members = file.read_members(|name| input.path(name)).bad_input("field")?;
+        let members = read_members(&file, input, &context.device)?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
@@ -85,6 +87,34 @@ impl Stage for RenderDepth {
         let count = views.len();
         context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(file.background, cameras.bounds, views) })?;
         context.write_summary(&format!("{count} views, {:.1} M pixels", pixels_of(&cameras, params.size) as f64 / 1e6))
+    }
+}
+
+/// All members of a field, whichever it is.
+fn read_members(file: &FieldFile, input: &GivenInput, device: &str) -> anyhow::Result<Vec<Box<dyn RayField>>> {
+    file.check().map_err(|reason| Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display())))?;
+    let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
+    match file.field {
+        FieldModel::Grid(architecture) => {
+            if device != "cpu" {
+                let message = format!("--device {device}: the grid is rendered on the CPU; leave --device away");
+                return Err(Failure::Usage(message).into());
+            }
+            let read = |path: PathBuf| Field::read(&path, architecture, file.bounds).bad_input("field");
+            paths.map(|path| Ok(Box::new(read(path)?) as Box<dyn RayField>)).collect()
+        }
+        #[cfg(feature = "torch")]
+        FieldModel::Mlp(architecture) => {
+            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+            nets::deterministic();
+            let read = |path: PathBuf| torch_field::Mlp::read(&path, architecture, file.bounds, device).bad_input("field");
+            paths.map(|path| Ok(Box::new(read(path)?) as Box<dyn RayField>)).collect()
+        }
+        #[cfg(not(feature = "torch"))]
+        FieldModel::Mlp(_) => {
+            let message = "field: mlp needs libtorch, and render-depth was built without it; build with --features torch";
+            Err(Failure::Usage(message.to_owned()).into())
+        }
     }
 }
 
@@ -108,7 +138,7 @@ fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
 struct Job<'a> {
     context: &'a Context,
     params: &'a Params,
-    members: &'a [Field],
+    members: &'a [Box<dyn RayField>],
     background: Background,
     camera: &'a Camera,
 }
@@ -128,7 +158,7 @@ impl Job<'_> {
         let mut png = PngRows::create(&self.context.output_path(&format!("previews/{}.png", self.camera.name))?, width, height)?;
         write_exr(&exr, (width, height), &channels, note, |first, rows, samples| -> Result<(), Stopped> {
             self.context.check_interrupt().map_err(Stopped::Other)?;
-            let bytes = self.band(first, rows, samples, channels.len());
+            let bytes = self.band(first, rows, samples, channels.len()).map_err(Stopped::Other)?;
             png.write(&bytes)?;
             progress.add(rows as u64);
             Ok(())
@@ -142,7 +172,7 @@ impl Job<'_> {
     }
 
     /// Renders some rows into EXR samples; returns the preview's bytes.
-    fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> Vec<u8> {
+    fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> anyhow::Result<Vec<u8>> {
         let width = self.camera.intrinsics.width as usize;
         let background = [self.background.shown(); 3];
         let n = self.params.sub_rays as usize;
@@ -157,7 +187,8 @@ impl Job<'_> {
                 (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
-        let rendered: Vec<Vec<radiance::Pixel>> = self.members.iter().map(|m| m.render(&rays)).collect();
+        let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
+        let rendered = rendered.map_err(|e| anyhow::anyhow!(e))?;
         let share = 1.0 / (n * n * self.members.len()) as f32;
         let mut preview = Vec::with_capacity(3 * rows * width);
         let (mut subs, mut distances) = (Vec::new(), Vec::new());
@@ -179,7 +210,7 @@ impl Job<'_> {
             }
             preview.extend((0..3).map(|c| to_u8(mean(&|p| p.colour[c]))));
         }
-        preview
+        Ok(preview)
     }
 
     fn distance(&self, pixel: &radiance::Pixel) -> f32 {

@@ -179,8 +179,9 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let pictures = train_ss::read_pictures(&input, &views)?;
         let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
-        let architecture = params.architecture(views.views[0].camera.intrinsics.width);
-        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), params.options());
+        let architecture = params.grid(views.views[0].camera.intrinsics.width);
+        let training = params.grid_training(params.rays(0));
+        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
@@ -192,9 +193,9 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         rows.add(format!("train_rays_per_s_per_gflops{name}"), speed / rows.value("sgemm_gflops"), "rays/GFLOP");
         Ok(trainer.finish())
     };
-    let params = Params { rays, ..Params::default() };
+    let params = Params { rays: Some(rays), ..Params::default() };
     let field = run(&params, rows, "")?;
-    let short = Params { rays: rays / 6, ..params.clone() };
+    let short = Params { rays: Some(rays / 6), ..params.clone() };
     run(&short, rows, "_first_sixth")?;
     one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
     for scale in [1.0, 4.0] {

@@ -2,9 +2,10 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use radiance::{StepReport, Trainer};
+use radiance::StepReport;
 use serde::{Deserialize, Serialize};
 
+use crate::field_trainer::FieldTrainer;
 use crate::{CurvePoint, Supersampling, TrainingLog};
 
 /// The training curve while it grows. Everything in it is saved, so that a resumed training writes the same one.
@@ -58,13 +59,13 @@ impl Checkpoints {
     }
 
     /// Loads what an earlier run left. What can't be read is said and left out: the training starts over.
-    pub(crate) fn resume(&self, trainer: &mut Trainer, supervision: &mut Supersampling, say: impl Fn(&str)) -> Curve {
+    pub(crate) fn resume(&self, trainer: &mut dyn FieldTrainer, supervision: &mut Supersampling, say: impl Fn(&str)) -> Curve {
         let Some(folder) = &self.folder else { return Curve::default() };
-        let path = folder.join("checkpoint.safetensors");
+        let path = folder.join(CHECKPOINT);
         if !path.exists() {
             return Curve::default();
         }
-        match whole(folder, &path, supervision).filter(|_| trainer.resume(&path).is_ok()) {
+        match whole(folder, &path, trainer, supervision).filter(|_| trainer.resume(&path)) {
             Some((curve, renders)) => {
                 if let Some(memory) = supervision.memory_mut() {
                     memory.restore(&renders);
@@ -80,17 +81,22 @@ impl Checkpoints {
     }
 
     /// Writes a checkpoint when writing costs at most a fiftieth of the time.
-    pub(crate) fn write_when_due(&mut self, trainer: &Trainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
+    pub(crate) fn write_when_due(
+        &mut self,
+        trainer: &dyn FieldTrainer,
+        supervision: &Supersampling,
+        curve: &Curve,
+    ) -> anyhow::Result<()> {
         if self.folder.is_some() && self.last.elapsed() > 50 * self.took {
             self.write(trainer, supervision, curve)?;
         }
         Ok(())
     }
 
-    pub(crate) fn write(&mut self, trainer: &Trainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
+    pub(crate) fn write(&mut self, trainer: &dyn FieldTrainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let started = Instant::now();
-        let (name, temporary) = (folder.join("checkpoint.safetensors"), folder.join("checkpoint.partial"));
+        let (name, temporary) = (folder.join(CHECKPOINT), folder.join("checkpoint.partial"));
         let step = trainer.steps();
         let own = [curve_name(step), renders_name(step)];
         artifact::write_json(&folder.join(&own[0]), curve)?;
@@ -112,6 +118,8 @@ impl Checkpoints {
     }
 }
 
+const CHECKPOINT: &str = "checkpoint.safetensors";
+
 fn curve_name(step: u64) -> String {
     format!("curve-{step}.json")
 }
@@ -121,8 +129,8 @@ fn renders_name(step: u64) -> String {
 }
 
 /// The curve and the remembered renders of a checkpoint's step, where all of it is there: looked for before anything changes.
-fn whole(folder: &Path, checkpoint: &Path, supervision: &Supersampling) -> Option<(Curve, Vec<u8>)> {
-    let step = Trainer::checkpoint_step(checkpoint).ok()?;
+fn whole(folder: &Path, checkpoint: &Path, trainer: &dyn FieldTrainer, supervision: &Supersampling) -> Option<(Curve, Vec<u8>)> {
+    let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
     let Some(memory) = supervision.memory() else { return Some((curve, Vec::new())) };
     let renders = std::fs::read(folder.join(renders_name(step))).ok()?;

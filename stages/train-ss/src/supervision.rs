@@ -21,6 +21,16 @@ pub enum Supervision {
     Kernel,
 }
 
+/// In which order pixels are drawn.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Order {
+    /// Each time any pixel.
+    Random,
+    /// All of them in random order, and then again in another.
+    Epochs,
+}
+
 /// Supersampling: a training pixel is drawn at random, and sub-rays are cast through it.
 ///
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
@@ -37,6 +47,8 @@ pub struct Supersampling {
     side: [usize; 2],
     coarse: f64,
     jitter: bool,
+    order: Order,
+    crop_groups: u64,
     seed: u64,
     memory: Option<Memory>,
 }
@@ -65,6 +77,10 @@ pub struct SupersamplingOptions {
     pub coarse: f64,
     /// Whether a sub-ray passes anywhere in its share of the pixel instead of at its centre.
     pub jitter: bool,
+    /// In which order pixels are drawn.
+    pub order: Order,
+    /// Pixels at the start that come from the middle half of each picture's width and height alone.
+    pub crop_groups: u64,
     /// Seed of what is drawn.
     pub seed: u64,
 }
@@ -73,6 +89,8 @@ pub struct SupersamplingOptions {
 const PIXEL: u64 = 100;
 const BACKGROUND: u64 = 101;
 const JITTER: u64 = 102;
+/// The first of four.
+const ORDER: u64 = 110;
 
 /// Above this (254.5 in 8 bits) an LR sample may have been clipped, and below its counterpart.
 const SATURATED: f32 = 254.5 / 255.0;
@@ -120,8 +138,9 @@ impl Supersampling {
                 down: (-r.y_axis / k.fy).to_array(),
             });
         }
-        let SupersamplingOptions { coarse, jitter, seed, .. } = *options;
-        Self { views: ready, pixels, background: views.background, full, side: full, coarse, jitter, seed, memory }
+        let SupersamplingOptions { coarse, jitter, order, crop_groups, seed, .. } = *options;
+        let background = views.background;
+        Self { views: ready, pixels, background, full, side: full, coarse, jitter, order, crop_groups, seed, memory }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -146,8 +165,21 @@ impl Supersampling {
 
     /// The view and pixel that a group trains on.
     fn pixel(&self, group: u64) -> (usize, usize) {
-        let at = Draws::new(self.seed, PIXEL, group).below(self.pixels);
+        let mut draws = Draws::new(self.seed, PIXEL, group);
+        let at = match self.order {
+            Order::Epochs if group >= self.crop_groups => {
+                let group = group - self.crop_groups;
+                shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels)
+            }
+            _ => draws.below(self.pixels),
+        };
         let view = self.views.partition_point(|v| v.before <= at) - 1;
+        let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
+        if group < self.crop_groups {
+            let mut middle = |length: u64| length / 4 + draws.below((length / 2).max(1));
+            let (x, y) = (middle(width), middle(height));
+            return (view, (y * width + x) as usize);
+        }
         (view, (at - self.views[view].before) as usize)
     }
 
@@ -158,6 +190,25 @@ impl Supersampling {
             [0, 1, 2].map(|_| draws.uniform())
         } else {
             [self.background.shown(); 3]
+        }
+    }
+}
+
+/// Where the i-th of n numbers comes in an epoch's random order: a Feistel cipher over the next power of four, which is gone
+/// through again from what lies beyond n. So the order needs no memory, and any thread may ask for any place.
+fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
+    let bits = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
+    let mask = (1u64 << bits) - 1;
+    let mut at = i;
+    loop {
+        let (mut left, mut right) = (at >> bits, at & mask);
+        for round in 0..4 {
+            let mixed = Draws::new(seed, ORDER + round, (epoch << 32) ^ right).below(mask + 1);
+            (left, right) = (right, left ^ mixed);
+        }
+        at = left << bits | right;
+        if at < n {
+            return at;
         }
     }
 }
@@ -260,7 +311,16 @@ mod tests {
     use super::*;
 
     fn options(supervision: Supervision, scale: [f64; 2]) -> SupersamplingOptions {
-        SupersamplingOptions { supervision, scale, filter: Filter::Lanczos, coarse: 0.0, jitter: false, seed: 9 }
+        SupersamplingOptions {
+            supervision,
+            scale,
+            filter: Filter::Lanczos,
+            coarse: 0.0,
+            jitter: false,
+            order: Order::Random,
+            crop_groups: 0,
+            seed: 9,
+        }
     }
 
     fn fine_picture(width: usize, height: usize) -> Picture {
@@ -387,6 +447,27 @@ mod tests {
         };
         for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
             assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
+        }
+    }
+
+    /// In epochs every pixel comes once before any comes again, each time in another order; the first come from the middle.
+    #[test]
+    fn epochs_draw_without_replacement() {
+        let (mut supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
+        (supersampling.order, supersampling.crop_groups) = (Order::Epochs, 50);
+        let drawn = |range: std::ops::Range<u64>| range.map(|g| supersampling.pixel(g).1).collect::<Vec<_>>();
+        // 5 × 4 pixels.
+        assert!(drawn(0..50).iter().all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5))));
+        let (mut first, mut second) = (drawn(50..70), drawn(70..90));
+        assert_ne!(first, second);
+        for epoch in [&mut first, &mut second] {
+            epoch.sort_unstable();
+            assert_eq!(*epoch, (0..20).collect::<Vec<_>>());
+        }
+        for n in [1, 2, 3, 17, 1000] {
+            let mut order: Vec<u64> = (0..n).map(|i| shuffled(7, 3, i, n)).collect();
+            order.sort_unstable();
+            assert!(order.iter().copied().eq(0..n));
         }
     }
 

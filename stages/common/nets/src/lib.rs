@@ -1,7 +1,8 @@
 //! libtorch glue that stages with networks share: determinism and weights. The networks themselves live where they are used.
 //!
 //! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes don't depend on threads.
-//! * [`Weights`]: tensors of a safetensors file, by name, each with the shape it must have.
+//! * [`device`]: the device that a stage was asked to use, or why it can't be.
+//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have.
 //!
 //! ```no_run,standalone_crate
 //! nets::deterministic();
@@ -13,12 +14,50 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
-use tch::{Kind, Tensor};
+use tch::{Cuda, Device, Kind, TchError, Tensor};
 
 /// Makes libtorch repeat its bytes: sums are split by thread, so it gets one.
 pub fn deterministic() {
     tch::set_num_threads(1);
+}
+
+/// A device that can't be used.
+#[derive(Debug, thiserror::Error)]
+#[error("--device {name}: {reason}")]
+pub struct DeviceError {
+    name: String,
+    reason: String,
+}
+
+/// The device of `--device`: `cpu`, `cuda` or `cuda:N`.
+pub fn device(name: &str) -> Result<Device, DeviceError> {
+    let refuse = |reason: String| Err(DeviceError { name: name.to_owned(), reason });
+    let index = match name.strip_prefix("cuda") {
+        None if name == "cpu" => return Ok(Device::Cpu),
+        Some("") => Some(0),
+        Some(index) => index.strip_prefix(':').and_then(|i| i.parse::<usize>().ok()),
+        None => None,
+    };
+    let Some(index) = index else { return refuse("no such device; cpu, cuda or cuda:N is expected".to_owned()) };
+    let found = Cuda::device_count();
+    if !Cuda::is_available() || found == 0 {
+        return refuse(
+            "no GPU can be used here; leave --device away, or build with LIBTORCH_USE_PYTORCH=1 beside a PyTorch that has CUDA, on a \
+             machine with an NVIDIA driver"
+                .to_owned(),
+        );
+    }
+    if index as i64 >= found {
+        return refuse(format!("there are {found} GPUs, counted from 0"));
+    }
+    Ok(Device::Cuda(index))
+}
+
+/// Whether libtorch failed for want of memory: then a smaller piece may do.
+pub fn is_out_of_memory(error: &TchError) -> bool {
+    error.to_string().contains("out of memory")
 }
 
 /// Weights that can't be used.
@@ -42,7 +81,7 @@ pub enum WeightsError {
     },
 }
 
-/// The tensors of a safetensors file, in f32 on the CPU.
+/// The tensors of a safetensors file, in f32 or i64 on the CPU.
 #[derive(Debug)]
 pub struct Weights {
     path: PathBuf,
@@ -50,7 +89,7 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// Reads a file of f32 or f16 tensors.
+    /// Reads a file of f32, f16 or i64 tensors.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
         let format = |reason: String| WeightsError::Format { path: path.to_path_buf(), reason };
         let bytes = std::fs::read(path).map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
@@ -61,17 +100,29 @@ impl Weights {
             let kind = match view.dtype() {
                 Dtype::F32 => Kind::Float,
                 Dtype::F16 => Kind::Half,
-                other => return Err(format(format!("tensor {name} is {other:?}; f32 or f16 is expected"))),
+                Dtype::I64 => Kind::Int64,
+                other => return Err(format(format!("tensor {name} is {other:?}; f32, f16 or i64 is expected"))),
             };
-            tensors.insert(name, Tensor::from_data_size(view.data(), &shape, kind).to_kind(Kind::Float));
+            let tensor = Tensor::from_data_size(view.data(), &shape, kind);
+            tensors.insert(name, if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor });
         }
         Ok(Self { path: path.to_path_buf(), tensors })
     }
 
-    /// A tensor that must have a shape.
+    /// Whole numbers, of which there must be so many.
+    pub fn integers(&self, name: &str, count: usize) -> Result<Vec<i64>, WeightsError> {
+        let integers = self.tensors.get(name).filter(|t| t.kind() == Kind::Int64).and_then(|t| Vec::<i64>::try_from(t).ok());
+        integers.filter(|i| i.len() == count).ok_or_else(|| WeightsError::Format {
+            path: self.path.clone(),
+            reason: format!("no tensor {name} of {count} whole numbers"),
+        })
+    }
+
+    /// A tensor of floats that must have a shape.
     pub fn tensor(&self, name: &str, shape: &[i64]) -> Result<Tensor, WeightsError> {
         let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
-        let tensor = self.tensors.get(name).ok_or_else(|| format(format!("no tensor {name}")))?;
+        let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Float);
+        let tensor = tensor.ok_or_else(|| format(format!("no tensor {name}")))?;
         if tensor.size() != shape {
             return Err(format(format!("tensor {name} is {:?} where {shape:?} is expected", tensor.size())));
         }
@@ -79,9 +130,51 @@ impl Weights {
     }
 }
 
+/// Writes tensors of f32 or i64, by name, as safetensors without metadata, so that bytes repeat.
+pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
+    let io = |source| WeightsError::Io { path: path.to_path_buf(), source };
+    let refused = |e: TchError| io(std::io::Error::other(e.to_string()));
+    let mut bytes = Vec::with_capacity(tensors.len());
+    for (name, tensor) in tensors {
+        let dtype = if tensor.kind() == Kind::Int64 { Dtype::I64 } else { Dtype::F32 };
+        let flat = tensor.f_detach().and_then(|t| t.f_to_device(Device::Cpu)?.f_contiguous()).map_err(refused)?;
+        let mut data = vec![0u8; flat.numel() * flat.kind().elt_size_in_bytes()];
+        flat.f_copy_data_u8(&mut data, flat.numel()).map_err(refused)?;
+        bytes.push((name.as_str(), dtype, tensor.size().iter().map(|&d| d as usize).collect::<Vec<_>>(), data));
+    }
+    let views = bytes.iter().map(|(name, dtype, shape, data)| {
+        (*name, TensorView::new(*dtype, shape.clone(), data).expect("the data is that of the shape"))
+    });
+    let whole = safetensors::serialize(views, None).map_err(|e| io(std::io::Error::other(e.to_string())))?;
+    std::fs::write(path, whole).map_err(io)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn devices_are_named_or_refused() {
+        assert_eq!(device("cpu").unwrap(), Device::Cpu);
+        for name in ["gpu", "cuda:x", "cuda0", "cuda:99", ""] {
+            let said = device(name).unwrap_err().to_string();
+            assert!(said.starts_with(&format!("--device {name}: ")), "{said}");
+        }
+        if !Cuda::is_available() {
+            assert!(device("cuda").unwrap_err().to_string().contains("leave --device away"));
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read() {
+        let path = tempfile::tempdir().unwrap().keep().join("w.safetensors");
+        let (a, b) = (Tensor::from_slice(&[1.5f32, -2.0]).reshape([2, 1]), Tensor::from_slice(&[3i64, -1]));
+        write(&path, &[("a".to_owned(), a.shallow_clone()), ("b".to_owned(), b)]).unwrap();
+        let weights = Weights::read(&path).unwrap();
+        assert_eq!(weights.tensor("a", &[2, 1]).unwrap(), a);
+        assert_eq!(weights.integers("b", 2).unwrap(), [3, -1]);
+        assert!(weights.tensor("b", &[2]).is_err() && weights.integers("a", 2).is_err() && weights.integers("b", 3).is_err());
+    }
 
     #[test]
     fn names_and_shapes_are_checked() {

@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::chunk::Chunk;
+use crate::field_file::in_ranges;
 use crate::grid::{FEATURES, Level, levels};
 use crate::mlp::Layer;
 use crate::occupancy::{GRID, Occupancy};
@@ -49,9 +50,7 @@ impl Architecture {
             ("hidden", self.hidden, 16, 128),
             ("steps", self.steps, 16, 8192),
         ];
-        ranges.into_iter().try_for_each(|(name, value, low, high)| {
-            if (low..=high).contains(&value) { Ok(()) } else { Err(format!("{name} = {value} is not in {low}..={high}")) }
-        })
+        in_ranges(&ranges)
     }
 }
 
@@ -118,6 +117,18 @@ pub struct Pixel {
     pub depth: f32,
     /// Distance at which half of the ray is stopped; the far end where it never is.
     pub median_depth: f32,
+}
+
+/// Whatever rays can be cast through: what renders views needn't know which field it has.
+pub trait RayField {
+    /// Colour, opacity and depth of each ray.
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>>;
+}
+
+impl RayField for Field {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
+        Ok(Self::render(self, rays))
+    }
 }
 
 /// A field that can't be read or written.

@@ -1,11 +1,9 @@
-use std::path::PathBuf;
-
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use scene::Bounds;
 
-use crate::{Architecture, Field, FieldError};
+use crate::Architecture;
 
 /// Name of the description in a field's artifact; the weights lie beside it, each member's in [`FieldFile::member`].
 pub const FIELD_FILE: &str = "field.json";
@@ -14,13 +12,11 @@ pub const FIELD_FILE: &str = "field.json";
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FieldFile {
-    /// Which kind of field.
-    pub field: FieldKind,
+    /// Which field, and what it is made of.
+    pub field: FieldModel,
     /// How many there are, trained apart on the same pictures: what they render is averaged.
     #[schemars(range(min = 1, max = 16))]
     pub members: u32,
-    /// What it is made of.
-    pub architecture: Architecture,
     /// Where it lies, in scene units.
     pub bounds: Bounds,
     /// What lies behind the scene.
@@ -33,20 +29,70 @@ impl FieldFile {
         format!("field-{index}.safetensors")
     }
 
-    /// Reads all members; `path` says where a file of the artifact lies.
-    pub fn read_members(&self, path: impl Fn(&str) -> PathBuf) -> Result<Vec<Field>, FieldError> {
+    /// Says which number can't be.
+    pub fn check(&self) -> Result<(), String> {
         if !(1..=16).contains(&self.members) {
-            let reason = format!("members = {} is not in 1..=16", self.members);
-            return Err(FieldError::Format { path: path(FIELD_FILE), reason });
+            return Err(format!("members = {} is not in 1..=16", self.members));
         }
-        (0..self.members).map(|i| Field::read(&path(&Self::member(i)), self.architecture, self.bounds)).collect()
+        match self.field {
+            FieldModel::Grid(architecture) => architecture.check(),
+            FieldModel::Mlp(architecture) => architecture.check(),
+        }
     }
 }
 
-/// The kinds of field.
+/// A kind of field, and what it is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum FieldKind {
+pub enum FieldModel {
     /// Multi-resolution grid with small MLPs: this crate's.
-    Grid,
+    Grid(Architecture),
+    /// The paper's own two MLPs.
+    Mlp(MlpArchitecture),
+}
+
+/// What the paper's field is made of; the defaults are the published ones.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct MlpArchitecture {
+    /// Octaves of the positions' encoding.
+    pub position_octaves: u32,
+    /// Octaves of the directions' encoding.
+    pub direction_octaves: u32,
+    /// Layers before density and colour part; positions join in again at the fifth.
+    pub depth: u32,
+    /// Width of those layers.
+    pub width: u32,
+    /// Samples of the coarse network along a ray.
+    pub coarse_samples: u32,
+    /// Samples that the fine network has besides those.
+    pub fine_samples: u32,
+}
+
+impl Default for MlpArchitecture {
+    fn default() -> Self {
+        Self { position_octaves: 10, direction_octaves: 4, depth: 8, width: 256, coarse_samples: 64, fine_samples: 64 }
+    }
+}
+
+impl MlpArchitecture {
+    /// Says which number can't be.
+    pub fn check(&self) -> Result<(), String> {
+        let ranges = [
+            ("position_octaves", self.position_octaves, 0, 16),
+            ("direction_octaves", self.direction_octaves, 0, 16),
+            ("depth", self.depth, 1, 32),
+            ("width", self.width, 2, 4096),
+            ("coarse_samples", self.coarse_samples, 4, 4096),
+            ("fine_samples", self.fine_samples, 1, 4096),
+        ];
+        in_ranges(&ranges)
+    }
+}
+
+/// Says which of some named numbers isn't between its bounds.
+pub(crate) fn in_ranges(ranges: &[(&str, u32, u32, u32)]) -> Result<(), String> {
+    ranges.iter().try_for_each(|(name, value, low, high)| {
+        if (low..=high).contains(&value) { Ok(()) } else { Err(format!("{name} = {value} is not in {low}..={high}")) }
+    })
 }

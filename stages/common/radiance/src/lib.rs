@@ -1,5 +1,6 @@
 //! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No autograd, no torch.
 //!
+//! * [`RayField`]: whatever rays can be cast through; [`FieldFile`] says what an artifact holds.
 //! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
@@ -39,8 +40,8 @@ mod simd;
 mod spherical;
 mod trainer;
 
-pub use field::{Architecture, Field, FieldError, Pixel};
-pub use field_file::{FIELD_FILE, FieldFile, FieldKind};
+pub use field::{Architecture, Field, FieldError, Pixel, RayField};
+pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
 pub use passes::Passes;
 pub use random::{Draws, uniform};
 pub use ray::Ray;

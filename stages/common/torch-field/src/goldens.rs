@@ -1,0 +1,122 @@
+//! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make goldens`).
+
+use radiance::{MlpArchitecture, uniform};
+use safetensors::SafeTensors;
+use scene::Bounds;
+use tch::{Device, Kind, Tensor};
+
+use crate::encoding::encode;
+use crate::mlp::{Batch, Mlp, SampleDraws};
+use crate::network::Network;
+use crate::sampling::{importance, middles, stratified};
+use crate::{MlpTrainer, MlpTraining, Schedule};
+
+const GOLDENS: &[u8] = include_bytes!("goldens/mlp.safetensors");
+
+/// What the script's `draw` gives.
+fn draw(purpose: u64, shape: &[i64]) -> Tensor {
+    let values: Vec<f64> = (0..shape.iter().product::<i64>()).map(|i| f64::from(uniform(11, purpose, i as u64))).collect();
+    Tensor::from_slice(&values).reshape(shape)
+}
+
+fn golden(name: &str) -> Tensor {
+    let file = SafeTensors::deserialize(GOLDENS).unwrap();
+    let view = file.tensor(name).unwrap();
+    let kind = if view.dtype() == safetensors::Dtype::F64 { Kind::Double } else { Kind::Float };
+    let shape: Vec<i64> = view.shape().iter().map(|&d| d as i64).collect();
+    Tensor::from_data_size(view.data(), &shape, kind)
+}
+
+#[track_caller]
+fn close(name: &str, ours: &Tensor, tolerance: f64) {
+    let theirs = golden(name).to_kind(Kind::Double);
+    let ours = ours.detach().to_kind(Kind::Double);
+    assert_eq!(ours.size(), theirs.size(), "{name}");
+    let error = f64::try_from((&ours - &theirs).norm() / theirs.norm()).unwrap();
+    assert!(error <= tolerance, "{name}: relative error {error:e}");
+}
+
+/// A network with the script's weights.
+fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> Network {
+    let mut next = purpose;
+    let read = Network::read(architecture, |_, shape| {
+        let drawn = draw(next, shape);
+        next += 1;
+        Ok(if shape.len() == 2 { (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0) } else { 0.2 * drawn - 0.05 })
+    });
+    read.unwrap().to(Device::Cpu, kind).unwrap()
+}
+
+#[test]
+fn published_size_forward_in_f32() {
+    let spread = |purpose, reach: f64| (draw(purpose, &[8, 3]) * (2.0 * reach) - reach).to_kind(Kind::Float);
+    let (position, direction) = (spread(1, 2.0), spread(2, 1.0));
+    let code = encode(&position, 10).unwrap();
+    close("encoding", &code, 1e-6);
+    let network = network(MlpArchitecture::default(), 1000, Kind::Float);
+    assert_eq!(network.parameters.iter().map(Tensor::numel).sum::<usize>(), 595_844);
+    let (colour, density) = network.forward(&code, &encode(&direction, 4).unwrap()).unwrap();
+    close("full.colour", &colour, 1e-5);
+    close("full.density", &density, 1e-5);
+}
+
+/// The small field, its rays and draws.
+fn small() -> (Mlp, Batch, SampleDraws) {
+    let architecture =
+        MlpArchitecture { position_octaves: 4, direction_octaves: 2, depth: 6, width: 16, coarse_samples: 8, fine_samples: 8 };
+    let bounds = Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0 };
+    let [coarse, fine] = [2000, 3000].map(|purpose| network(architecture, purpose, Kind::Double));
+    let field = Mlp { architecture, bounds, coarse, fine, device: Device::Cpu };
+    let origin = 0.5 * draw(3, &[8, 3]) + Tensor::from_slice(&[0.0, 0.0, 4.0f64]);
+    let direction = draw(4, &[8, 3]) - 0.5;
+    let _ = direction.narrow(1, 2, 1).fill_(-1.0);
+    let noise = Some([draw(9, &[8, 8]) - 0.5, draw(10, &[8, 16]) - 0.5]);
+    let draws = SampleDraws { coarse: draw(7, &[8, 8]), fine: draw(8, &[8, 8]), noise };
+    (field, Batch { origin, direction, background: draw(5, &[8, 3]) }, draws)
+}
+
+#[test]
+fn sampling_and_compositing_in_f64() {
+    let (field, batch, draws) = small();
+    let ends = [2.0, 6.0].map(|x| Tensor::full([8, 1], x, (Kind::Double, Device::Cpu)));
+    let t = stratified(&ends[0], &ends[1], 8, Some(&draws.coarse)).unwrap();
+    close("stratified", &t, 1e-12);
+    let seen = field.see(&batch, Some(&draws)).unwrap();
+    // The reference multiplies by 1 - α + 1e-10, we add optical depths.
+    close("coarse.weights", &seen.coarse.weights, 1e-8);
+    let inner = seen.coarse.weights.narrow(1, 1, 6);
+    close("importance", &importance(&middles(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);
+    let even = stratified(&ends[0], &ends[1], 8, None).unwrap();
+    let shares = Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
+    close("importance.even", &importance(&middles(&even).unwrap(), &inner, &shares).unwrap(), 1e-9);
+    close("fine.weights", &seen.fine.weights, 1e-8);
+    close("coarse.colour", &seen.coarse.colour, 1e-8);
+    close("fine.colour", &seen.fine.colour, 1e-8);
+}
+
+/// Loss, every parameter's gradient, and all parameters after three steps of Adam.
+#[test]
+fn gradients_and_three_steps_in_f64() {
+    let (field, batch, draws) = small();
+    let options =
+        MlpTraining { rays: 1, batch: 8, rate: 5e-4, final_rate: 1.0, schedule: Schedule::Exponential, noise: 0.0, seed: 0 };
+    let mut trainer = MlpTrainer::new(field, options).unwrap();
+    let target = draw(6, &[2, 3]);
+    let flat = |tensors: &[Tensor]| Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0);
+    for step in 0..3 {
+        let seen = trainer.field().see(&batch, Some(&draws)).unwrap();
+        let part = |colour: &Tensor| {
+            let mean = colour.reshape([2, 4, 3]).mean_dim([1i64].as_slice(), false, Kind::Double);
+            (mean - &target).square().mean(Kind::Double)
+        };
+        let loss = part(&seen.coarse.colour) + part(&seen.fine.colour);
+        let parameters: Vec<Tensor> = trainer.field().parameters().collect();
+        let gradients = Tensor::run_backward(&[&loss], &parameters, false, false);
+        if step == 0 {
+            close("loss", &loss.reshape([1]), 1e-9);
+            close("gradient", &flat(&gradients), 1e-7);
+        }
+        trainer.take(&gradients, 0.0).unwrap();
+    }
+    close("parameters", &flat(&trainer.field().parameters().collect::<Vec<_>>()), 1e-9);
+}

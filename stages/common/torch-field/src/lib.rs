@@ -1,0 +1,71 @@
+//! Radiance fields through libtorch's operations and autograd, on the CPU or on CUDA.
+//!
+//! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020): positional encoding, a coarse and a fine
+//!   network of eight layers, stratified and importance sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
+//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervision`] as the fast field's.
+//!
+//! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one thread, and their gradients are added in
+//! order: bytes don't depend on the number of threads. On CUDA results hold to a tolerance.
+//!
+//! Units: positions and distances are scene units, directions have unit length, colours are display-encoded sRGB.
+//!
+//! ```no_run
+//! use radiance::{MlpArchitecture, Ray};
+//! let bounds = scene::Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0 };
+//! let field = torch_field::Mlp::new(MlpArchitecture::default(), bounds, 7, nets::device("cpu")?)?;
+//! let ray = Ray { origin: [0.0, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
+//! let pixel = field.render(&[ray])?[0];
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+mod composite;
+mod encoding;
+#[cfg(test)]
+mod goldens;
+mod mlp;
+mod network;
+mod sampling;
+mod schedule;
+mod trainer;
+
+use std::path::PathBuf;
+
+pub use mlp::Mlp;
+pub use schedule::Schedule;
+pub use trainer::{MlpTrainer, MlpTraining};
+
+/// A field that can't be read, written, rendered or trained.
+#[derive(Debug, thiserror::Error)]
+pub enum TorchFieldError {
+    /// libtorch refused.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+    /// A file of weights can't be used.
+    #[error(transparent)]
+    Weights(#[from] nets::WeightsError),
+    /// The file isn't a field.
+    #[error("{path}: {reason}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// Numbers went wrong twice within a hundred steps.
+    #[error("step {step}: the gradient is not finite, for the second time within 100 steps; lower the rate")]
+    NotFinite {
+        /// The step.
+        step: u64,
+    },
+    /// A network sees nothing but the background, and can't learn any more.
+    #[error(
+        "step {step}: the {network} network has collapsed: it sees nothing but the background, and its ReLU passes no gradient; \
+         try another seed"
+    )]
+    Collapsed {
+        /// The step.
+        step: u64,
+        /// Which network.
+        network: &'static str,
+    },
+}

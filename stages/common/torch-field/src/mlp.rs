@@ -1,0 +1,256 @@
+use std::path::Path;
+
+use radiance::{Draws, MlpArchitecture, Pixel, Ray, RayField};
+use rayon::prelude::*;
+use scene::Bounds;
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use crate::TorchFieldError;
+use crate::composite::{Composite, composite};
+use crate::encoding::encode;
+use crate::network::{Network, normal};
+use crate::sampling::{importance, middles, stratified};
+
+/// The paper's field: a coarse network that says where to look and a fine one that is looked at. Positions are scene units, as they
+/// come; rays run from `near` to `far` of the bounds.
+#[derive(Debug)]
+pub struct Mlp {
+    pub(crate) architecture: MlpArchitecture,
+    pub(crate) bounds: Bounds,
+    pub(crate) coarse: Network,
+    pub(crate) fine: Network,
+    pub(crate) device: Device,
+}
+
+/// What a training step draws for its rays; without it samples lie at equal steps and at equal shares of what stops the light.
+#[derive(Debug)]
+pub(crate) struct SampleDraws {
+    /// In 0..1: n × coarse samples.
+    pub(crate) coarse: Tensor,
+    /// In 0..1: n × fine samples.
+    pub(crate) fine: Tensor,
+    /// Added to raw densities: n × coarse samples, and n × (coarse + fine) samples.
+    pub(crate) noise: Option<[Tensor; 2]>,
+}
+
+/// Rays as tensors.
+#[derive(Debug)]
+pub(crate) struct Batch {
+    pub(crate) origin: Tensor,
+    pub(crate) direction: Tensor,
+    pub(crate) background: Tensor,
+}
+
+/// What both networks see, and where the fine one looked.
+#[derive(Debug)]
+pub(crate) struct Seen {
+    pub(crate) coarse: Composite,
+    pub(crate) fine: Composite,
+    pub(crate) t: Tensor,
+}
+
+/// Purposes of draws.
+const STRATIFIED: u64 = 201;
+const IMPORTANCE: u64 = 202;
+const NOISE: u64 = 203;
+
+impl SampleDraws {
+    /// Those of the rays `first..first + n` of a training.
+    pub(crate) fn new(field: &Mlp, seed: u64, first: u64, n: usize, noise: f64) -> Result<Self, TchError> {
+        let (coarse, fine) = (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
+        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut Draws) -> f32| {
+            let row = |ray: u64| {
+                let mut draws = Draws::new(seed, purpose, ray);
+                (0..width).map(|_| draw(&mut draws)).collect::<Vec<_>>()
+            };
+            let values: Vec<f32> = (first..first + n as u64).flat_map(row).collect();
+            Tensor::f_from_slice(&values)?.f_reshape([n as i64, width as i64])?.f_to_device(field.device)
+        };
+        let scaled = |draws: &mut Draws| (noise * normal(draws)) as f32;
+        let noise = if noise > 0.0 {
+            let all = rows(NOISE, 2 * coarse + fine, &scaled)?;
+            Some([all.f_narrow(1, 0, coarse as i64)?, all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?])
+        } else {
+            None
+        };
+        Ok(Self { coarse: rows(STRATIFIED, coarse, &Draws::uniform)?, fine: rows(IMPORTANCE, fine, &Draws::uniform)?, noise })
+    }
+}
+
+impl Batch {
+    pub(crate) fn new(rays: &[Ray], device: Device) -> Result<Self, TchError> {
+        let rows = |of: &dyn Fn(&Ray) -> [f32; 3]| {
+            let values: Vec<f32> = rays.iter().flat_map(of).collect();
+            Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, 3])?.f_to_device(device)
+        };
+        Ok(Self { origin: rows(&|r| r.origin)?, direction: rows(&|r| r.direction)?, background: rows(&|r| r.background)? })
+    }
+}
+
+impl Mlp {
+    /// A field before training, drawn from a seed.
+    pub fn new(architecture: MlpArchitecture, bounds: Bounds, seed: u64, device: Device) -> Result<Self, TorchFieldError> {
+        let network = |index| Network::new(architecture, seed, index, device);
+        Ok(Self { architecture, bounds, coarse: network(0)?, fine: network(1)?, device })
+    }
+
+    /// Reads what [`Mlp::write`] wrote, or `scripts/convert-checkpoint.py` made of the reference's files.
+    pub fn read(path: &Path, architecture: MlpArchitecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
+        architecture.check().map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
+        let weights = nets::Weights::read(path)?;
+        let network = |prefix: &str| -> Result<Network, TorchFieldError> {
+            let read = Network::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
+            let finite = |t: &Tensor| -> Result<bool, TchError> { Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0) };
+            for (parameter, (name, _)) in read.parameters.iter().zip(Network::names(&architecture)) {
+                if !finite(parameter)? {
+                    let reason = format!("tensor {prefix}.{name} is not finite");
+                    return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
+                }
+            }
+            Ok(read.to(device, Kind::Float)?)
+        };
+        Ok(Self { architecture, bounds, coarse: network("coarse")?, fine: network("fine")?, device })
+    }
+
+    /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the reference's names of layers.
+    pub fn write(&self, path: &Path) -> Result<(), TorchFieldError> {
+        nets::write(path, &self.named())?;
+        Ok(())
+    }
+
+    /// All parameters by name.
+    pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
+        let names = || Network::names(&self.architecture).map(|(name, _)| name);
+        let named = |prefix: &'static str, network: &Network| {
+            names().zip(network.share().parameters).map(move |(name, t)| (format!("{prefix}.{name}"), t)).collect::<Vec<_>>()
+        };
+        named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
+    }
+
+    /// Handles on the parameters of both networks, in the order of [`Mlp::named`].
+    pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
+        self.coarse.parameters.iter().chain(&self.fine.parameters).map(Tensor::shallow_clone)
+    }
+
+    /// Another handle on the same networks, for another thread.
+    pub(crate) fn share(&self) -> Self {
+        let Self { architecture, bounds, device, .. } = *self;
+        Self { architecture, bounds, coarse: self.coarse.share(), fine: self.fine.share(), device }
+    }
+
+    /// What rays see; `noise` and places of samples by `draws`.
+    pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
+        let n = batch.origin.size()[0];
+        let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
+        let (near, far) = (like(self.bounds.near)?, like(self.bounds.far)?);
+        let count = i64::from(self.architecture.coarse_samples);
+        let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
+        let noise = |i: usize| draws.and_then(|d| d.noise.as_ref()).map(|n| &n[i]);
+
+        let t = stratified(&near, &far, count, draws.map(|d| &d.coarse))?;
+        let coarse = self.look(&self.coarse, batch, &direction, &t, noise(0))?;
+        let fine_count = i64::from(self.architecture.fine_samples);
+        let shares = match draws {
+            Some(draws) => draws.fine.shallow_clone(),
+            None => {
+                Tensor::f_linspace(0, 1, fine_count, (t.kind(), self.device))?.f_expand([n, fine_count], false)?.f_contiguous()?
+            }
+        };
+        let inner = coarse.weights.f_detach()?.f_narrow(1, 1, count - 2)?;
+        let finer = importance(&middles(&t)?, &inner, &shares)?;
+        let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
+        let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
+        Ok(Seen { coarse, fine, t })
+    }
+
+    /// What one network sees at distances t.
+    fn look(
+        &self,
+        network: &Network,
+        batch: &Batch,
+        direction: &Tensor,
+        t: &Tensor,
+        noise: Option<&Tensor>,
+    ) -> Result<Composite, TchError> {
+        let (n, m) = (t.size()[0], t.size()[1]);
+        let along = t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?;
+        let positions = along.f_add(&batch.origin.f_unsqueeze(1)?)?.f_reshape([n * m, 3])?;
+        let code = encode(&positions, self.architecture.position_octaves)?;
+        let width = direction.size()[1];
+        let directions = direction.f_unsqueeze(1)?.f_expand([n, m, width], false)?.f_reshape([n * m, width])?;
+        let (colour, raw) = network.forward(&code, &directions)?;
+        let mut raw = raw.f_reshape([n, m])?;
+        if let Some(noise) = noise {
+            raw = raw.f_add(noise)?;
+        }
+        composite(t, &colour.f_reshape([n, m, 3])?, &raw, &batch.background)
+    }
+
+    /// Colour, opacity and depth of each ray. On the CPU in parallel, with results that don't depend on the number of threads; on
+    /// a GPU in pieces as large as its memory allows.
+    pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
+        const CPU_RAYS: usize = 32;
+        if self.device == Device::Cpu {
+            let pieces: Vec<(Self, &[Ray])> = rays.chunks(CPU_RAYS).map(|rays| (self.share(), rays)).collect();
+            let rendered: Result<Vec<_>, TchError> = pieces.into_par_iter().map(|(field, rays)| field.pixels(rays)).collect();
+            return Ok(rendered?.concat());
+        }
+        let mut pixels = Vec::with_capacity(rays.len());
+        let mut piece = 1 << 14;
+        while pixels.len() < rays.len() {
+            let end = (pixels.len() + piece).min(rays.len());
+            match self.pixels(&rays[pixels.len()..end]) {
+                Ok(more) => pixels.extend(more),
+                Err(error) if piece > CPU_RAYS && nets::is_out_of_memory(&error) => piece /= 2,
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(pixels)
+    }
+
+    fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
+        let usable = |r: &Ray| r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3];
+        let tame: Vec<Ray> =
+            rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
+        let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
+            let seen = self.see(&Batch::new(&tame, self.device)?, None)?;
+            Ok([host(&seen.fine.colour)?, host(&seen.fine.premultiplied)?, host(&seen.fine.weights)?, host(&seen.t)?])
+        })?;
+        let samples = weights.len() / rays.len().max(1);
+        let far = self.bounds.far as f32;
+        let pixel = |(i, ray): (usize, &Ray)| {
+            if !usable(ray) {
+                return Pixel { colour: ray.background, depth: far, median_depth: far, ..Pixel::default() };
+            }
+            let three = |of: &[f32]| std::array::from_fn(|c| of[3 * i + c]);
+            let (weights, t) = (&weights[i * samples..][..samples], &t[i * samples..][..samples]);
+            let opacity: f32 = weights.iter().sum();
+            let distance: f32 = weights.iter().zip(t).map(|(w, t)| w * t).sum();
+            let mut light = 1.0;
+            let median = weights.iter().zip(t).find(|(w, _)| {
+                light -= *w;
+                light <= 0.5
+            });
+            Pixel {
+                colour: three(&colour),
+                premultiplied: three(&premultiplied),
+                opacity: opacity.clamp(0.0, 1.0),
+                depth: if opacity > 1e-4 { distance / opacity } else { far },
+                median_depth: median.map_or(far, |(_, &t)| t),
+            }
+        };
+        Ok(rays.iter().enumerate().map(pixel).collect())
+    }
+}
+
+impl RayField for Mlp {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
+        Ok(Self::render(self, rays)?)
+    }
+}
+
+/// A tensor's numbers in f32.
+pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
+    let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_contiguous()?.f_view([-1])?;
+    Vec::<f32>::try_from(flat)
+}

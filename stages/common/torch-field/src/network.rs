@@ -1,0 +1,112 @@
+use radiance::{Draws, MlpArchitecture};
+use tch::{Device, Kind, TchError, Tensor};
+
+use crate::TorchFieldError;
+use crate::encoding::encoded;
+
+/// One of the two networks: position → density and a feature, that and direction → colour. Parameters are weight and bias of
+/// each layer, in the order of [`Network::layers`].
+#[derive(Debug)]
+pub(crate) struct Network {
+    architecture: MlpArchitecture,
+    pub(crate) parameters: Vec<Tensor>,
+}
+
+/// A linear layer: its name in the reference's checkpoints, inputs, outputs.
+type Layer = (String, i64, i64);
+
+/// The encoded position joins in again at this layer, counted from 0.
+const SKIP: u32 = 4;
+
+impl Network {
+    /// Layers from front to back.
+    pub(crate) fn layers(architecture: &MlpArchitecture) -> Vec<Layer> {
+        let width = i64::from(architecture.width);
+        let position = encoded(3, architecture.position_octaves);
+        let direction = encoded(3, architecture.direction_octaves);
+        let trunk = (0..architecture.depth).map(|i| {
+            let inputs = match i {
+                0 => position,
+                SKIP => position + width,
+                _ => width,
+            };
+            (format!("xyz_encoding_{}.0", i + 1), inputs, width)
+        });
+        let heads = [
+            ("sigma", width, 1),
+            ("xyz_encoding_final", width, width),
+            ("dir_encoding.0", width + direction, width / 2),
+            ("rgb.0", width / 2, 3),
+        ];
+        trunk.chain(heads.map(|(name, inputs, outputs)| (name.to_owned(), inputs, outputs))).collect()
+    }
+
+    /// Names of the parameters.
+    pub(crate) fn names(architecture: &MlpArchitecture) -> impl Iterator<Item = (String, Vec<i64>)> {
+        let both = |(name, inputs, outputs): Layer| {
+            [(format!("{name}.weight"), vec![outputs, inputs]), (format!("{name}.bias"), vec![outputs])]
+        };
+        Self::layers(architecture).into_iter().flat_map(both)
+    }
+
+    /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells the networks of a seed apart.
+    pub(crate) fn new(architecture: MlpArchitecture, seed: u64, index: u64, device: Device) -> Result<Self, TchError> {
+        let mut draws = Draws::new(seed, WEIGHTS, index);
+        let mut parameters = Vec::new();
+        for (_, inputs, outputs) in Self::layers(&architecture) {
+            let deviation = (2.0 / inputs as f64).sqrt();
+            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut draws)) as f32).collect();
+            parameters.push(Tensor::f_from_slice(&values)?.f_reshape([outputs, inputs])?);
+            parameters.push(Tensor::f_zeros([outputs], (Kind::Float, Device::Cpu))?);
+        }
+        Self { architecture, parameters }.to(device, Kind::Float)
+    }
+
+    /// From parameters by name, each with its shape.
+    pub(crate) fn read(
+        architecture: MlpArchitecture,
+        mut tensor: impl FnMut(&str, &[i64]) -> Result<Tensor, TorchFieldError>,
+    ) -> Result<Self, TorchFieldError> {
+        let parameters = Self::names(&architecture).map(|(name, shape)| tensor(&name, &shape)).collect::<Result<_, _>>()?;
+        Ok(Self { architecture, parameters })
+    }
+
+    /// The same network elsewhere or in another precision; its parameters take gradients.
+    pub(crate) fn to(&self, device: Device, kind: Kind) -> Result<Self, TchError> {
+        let moved = |t: &Tensor| -> Result<Tensor, TchError> {
+            Ok(t.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
+        };
+        Ok(Self { architecture: self.architecture, parameters: self.parameters.iter().map(moved).collect::<Result<_, _>>()? })
+    }
+
+    /// Another handle on the same parameters, for another thread.
+    pub(crate) fn share(&self) -> Self {
+        Self { architecture: self.architecture, parameters: self.parameters.iter().map(Tensor::shallow_clone).collect() }
+    }
+
+    /// Colour (n × 3, in 0..1) and raw density (n) of encoded positions and directions.
+    pub(crate) fn forward(&self, position: &Tensor, direction: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+        let depth = self.architecture.depth as usize;
+        let linear = |x: &Tensor, i: usize| x.f_linear(&self.parameters[2 * i], Some(&self.parameters[2 * i + 1]));
+        let mut x = position.shallow_clone();
+        for i in 0..depth {
+            if i == SKIP as usize {
+                x = Tensor::f_cat(&[position, &x], -1)?;
+            }
+            x = linear(&x, i)?.f_relu()?;
+        }
+        let density = linear(&x, depth)?.f_squeeze_dim(-1)?;
+        let feature = linear(&x, depth + 1)?;
+        let shaded = linear(&Tensor::f_cat(&[&feature, direction], -1)?, depth + 2)?.f_relu()?;
+        Ok((linear(&shaded, depth + 3)?.f_sigmoid()?, density))
+    }
+}
+
+/// Purposes of draws.
+const WEIGHTS: u64 = 200;
+
+/// A standard normal draw (Box and Muller 1958).
+pub(crate) fn normal(draws: &mut Draws) -> f64 {
+    let radius = (-2.0 * (1.0 - f64::from(draws.uniform())).ln()).sqrt();
+    radius * (std::f64::consts::TAU * f64::from(draws.uniform())).cos()
+}

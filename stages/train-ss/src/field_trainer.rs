@@ -1,0 +1,151 @@
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::Failure;
+use radiance::{Field, FieldModel, StepReport, Trainer, TrainingError};
+use scene::Bounds;
+
+use crate::{Params, Supersampling};
+
+/// Whatever is trained: a step at a time, with checkpoints.
+pub(crate) trait FieldTrainer {
+    /// Takes a step; `None` once all rays are spent.
+    fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>>;
+    /// Steps taken.
+    fn steps(&self) -> u64;
+    /// Rays cast so far.
+    fn rays_done(&self) -> u64;
+    /// The step that a checkpoint was written at, where it is whole.
+    fn checkpoint_step(&self, path: &Path) -> Option<u64>;
+    /// Writes all that a resumed training needs.
+    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
+    /// Goes on from a checkpoint; whether it could.
+    fn resume(&mut self, path: &Path) -> bool;
+    /// Ends the training and writes the field's weights.
+    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;
+}
+
+/// A training that can't learn any more; another seed may do.
+#[derive(Debug)]
+pub(crate) struct Collapsed(pub(crate) String);
+
+impl std::fmt::Display for Collapsed {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for Collapsed {}
+
+/// A training that hasn't begun. `hull` are 128³ cells that alone may hold something; `epoch` counts the rays of all pixels.
+pub(crate) fn start(
+    params: &Params,
+    model: FieldModel,
+    bounds: Bounds,
+    device: &str,
+    hull: Option<Vec<u8>>,
+    epoch: u64,
+) -> anyhow::Result<Box<dyn FieldTrainer>> {
+    let rays = params.rays(epoch);
+    match model {
+        FieldModel::Grid(architecture) => {
+            if device != "cpu" {
+                let message = format!("--device {device}: the grid is trained on the CPU; leave --device away");
+                return Err(Failure::Usage(message).into());
+            }
+            let mut trainer = Trainer::new(Field::new(architecture, bounds, params.seed), params.grid_training(rays));
+            if let Some(hull) = hull {
+                trainer.limit_to_hull(&hull);
+            }
+            Ok(Box::new(trainer))
+        }
+        #[cfg(feature = "torch")]
+        FieldModel::Mlp(architecture) => {
+            if hull.is_some() {
+                let message = "parameter field: mlp can't make use of a visual hull; choose prep.hull none";
+                return Err(Failure::Usage(message.to_owned()).into());
+            }
+            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+            nets::deterministic();
+            let field = torch_field::Mlp::new(architecture, bounds, params.seed, device)?;
+            Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(rays, epoch))?))
+        }
+        #[cfg(not(feature = "torch"))]
+        FieldModel::Mlp(_) => {
+            let message = "parameter field: mlp needs libtorch, and train-ss was built without it; build with --features torch";
+            Err(Failure::Usage(message.to_owned()).into())
+        }
+    }
+}
+
+impl FieldTrainer for Trainer {
+    fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
+        Self::step(self, supervision).map_err(|e| match e {
+            TrainingError::NotFinite { .. } => Failure::Numerical(e.to_string()).into(),
+        })
+    }
+
+    fn steps(&self) -> u64 {
+        Self::steps(self)
+    }
+
+    fn rays_done(&self) -> u64 {
+        Self::rays_done(self)
+    }
+
+    fn checkpoint_step(&self, path: &Path) -> Option<u64> {
+        Self::checkpoint_step(path).ok()
+    }
+
+    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
+        Ok(Self::write_checkpoint(self, path)?)
+    }
+
+    fn resume(&mut self, path: &Path) -> bool {
+        Self::resume(self, path).is_ok()
+    }
+
+    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
+        let steps = Self::steps(&self);
+        let field = Self::finish(*self);
+        if !field.is_finite() {
+            return Err(Failure::Numerical(format!("step {steps}: a parameter is not finite; lower the rate")).into());
+        }
+        field.write(weights).context("cannot write the field")
+    }
+}
+
+#[cfg(feature = "torch")]
+impl FieldTrainer for torch_field::MlpTrainer {
+    fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
+        Self::step(self, supervision).map_err(|e| match e {
+            torch_field::TorchFieldError::NotFinite { .. } => Failure::Numerical(e.to_string()).into(),
+            torch_field::TorchFieldError::Collapsed { .. } => Collapsed(e.to_string()).into(),
+            _ => e.into(),
+        })
+    }
+
+    fn steps(&self) -> u64 {
+        Self::steps(self)
+    }
+
+    fn rays_done(&self) -> u64 {
+        Self::rays_done(self)
+    }
+
+    fn checkpoint_step(&self, path: &Path) -> Option<u64> {
+        Self::checkpoint_step(path).ok()
+    }
+
+    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
+        Ok(Self::write_checkpoint(self, path)?)
+    }
+
+    fn resume(&mut self, path: &Path) -> bool {
+        Self::resume(self, path).is_ok()
+    }
+
+    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
+        self.field().write(weights).context("cannot write the field")
+    }
+}

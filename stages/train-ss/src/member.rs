@@ -1,0 +1,116 @@
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, GivenInput, Progress};
+use radiance::{FieldFile, FieldModel};
+use scene::Views;
+
+use crate::checkpoint::Checkpoints;
+use crate::field_trainer::{Collapsed, start};
+use crate::{Params, TrainingLog, epoch, read_hull, read_pictures, supervision};
+
+/// A field that is trained alone, with its checkpoints in a folder of its own.
+pub(crate) struct Member<'a> {
+    context: &'a Context,
+    params: Params,
+    model: FieldModel,
+    /// Where its weights go.
+    output: PathBuf,
+    work: Option<PathBuf>,
+    /// Rays of the members before it.
+    before: u64,
+}
+
+/// In a member's folder: its weights once it is trained, and its log, which is written last.
+const DONE_WEIGHTS: &str = "field.safetensors";
+const DONE_LOG: &str = "training.json";
+
+impl<'a> Member<'a> {
+    pub(crate) fn new(context: &'a Context, params: Params, model: FieldModel, index: u32, before: u64) -> anyhow::Result<Self> {
+        let output = context.output_path(&FieldFile::member(index))?;
+        let work = context.work().map(|w| w.join(format!("member-{index}")));
+        Ok(Self { context, params, model, output, work, before })
+    }
+
+    /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
+    pub(crate) fn run(&self, input: &GivenInput, views: &Views, progress: &Progress) -> anyhow::Result<TrainingLog> {
+        if let Some(log) = self.finished() {
+            return Ok(log);
+        }
+        let mut said = String::new();
+        for restart in 0..=self.params.restarts {
+            let params = Params { seed: self.params.seed.wrapping_add(u64::from(restart)), ..self.params.clone() };
+            if restart > 0 {
+                self.context.say(format!("{said}: starting over with seed {}", params.seed));
+            }
+            // A folder each, so that a checkpoint goes on with the seed it began with.
+            let work = self.work.as_ref().map(|w| if restart == 0 { w.clone() } else { w.join(format!("restart-{restart}")) });
+            match self.train(&params, work.as_deref(), input, views, progress) {
+                Err(error) => match error.downcast_ref() {
+                    Some(Collapsed(message)) => said.clone_from(message),
+                    None => return Err(error),
+                },
+                done => return done,
+            }
+        }
+        Err(Failure::Numerical(format!("{said}, or let it start over: parameter restarts")).into())
+    }
+
+    /// What an earlier run finished, if anything: its weights go to the output.
+    fn finished(&self) -> Option<TrainingLog> {
+        let work = self.work.as_ref()?;
+        let log = serde_json::from_slice(&std::fs::read(work.join(DONE_LOG)).ok()?).ok()?;
+        std::fs::copy(work.join(DONE_WEIGHTS), &self.output).ok()?;
+        Some(log)
+    }
+
+    /// Trains to the end, with checkpoints, progress and a curve.
+    fn train(
+        &self,
+        params: &Params,
+        work: Option<&Path>,
+        input: &GivenInput,
+        views: &Views,
+        progress: &Progress,
+    ) -> anyhow::Result<TrainingLog> {
+        let context = self.context;
+        let mut supervision = supervision(input, params, views, read_pictures(input, views)?)?;
+        let epoch = epoch(views, params);
+        let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
+        if total < group as u64 {
+            let message = format!("parameter rays: {total} for a field is less than the {group} of one pixel");
+            return Err(Failure::Usage(message).into());
+        }
+        let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
+        let mut trainer = start(params, self.model, views.bounds, &context.device, hull, epoch)?;
+        if let Some(work) = work {
+            std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
+        }
+        let mut checkpoints = Checkpoints::new(work);
+        let mut curve = checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
+        loop {
+            if context.interrupted() {
+                checkpoints.write(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+                return Err(Failure::Interrupted.into());
+            }
+            let Some(report) = trainer.step(&mut supervision)? else { break };
+            if report.skipped {
+                context.say(format!(
+                    "step {}: something wasn't finite; the step was thrown away and the rate halved",
+                    trainer.steps()
+                ));
+            }
+            let rays = trainer.rays_done();
+            curve.add(&report, rays, total);
+            progress.set(self.before + rays, &curve.note());
+            checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+        }
+        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        trainer.finish(&self.output)?;
+        if let Some(work) = &self.work {
+            std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;
+            artifact::write_json(&work.join(DONE_LOG), &log)?;
+        }
+        Ok(log)
+    }
+}

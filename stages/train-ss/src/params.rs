@@ -1,0 +1,319 @@
+use radiance::{Architecture, MlpArchitecture, TrainingOptions};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::{Order, Supervision};
+
+/// Parameters of `train-ss`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Which field: ours, or the paper's own (hours on a CPU; with the published settings unless told otherwise).
+    pub field: FieldKind,
+    /// Sub-rays along each side of an LR pixel, the paper's s; 1 is plain NeRF. It needn't be the scale at which views will be
+    /// rendered: few sub-rays leave more of the budget for other pixels. For `kernel`, the HR pixels along each side; where that
+    /// isn't whole, sub-rays are cast for the next whole number.
+    #[schemars(range(min = 1.0, max = 16.0))]
+    pub supersample: f64,
+    /// Share of the rays during which fewer sub-rays are cast: one, then two a side and so on, doubling up to `supersample`. Coarse
+    /// pixels teach the rough shape from more views in the same time. Without it: 0.3 for `grid`, 0 for `mlp`.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub coarse: Option<f64>,
+    /// What an LR pixel is compared with. Without it: for `grid`, `kernel` where the scene says what made it and has a background;
+    /// else `average`.
+    pub supervision: Option<Supervision>,
+    /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
+    pub jitter: bool,
+    /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.
+    pub order: Option<Order>,
+    /// Steps at the start that draw from the middle half of each picture's width and height alone, where something is to be seen.
+    /// Without it: 0 for `grid`, 1000 for `mlp`.
+    #[schemars(range(min = 0))]
+    pub crop_steps: Option<u32>,
+    /// How many fields to train apart, each with its share of the rays: what they render is averaged, and so is what each of them
+    /// makes up where the pictures leave it open. Member m is what `seed` + m gives alone.
+    #[schemars(range(min = 1, max = 16))]
+    pub members: u32,
+    /// Rays to train with, sub-rays counted each, over all members. Without it: 30 million for `grid`; for `mlp` as many as 20 epochs
+    /// have.
+    #[schemars(range(min = 1))]
+    pub rays: Option<u64>,
+    /// Most rays in a step.
+    #[schemars(range(min = 1, max = 1_048_576))]
+    pub batch: u32,
+    /// `grid`: samples a step aims at while space is full of fog and rays are expensive.
+    #[schemars(range(min = 1024, max = 16_777_216))]
+    pub samples: u32,
+    /// Highest learning rate; of the grid's coarsest level. Without it: 0.04 for `grid`, 0.0005 for `mlp`.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub rate: Option<f64>,
+    /// `grid`: learning rate of a level over that of the next coarser one: below 1 what is coarse explains the pictures first.
+    #[schemars(range(min = 0.01, max = 2.0))]
+    pub level_rate: f64,
+    /// `grid`: highest learning rate of the networks.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub network_rate: f64,
+    /// Learning rates at the end, as a share of the highest. Without it: 0.25 for `grid`, 0.01 for `mlp`.
+    #[schemars(range(min = 1e-6, max = 1.0))]
+    pub final_rate: Option<f64>,
+    /// `mlp`: how the learning rate falls. (`grid`'s falls exponentially.)
+    pub schedule: RateSchedule,
+    /// `grid`: share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
+    #[schemars(range(min = 0.0, max = 0.999))]
+    pub averaging: f64,
+    /// `grid`: weight decay of the grid.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub grid_decay: f64,
+    /// `grid`: weight decay of the networks.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub network_decay: f64,
+    /// `grid`: levels of the grid.
+    #[schemars(range(min = 1, max = 16))]
+    pub levels: u32,
+    /// `grid`: cells along an axis of the coarsest level.
+    #[schemars(range(min = 2, max = 512))]
+    pub coarsest: u32,
+    /// `grid`: cells along an axis of the finest level. Without it: 2.56 for every LR pixel across, at least `coarsest`.
+    #[schemars(range(min = 2, max = 4096))]
+    pub finest: Option<u32>,
+    /// `grid`: base-2 logarithm of the most entries in a level. Without it: 17 for 256 cells along the finest level's axis, and two more
+    /// for every doubling of those, since surfaces grow with the square.
+    #[schemars(range(min = 8, max = 22))]
+    pub log2_entries: Option<u32>,
+    /// Width of the networks' hidden layers. Without it: 64 for `grid`, 256 for `mlp`.
+    #[schemars(range(min = 2, max = 1024))]
+    pub hidden: Option<u32>,
+    /// `grid`: samples along the diagonal of the scene's cube.
+    #[schemars(range(min = 16, max = 8192))]
+    pub steps: u32,
+    /// `mlp`: octaves of the positions' encoding.
+    #[schemars(range(min = 0, max = 16))]
+    pub position_octaves: u32,
+    /// `mlp`: octaves of the directions' encoding.
+    #[schemars(range(min = 0, max = 16))]
+    pub direction_octaves: u32,
+    /// `mlp`: layers before density and colour part.
+    #[schemars(range(min = 1, max = 32))]
+    pub depth: u32,
+    /// `mlp`: samples of the coarse network along a ray.
+    #[schemars(range(min = 4, max = 4096))]
+    pub coarse_samples: u32,
+    /// `mlp`: samples that the fine network has besides those.
+    #[schemars(range(min = 1, max = 4096))]
+    pub fine_samples: u32,
+    /// `mlp`: standard deviation of the noise on raw densities; the reference has 1 for photographs.
+    #[schemars(range(min = 0.0, max = 100.0))]
+    pub noise: f64,
+    /// `mlp`: how often a network that has collapsed to the background may start over, with the next seed.
+    #[schemars(range(min = 0, max = 100))]
+    pub restarts: u32,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        let (grid, mlp) = (Architecture::default(), MlpArchitecture::default());
+        Self {
+            field: FieldKind::Grid,
+            supersample: 2.0,
+            coarse: None,
+            supervision: None,
+            jitter: false,
+            order: None,
+            crop_steps: None,
+            members: 1,
+            rays: None,
+            batch: 2_048,
+            samples: 32_768,
+            rate: None,
+            level_rate: 0.8,
+            network_rate: 1e-2,
+            final_rate: None,
+            schedule: RateSchedule::Code,
+            averaging: 0.97,
+            grid_decay: 0.0,
+            network_decay: 1e-6,
+            levels: grid.levels,
+            coarsest: grid.coarsest,
+            finest: None,
+            log2_entries: None,
+            hidden: None,
+            steps: grid.steps,
+            position_octaves: mlp.position_octaves,
+            direction_octaves: mlp.direction_octaves,
+            depth: mlp.depth,
+            coarse_samples: mlp.coarse_samples,
+            fine_samples: mlp.fine_samples,
+            noise: 0.0,
+            restarts: 0,
+            seed: 0,
+        }
+    }
+}
+
+/// The kinds of field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum FieldKind {
+    /// Multi-resolution grid with small MLPs.
+    Grid,
+    /// The paper's own two MLPs, through libtorch.
+    Mlp,
+}
+
+/// How the paper's learning rate falls.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum RateSchedule {
+    /// As the reference's code does it: by epochs, flat until the last ten.
+    Code,
+    /// As the paper's text has it: exponentially throughout.
+    Paper,
+}
+
+/// Epochs of the published Blender trainings.
+const EPOCHS: u64 = 20;
+
+impl Params {
+    /// Fails on parameters that can't be meant together.
+    pub fn check(&self) -> Result<(), String> {
+        if let Some(finest) = self.finest.filter(|f| *f < self.coarsest) {
+            return Err(format!("parameter coarsest: {} is above finest = {finest}", self.coarsest));
+        }
+        if self.field == FieldKind::Grid && self.hidden.is_some_and(|h| !(16..=128).contains(&h)) {
+            return Err("parameter hidden: the grid's networks are 16 to 128 wide".to_owned());
+        }
+        // What belongs to the other field would be silently without effect.
+        let default = Self::default();
+        let foreign: &[(&str, bool)] = match self.field {
+            FieldKind::Grid => &[
+                ("schedule", self.schedule != default.schedule),
+                ("position_octaves", self.position_octaves != default.position_octaves),
+                ("direction_octaves", self.direction_octaves != default.direction_octaves),
+                ("depth", self.depth != default.depth),
+                ("coarse_samples", self.coarse_samples != default.coarse_samples),
+                ("fine_samples", self.fine_samples != default.fine_samples),
+                ("noise", self.noise != default.noise),
+                ("restarts", self.restarts != default.restarts),
+            ],
+            FieldKind::Mlp => &[
+                ("samples", self.samples != default.samples),
+                ("level_rate", self.level_rate != default.level_rate),
+                ("network_rate", self.network_rate != default.network_rate),
+                ("averaging", self.averaging != default.averaging),
+                ("grid_decay", self.grid_decay != default.grid_decay),
+                ("network_decay", self.network_decay != default.network_decay),
+                ("levels", self.levels != default.levels),
+                ("coarsest", self.coarsest != default.coarsest),
+                ("finest", self.finest != default.finest),
+                ("log2_entries", self.log2_entries != default.log2_entries),
+                ("steps", self.steps != default.steps),
+            ],
+        };
+        match foreign.iter().find(|(_, given)| *given) {
+            Some((name, _)) => {
+                Err(format!("parameter {name}: it belongs to the other field; leave it out, or choose that field"))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// What is said for a field, or that field's own default.
+    fn or<T>(&self, given: Option<T>, grid: T, mlp: T) -> T {
+        given.unwrap_or(match self.field {
+            FieldKind::Grid => grid,
+            FieldKind::Mlp => mlp,
+        })
+    }
+
+    /// Share of the rays with fewer sub-rays.
+    pub fn coarse(&self) -> f64 {
+        self.or(self.coarse, 0.3, 0.0)
+    }
+
+    /// Order of the pixels.
+    pub fn order(&self) -> Order {
+        self.or(self.order, Order::Random, Order::Epochs)
+    }
+
+    /// Groups of rays that are drawn from the middle of the pictures, at `group` rays each.
+    pub fn crop_groups(&self, group: u64) -> u64 {
+        u64::from(self.or(self.crop_steps, 0, 1000)) * (u64::from(self.batch) / group).max(1)
+    }
+
+    /// Rays over all members, where an epoch has so many.
+    pub fn rays(&self, epoch: u64) -> u64 {
+        self.or(self.rays, 30_000_000, EPOCHS * epoch)
+    }
+
+    /// What grid they ask for, with LR images of a width.
+    pub fn grid(&self, lr_width: u32) -> Architecture {
+        let by_width = (2.56 * f64::from(lr_width)).round().clamp(64.0, 2048.0) as u32;
+        let finest = self.finest.unwrap_or(by_width.max(self.coarsest));
+        let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
+        Architecture {
+            levels: self.levels,
+            coarsest: self.coarsest,
+            finest,
+            log2_entries: self.log2_entries.unwrap_or(by_finest),
+            hidden: self.or(self.hidden, Architecture::default().hidden, 256),
+            steps: self.steps,
+        }
+    }
+
+    /// What paper's field they ask for.
+    pub fn mlp(&self) -> MlpArchitecture {
+        MlpArchitecture {
+            position_octaves: self.position_octaves,
+            direction_octaves: self.direction_octaves,
+            depth: self.depth,
+            width: self.or(self.hidden, 64, MlpArchitecture::default().width),
+            coarse_samples: self.coarse_samples,
+            fine_samples: self.fine_samples,
+        }
+    }
+
+    /// How they ask for a grid to be trained, with so many rays.
+    pub fn grid_training(&self, rays: u64) -> TrainingOptions {
+        TrainingOptions {
+            rays,
+            batch: self.batch as usize,
+            samples: self.samples as usize,
+            rate: self.or(self.rate, 4e-2, 5e-4),
+            level_rate: self.level_rate,
+            network_rate: self.network_rate,
+            final_rate: self.or(self.final_rate, 0.25, 0.01),
+            warm_up: 100,
+            averaging: self.averaging as f32,
+            grid_decay: self.grid_decay as f32,
+            network_decay: self.network_decay as f32,
+            seed: self.seed,
+        }
+    }
+
+    /// How they ask for the paper's field to be trained, with so many rays, where an epoch has so many.
+    #[cfg(feature = "torch")]
+    pub fn mlp_training(&self, rays: u64, epoch: u64) -> torch_field::MlpTraining {
+        let epochs = rays.div_ceil(epoch.max(1));
+        torch_field::MlpTraining {
+            rays,
+            batch: self.batch as usize,
+            rate: self.or(self.rate, 4e-2, 5e-4),
+            final_rate: self.or(self.final_rate, 0.25, 0.01),
+            schedule: match self.schedule {
+                RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
+                RateSchedule::Paper => torch_field::Schedule::Exponential,
+            },
+            noise: self.noise,
+            seed: self.seed,
+        }
+    }
+
+    /// Parameters by which a member is trained as if it were alone, with its share of the rays.
+    pub fn member(&self, index: u32, rays: u64) -> Self {
+        let members = u64::from(self.members.max(1));
+        let own = rays / members + u64::from(u64::from(index) < rays % members);
+        Self { members: 1, rays: Some(own), seed: self.seed.wrapping_add(u64::from(index)), ..self.clone() }
+    }
+}
