@@ -81,7 +81,7 @@ pub enum WeightsError {
     },
 }
 
-/// The tensors of a safetensors file, in f32 or i64 on the CPU.
+/// The tensors of a safetensors file, in f32, i64 or u8 on the CPU.
 #[derive(Debug)]
 pub struct Weights {
     path: PathBuf,
@@ -89,7 +89,7 @@ pub struct Weights {
 }
 
 impl Weights {
-    /// Reads a file of f32, f16 or i64 tensors.
+    /// Reads a file of f32, f16, i64 or u8 tensors.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
         let format = |reason: String| WeightsError::Format { path: path.to_path_buf(), reason };
         let bytes = std::fs::read(path).map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
@@ -101,7 +101,8 @@ impl Weights {
                 Dtype::F32 => Kind::Float,
                 Dtype::F16 => Kind::Half,
                 Dtype::I64 => Kind::Int64,
-                other => return Err(format(format!("tensor {name} is {other:?}; f32, f16 or i64 is expected"))),
+                Dtype::U8 => Kind::Uint8,
+                other => return Err(format(format!("tensor {name} is {other:?}; f32, f16, i64 or u8 is expected"))),
             };
             let tensor = Tensor::from_data_size(view.data(), &shape, kind);
             tensors.insert(name, if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor });
@@ -116,6 +117,14 @@ impl Weights {
             path: self.path.clone(),
             reason: format!("no tensor {name} of {count} whole numbers"),
         })
+    }
+
+    /// Bytes, of which there must be so many.
+    pub fn bytes(&self, name: &str, count: i64) -> Result<Tensor, WeightsError> {
+        let bytes = self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
+        bytes
+            .map(Tensor::shallow_clone)
+            .ok_or_else(|| WeightsError::Format { path: self.path.clone(), reason: format!("no tensor {name} of {count} bytes") })
     }
 
     /// A tensor of floats that must have a shape.

@@ -3,7 +3,8 @@ use crate::field::{CHUNK_RAYS, Field};
 use crate::ray::{Ray, clip};
 use crate::simd::LANES;
 
-/// One worker's forward and backward pass without an optimiser: what benchmarks measure.
+/// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what another reading of the field is
+/// compared with.
 #[derive(Debug)]
 pub struct Passes {
     chunk: Chunk,
@@ -52,5 +53,12 @@ impl Passes {
             let touched = &mut self.touched[..level.blocks()];
             crate::grid::scatter(level, &mut table[level.range()], touched, &self.into.positions, gradients);
         }
+    }
+
+    /// Gradient by the networks, layer after layer, each input by input, summed over all backward passes so far.
+    pub fn network_gradient(&mut self, field: &Field) -> Vec<f32> {
+        let mut gradient = vec![0.0; field.network.len()];
+        crate::mlp::drain_lanes(&mut self.lanes, &mut gradient);
+        gradient
     }
 }

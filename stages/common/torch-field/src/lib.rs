@@ -4,6 +4,8 @@
 //!   network of eight layers, stratified and importance sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
 //! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervision`] as the fast field's.
 //!
+//! * [`TorchGrid`]: the fast field of `radiance` on the same file: its judge, and its way to CUDA.
+//!
 //! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one thread, and their gradients are added in
 //! order: bytes don't depend on the number of threads. On CUDA results hold to a tolerance.
 //!
@@ -22,6 +24,7 @@ mod composite;
 mod encoding;
 #[cfg(test)]
 mod goldens;
+mod grid;
 mod mlp;
 mod network;
 mod sampling;
@@ -30,6 +33,7 @@ mod trainer;
 
 use std::path::PathBuf;
 
+pub use grid::TorchGrid;
 pub use mlp::Mlp;
 pub use schedule::Schedule;
 pub use trainer::{MlpTrainer, MlpTraining};
