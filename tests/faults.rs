@@ -4,10 +4,10 @@
 mod common;
 
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::Duration;
 
-use common::{Finished, Project, stage, stage_command};
+use common::{Finished, Project, signal, stage, stage_command};
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
 const PARAMS: &str = r#"{"supervision": "kernel", "members": 2, "rays": 900000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
@@ -17,10 +17,6 @@ fn scene(project: &Project) -> std::path::PathBuf {
     assert_eq!(stage("demo-scene", r#"{"size": 48, "train": 8, "test": 1, "samples": 1}"#, &[], &data, &[]).code, 0);
     assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
     scene.join("train")
-}
-
-fn signal(child: &std::process::Child, name: &str) {
-    Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
 }
 
 fn manifest(folder: &Path) -> String {

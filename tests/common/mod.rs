@@ -158,6 +158,11 @@ pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output:
     command
 }
 
+/// Sends a running stage a signal: "-TERM", "-KILL".
+pub fn signal(child: &std::process::Child, name: &str) {
+    Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
+}
+
 /// The data folder with real scenes and weights; without it a test says so and ends.
 pub fn data() -> Option<PathBuf> {
     let path = std::env::var("NERF_SR_DATA")

@@ -203,6 +203,9 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         run(&scaled, rows, &format!("_first_sixth_x{scale}"))?;
     }
 
+    #[cfg(feature = "torch")]
+    mlp(rows, &input, &views)?;
+
     let truth = Views::read(&GivenInput::open("cameras", &scene.join("cameras"))?)?;
     let cameras: Vec<Camera> = truth.views.iter().take(10).map(|v| v.camera.clone()).collect();
     let own = cameras[0].intrinsics.width;
@@ -224,6 +227,32 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     render("render_rays_per_s_twice_the_size".into(), own * 2, false);
     let (speed, gflops) = (rows.value("render_rays_per_s"), rows.value("sgemm_gflops"));
     rows.add("render_rays_per_s_per_gflops", speed / gflops, "rays/GFLOP");
+    Ok(())
+}
+
+/// Some steps of the paper's field as published: 2,048 rays, 64 + 64 samples, two networks of eight 256-wide layers.
+#[cfg(feature = "torch")]
+fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
+    const STEPS: u64 = 3;
+    let params = Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
+    nets::deterministic();
+    let mut supervision = train_ss::supervision(input, &params, views, train_ss::read_pictures(input, views)?)?;
+    let architecture = params.mlp();
+    let field = torch_field::Mlp::new(architecture, views.bounds, params.seed, nets::device("cpu")?)?;
+    let weights = field.parameter_count() / 2;
+    let epoch = train_ss::epoch(views, &params);
+    let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(params.rays(epoch), epoch))?;
+    trainer.step(&mut supervision)?;
+    let (start, mut samples) = (Instant::now(), 0);
+    while let Some(report) = trainer.step(&mut supervision)? {
+        samples += report.samples;
+    }
+    let seconds = start.elapsed().as_secs_f64();
+    // A multiplication and an addition for each weight, forward once, backward twice.
+    let gflops = (samples * weights * 6) as f64 / seconds / 1e9;
+    rows.add("mlp_train_rays_per_s", (STEPS * 2048) as f64 / seconds, "rays/s");
+    rows.add("mlp_gflops", gflops, "GFLOP/s");
+    rows.add("mlp_share_of_sgemm", 100.0 * gflops / rows.value("sgemm_gflops"), "%");
     Ok(())
 }
 

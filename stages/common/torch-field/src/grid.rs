@@ -123,11 +123,6 @@ impl TorchGrid {
         Ok(Self { architecture, bounds, device, levels, table, layers, occupied })
     }
 
-    /// All parameters: the table and the five layers.
-    pub(crate) fn parameters(&self) -> Vec<Tensor> {
-        std::iter::once(&self.table).chain(&self.layers).map(Tensor::shallow_clone).collect()
-    }
-
     /// Distance between samples, in cube sides.
     fn step(&self) -> f64 {
         3f64.sqrt() / f64::from(self.architecture.steps)
@@ -319,6 +314,11 @@ mod tests {
 
     use super::*;
 
+    /// The table and the five layers.
+    fn parameters(of: &TorchGrid) -> Vec<Tensor> {
+        std::iter::once(&of.table).chain(&of.layers).map(Tensor::shallow_clone).collect()
+    }
+
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
         let ray = |i| {
             let mut draws = Draws::new(3, 1, i);
@@ -376,7 +376,7 @@ mod tests {
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
                     &[(seen.premultiplied + background).sum(Kind::Float)],
-                    &judge.parameters(),
+                    &parameters(&judge),
                     false,
                     false,
                 );

@@ -127,6 +127,11 @@ impl Mlp {
         named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
     }
 
+    /// Numbers in both networks.
+    pub fn parameter_count(&self) -> usize {
+        self.parameters().map(|p| p.numel()).sum()
+    }
+
     /// Handles on the parameters of both networks, in the order of [`Mlp::named`].
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
         self.coarse.parameters.iter().chain(&self.fine.parameters).map(Tensor::shallow_clone)

@@ -43,10 +43,11 @@ pub struct MlpTrainer {
     dark_steps: u64,
 }
 
-/// Shards of a step on the CPU, and the rays of each that go through the networks at once: fixed, so that sums have one order at any
-/// thread count, and small, so that what a ray leaves on its way stays in the cache.
-const SHARDS: usize = 16;
-const CHUNK_RAYS: usize = 16;
+/// Shards of a step on the CPU: fixed, so that sums have one order at any thread count.
+const SHARDS: usize = 8;
+/// Samples that go through the fine network at once: few, so that what they leave on their way stays in the cache, and enough to be worth
+/// a call.
+const CHUNK_SAMPLES: usize = 4096;
 /// Steps with less opacity than this, so many in a row, are a collapse: the white background alone explains the pictures, and ReLU
 /// has no gradient there.
 const DARK_OPACITY: f64 = 1e-3;
@@ -260,7 +261,8 @@ impl Plan {
         range: std::ops::Range<usize>,
         group: usize,
     ) -> Result<Option<Piece>, TchError> {
-        let chunk = (CHUNK_RAYS / group).max(1);
+        let samples = (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
+        let chunk = (CHUNK_SAMPLES / (samples * group)).max(1);
         let mut whole: Option<Piece> = None;
         for start in range.clone().step_by(chunk) {
             let piece = self.run(field, supervision, start..(start + chunk).min(range.end), group)?;

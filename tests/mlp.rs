@@ -1,0 +1,89 @@
+//! The paper's own field through the stages, small: bytes, checkpoints, collapse, errors.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use common::{Project, stage, stage_command};
+
+/// All of the published shape, in miniature; long enough to be stopped on the way.
+const PARAMS: &str = r#"{"field": "mlp", "hidden": 16, "depth": 5, "position_octaves": 4, "direction_octaves": 1, "coarse_samples": 8,
+    "fine_samples": 8, "batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1}"#;
+
+fn scene(project: &Project) -> PathBuf {
+    let (data, scene) = (project.path("data"), project.path("scene"));
+    assert_eq!(stage("demo-scene", r#"{"size": 48, "train": 6, "test": 1, "samples": 1}"#, &[], &data, &[]).code, 0);
+    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
+    scene.join("train")
+}
+
+fn manifest(folder: &Path) -> String {
+    std::fs::read_to_string(folder.join("artifact.json")).unwrap()
+}
+
+/// Equal bytes at one and two threads, and after an interruption.
+#[test]
+fn trains_to_the_same_bytes_however_it_is_run() {
+    let project = Project::tiny();
+    let train = scene(&project);
+    let inputs = [("scene", train.as_path())];
+    let [one, two, stopped, work] = ["one", "two", "stopped", "work"].map(|name| project.path(name));
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &one, &["--threads", "1"]).code, 0);
+    assert_eq!(stage("train-ss", PARAMS, &inputs, &two, &["--threads", "2"]).code, 0);
+    assert_eq!(manifest(&one), manifest(&two));
+
+    let more = ["--work", work.to_str().unwrap()];
+    let child = stage_command("train-ss", PARAMS, &inputs, &stopped, &more).stderr(Stdio::piped()).spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(1500));
+    common::signal(&child, "-TERM");
+    let code = child.wait_with_output().unwrap().status.code();
+    assert!(code == Some(130) || stopped.exists(), "{code:?}");
+    if !stopped.exists() {
+        assert!(work.join("member-0/checkpoint.safetensors").exists());
+        assert_eq!(stage("train-ss", PARAMS, &inputs, &stopped, &more).code, 0);
+    }
+    assert_eq!(manifest(&one), manifest(&stopped));
+
+    // `render-depth` doesn't know which field it has.
+    let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
+    let rendered = stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);
+    assert_eq!(rendered.code, 0, "{}", rendered.stderr);
+    assert!(views.join("images").read_dir().unwrap().count() == 1);
+}
+
+/// A rate of 1 kills a network under some seeds: the stage says so, and another seed is tried where that is allowed.
+#[test]
+fn a_collapse_is_told_and_starts_over_when_asked_to() {
+    let project = Project::tiny();
+    let train = scene(&project);
+    let run = |name: &str, seed: u64, restarts: u32| {
+        let more = format!(r#""rate": 1.0, "seed": {seed}, "restarts": {restarts}, "batch": 64"#);
+        let params = PARAMS.replace(r#""batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1"#, &more);
+        let params = params.replace(r#""rate""#, r#""rays": 20000, "crop_steps": 0, "rate""#);
+        stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
+    };
+    let codes: Vec<i32> = (0..10).map(|seed| run(&format!("alone-{seed}"), seed, 0).code).collect();
+    assert!(codes.iter().all(|c| [0, 4].contains(c)), "{codes:?}");
+    let seed = codes.iter().position(|c| *c == 4).expect("some seed collapses");
+    run("told", seed as u64, 0).fails(4, &["network has collapsed", "try another seed"]);
+    assert!(!project.path("told").exists());
+    let Some(after) = codes[seed..].iter().position(|c| *c == 0) else { return };
+    assert_eq!(run("again", seed as u64, after as u32).code, 0);
+    assert_eq!(manifest(&project.path("again")), manifest(&project.path(&format!("alone-{}", seed + after))));
+}
+
+#[test]
+fn mistakes_are_one_line() {
+    let project = Project::tiny();
+    let train = scene(&project);
+    let out = project.path("out");
+    let inputs = [("scene", train.as_path())];
+    stage("train-ss", PARAMS, &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);
+    stage("train-ss", PARAMS, &inputs, &out, &["--device", "gpu"]).fails(2, &["--device gpu", "cuda:N"]);
+    stage("train-ss", "{}", &inputs, &out, &["--device", "cuda:0"]).fails(2, &["--device cuda:0", "grid"]);
+    stage("train-ss", r#"{"field": "mlp", "levels": 4}"#, &inputs, &out, &[]).fails(2, &["parameter levels", "other field"]);
+    stage("train-ss", r#"{"noise": 1.0}"#, &inputs, &out, &[]).fails(2, &["parameter noise", "other field"]);
+}
