@@ -234,7 +234,8 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
 #[cfg(feature = "torch")]
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;
-    let params = Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
+    let params =
+        Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
     nets::deterministic();
     let mut supervision = train_ss::supervision(input, &params, views, train_ss::read_pictures(input, views)?)?;
     let architecture = params.mlp();
