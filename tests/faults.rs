@@ -80,7 +80,7 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
 #[test]
 fn a_runner_killed_or_interrupted_goes_on() {
     let project = Project::tiny();
-    project.replace("rays: 60000", "rays: 600000");
+    project.replace("rays: 60000", "rays: 1500000");
     let spawn = || project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     for (name, milliseconds) in [("-KILL", 150), ("-KILL", 900), ("-INT", 1200)] {
         let child = spawn();
@@ -90,7 +90,8 @@ fn a_runner_killed_or_interrupted_goes_on() {
         if name == "-INT" {
             assert_eq!(finished.code, 130, "{}", finished.stderr);
             assert!(finished.stderr.contains("interrupted"), "{}", finished.stderr);
-            assert!(project.ok(&["status"]).contains("has a checkpoint to go on from"));
+            let status = project.ok(&["status"]);
+            assert!(status.contains("has a checkpoint to go on from"), "{status}{}", finished.stderr);
         }
     }
     let last = project.run(&["run"]);

@@ -105,7 +105,7 @@ impl Call<'_> {
         command.args(["--device", self.device, "--threads", &self.threads.to_string(), "--progress", "json"]);
         let declared = self.program.description.environment.iter().map(String::as_str);
         let passed = ENVIRONMENT.into_iter().chain(declared).filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
-        command.env_clear().envs(passed);
+        command.env_clear().envs(passed).env(artifact::RUNNER_VARIABLE, std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end, once.
         command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped());
         command

@@ -35,6 +35,7 @@ impl<'a> Member<'a> {
     /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
     pub(crate) fn run(&self, input: &GivenInput, views: &Views, progress: &Progress) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.finished() {
+            self.context.say("going on from a field that an earlier run has trained");
             return Ok(log);
         }
         let mut said = String::new();

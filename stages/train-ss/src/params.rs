@@ -94,7 +94,7 @@ pub struct Params {
     pub direction_octaves: u32,
     /// `mlp`: layers before density and colour part.
     #[schemars(range(min = 1, max = 32))]
-    pub depth: u32,
+    pub layers: u32,
     /// `mlp`: samples of the coarse network along a ray.
     #[schemars(range(min = 4, max = 4096))]
     pub coarse_samples: u32,
@@ -142,7 +142,7 @@ impl Default for Params {
             steps: grid.steps,
             position_octaves: mlp.position_octaves,
             direction_octaves: mlp.direction_octaves,
-            depth: mlp.depth,
+            layers: mlp.depth,
             coarse_samples: mlp.coarse_samples,
             fine_samples: mlp.fine_samples,
             noise: 0.0,
@@ -191,7 +191,7 @@ impl Params {
                 ("schedule", self.schedule != default.schedule),
                 ("position_octaves", self.position_octaves != default.position_octaves),
                 ("direction_octaves", self.direction_octaves != default.direction_octaves),
-                ("depth", self.depth != default.depth),
+                ("layers", self.layers != default.layers),
                 ("coarse_samples", self.coarse_samples != default.coarse_samples),
                 ("fine_samples", self.fine_samples != default.fine_samples),
                 ("noise", self.noise != default.noise),
@@ -267,7 +267,7 @@ impl Params {
         MlpArchitecture {
             position_octaves: self.position_octaves,
             direction_octaves: self.direction_octaves,
-            depth: self.depth,
+            depth: self.layers,
             width: self.or(self.hidden, 64, MlpArchitecture::default().width),
             coarse_samples: self.coarse_samples,
             fine_samples: self.fine_samples,

@@ -53,5 +53,5 @@ pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_folder, rela
 pub use parameters::{ParameterProblem, Schema};
 pub use progress::{Event, Progress, ProgressMode, eta};
 pub use run_record::{RunInput, RunNode, RunRecord};
-pub use stage::{Context, GivenInput, SUMMARY_FILE, Stage, run_stage};
+pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, KeyLock, Record, Store, StoreError};

@@ -99,6 +99,9 @@ enum Command {
     },
 }
 
+/// Environment variable in which a runner tells its stages its process id, so that they see when it is gone.
+pub const RUNNER_VARIABLE: &str = "NERF_SR_RUNNER";
+
 /// What a running stage has at hand.
 pub struct Context {
     /// Threads to use (rayon's global pool has this size).
@@ -313,6 +316,12 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if arguments.progress == ProgressMode::Json {
         // The parent is a runner: when it is killed, end as if interrupted, with a checkpoint, rather than work on unseen.
         rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
+        // It may have been killed before that, while this process was being loaded.
+        let runner = std::env::var(RUNNER_VARIABLE).ok().and_then(|pid| pid.parse::<i32>().ok());
+        let parent = rustix::process::getppid().map_or(0, rustix::process::Pid::as_raw_pid);
+        if runner.is_some_and(|pid| pid != parent) {
+            interrupted.store(true, std::sync::atomic::Ordering::SeqCst);
+        }
     }
 
     let output = arguments.output.expect("clap requires --output");
