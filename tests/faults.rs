@@ -85,6 +85,17 @@ fn a_runner_killed_or_interrupted_goes_on() {
     for (name, milliseconds) in [("-KILL", 150), ("-KILL", 900), ("-INT", 1200)] {
         let child = spawn();
         std::thread::sleep(Duration::from_millis(milliseconds));
+        // However slow the machine is just now, the interruption comes while something is being trained.
+        let training = || {
+            let files = walkdir::WalkDir::new(project.path(".nerf-sr/partial")).into_iter().flatten();
+            files.into_iter().any(|f| f.file_name() == "checkpoint.safetensors")
+        };
+        for _ in 0..600 {
+            if name != "-INT" || training() {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(100));
+        }
         signal(&child, name);
         let finished = Finished::of(child.wait_with_output().unwrap());
         if name == "-INT" {
