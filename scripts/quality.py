@@ -12,10 +12,10 @@ import pathlib
 import cells
 
 # Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
-BUDGET = {"100x2": (48_000_000, 1), "100x4": (100_000_000, 4), "200x2": (44_000_000, 1), "200x4": (48_000_000, 1)}
-OTHER_BUDGET = (40_000_000, 1)
-# `kernel` takes about an eighth more time for a ray than `average`, which therefore gets as many more rays: equal times.
-AVERAGE_RAYS = 9 / 8
+BUDGET = {"100x2": (32_000_000, 1), "100x4": (64_000_000, 4), "200x2": (80_000_000, 1), "200x4": (90_000_000, 1)}
+OTHER_BUDGET = (60_000_000, 1)
+# `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
+AVERAGE_RAYS = 13 / 12
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_synthetic/SCENE (or SCENE) and weights")

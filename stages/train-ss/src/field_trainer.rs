@@ -78,6 +78,31 @@ pub(crate) fn start(
     }
 }
 
+/// What both trainers have by the same names.
+macro_rules! forwarded {
+    () => {
+        fn steps(&self) -> u64 {
+            Self::steps(self)
+        }
+
+        fn rays_done(&self) -> u64 {
+            Self::rays_done(self)
+        }
+
+        fn checkpoint_step(&self, path: &Path) -> Option<u64> {
+            Self::checkpoint_step(path).ok()
+        }
+
+        fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
+            Ok(Self::write_checkpoint(self, path)?)
+        }
+
+        fn resume(&mut self, path: &Path) -> bool {
+            Self::resume(self, path).is_ok()
+        }
+    };
+}
+
 impl FieldTrainer for Trainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
         Self::step(self, supervision).map_err(|e| match e {
@@ -85,25 +110,7 @@ impl FieldTrainer for Trainer {
         })
     }
 
-    fn steps(&self) -> u64 {
-        Self::steps(self)
-    }
-
-    fn rays_done(&self) -> u64 {
-        Self::rays_done(self)
-    }
-
-    fn checkpoint_step(&self, path: &Path) -> Option<u64> {
-        Self::checkpoint_step(path).ok()
-    }
-
-    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
-        Ok(Self::write_checkpoint(self, path)?)
-    }
-
-    fn resume(&mut self, path: &Path) -> bool {
-        Self::resume(self, path).is_ok()
-    }
+    forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
         let steps = Self::steps(&self);
@@ -125,25 +132,7 @@ impl FieldTrainer for torch_field::MlpTrainer {
         })
     }
 
-    fn steps(&self) -> u64 {
-        Self::steps(self)
-    }
-
-    fn rays_done(&self) -> u64 {
-        Self::rays_done(self)
-    }
-
-    fn checkpoint_step(&self, path: &Path) -> Option<u64> {
-        Self::checkpoint_step(path).ok()
-    }
-
-    fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()> {
-        Ok(Self::write_checkpoint(self, path)?)
-    }
-
-    fn resume(&mut self, path: &Path) -> bool {
-        Self::resume(self, path).is_ok()
-    }
+    forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
         self.field().write(weights).context("cannot write the field")

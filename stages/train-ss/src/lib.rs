@@ -168,6 +168,7 @@ pub fn supervision(
         jitter: params.jitter,
         order: params.order(),
         crop_groups: params.crop_groups(((params.supersample - 1e-6).ceil() as u64).pow(2)),
+        detail: params.detail(),
         seed: params.seed,
     };
     Ok(Supersampling::new(views, pictures, &options))

@@ -17,6 +17,9 @@ struct Remembered {
     height: usize,
     /// RGB, row by row.
     rendered: Vec<u8>,
+    /// RGB of the LR pixels that the kernel makes of those, in levels of 1/[`ONE`]². It follows every change: whole numbers add up to the
+    /// same whatever the order, so it is what the kernel makes of them anew, to the last bit.
+    made: Vec<[i64; 3]>,
     kernel: Arc<Kernel>,
 }
 
@@ -43,7 +46,9 @@ impl Memory {
     /// Adds the next view: an RGB picture at HR size to begin with, and what makes it an LR picture.
     pub(crate) fn add(&mut self, picture: &Picture, kernel: Arc<Kernel>) {
         let rendered = picture.data.iter().map(|&v| to_u8(v)).collect();
-        self.views.push(Remembered { width: picture.width, height: picture.height, rendered, kernel });
+        let mut view = Remembered { width: picture.width, height: picture.height, rendered, made: Vec::new(), kernel };
+        view.make();
+        self.views.push(view);
     }
 
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
@@ -84,54 +89,54 @@ impl Memory {
         judge: impl Fn(f32, f32) -> f32,
         pulls: &mut [[f32; 3]],
     ) -> [f32; 3] {
+        const MOST: usize = 2 * Memory::REACH + 1;
         let [left, top] = self.block(view, x, y);
         let [columns, rows] = self.side;
         let view = &self.views[view];
-        let (across, down, inverse) = (&view.kernel.operator.x, &view.kernel.operator.y, &view.kernel.inverse);
-        let near = |at: usize, end: usize| at.saturating_sub(Self::REACH)..(at + Self::REACH + 1).min(end);
-        let (xs, ys) = (near(x, across.outputs()), near(y, down.outputs()));
-        // Remembered rows, filtered along x for the columns of the neighbourhood: each row serves all of its LR rows.
-        const MOST: usize = 2 * Memory::REACH + 1;
-        let mut sums = [[[0.0f32; 3]; MOST]; MOST];
-        let first_row = down.run(ys.start).0;
-        let last_row = down.run(ys.end - 1).0 + down.run(ys.end - 1).1.len();
-        for (j, row) in (first_row..last_row).zip(view.rendered[3 * view.width * first_row..].chunks_exact(3 * view.width)) {
-            let mut filtered = [[0.0f32; 3]; MOST];
-            for (qx, sum) in xs.clone().zip(&mut filtered) {
-                let (first, weights) = across.run(qx);
-                for (pixel, w) in row[3 * first..].as_chunks::<3>().0.iter().zip(weights) {
-                    (0..3).for_each(|c| sum[c] += w * f32::from(pixel[c]));
+        let (operator, inverse) = (&view.kernel.operator, &view.kernel.inverse);
+        let (xs, ys) = (near(x, Self::REACH, operator.x.outputs()), near(y, Self::REACH, operator.y.outputs()));
+        // What the fresh block changes in what the kernel made, and then the residuals.
+        let mut residuals = [[[0.0f32; 3]; MOST]; MOST];
+        for b in 0..rows {
+            let mut change = [[0.0f32; 3]; MOST];
+            let remembered = &view.rendered[3 * ((top + b) * view.width + left)..].as_chunks::<3>().0[..columns];
+            for (a, (fresh, old)) in colours[b * columns..][..columns].iter().zip(remembered).enumerate() {
+                let news: [f32; 3] = std::array::from_fn(|c| 255.0 * fresh[c] - f32::from(old[c]));
+                for (qx, sum) in xs.clone().zip(&mut change) {
+                    let w = operator.x.weight(qx, left + a);
+                    (0..3).for_each(|c| sum[c] += w * news[c]);
                 }
             }
-            // What is fresh replaces what was remembered.
-            if let Some(b) = j.checked_sub(top).filter(|b| *b < rows) {
-                for (a, fresh) in colours[b * columns..(b + 1) * columns].iter().enumerate() {
-                    let old = &row[3 * (left + a)..];
-                    for (qx, sum) in xs.clone().zip(&mut filtered) {
-                        let w = across.weight(qx, left + a);
-                        (0..3).for_each(|c| sum[c] += w * (255.0 * fresh[c] - f32::from(old[c])));
-                    }
-                }
+            for (qy, sums) in ys.clone().zip(&mut residuals) {
+                let w = operator.y.weight(qy, top + b);
+                sums.as_flattened_mut().iter_mut().zip(change.as_flattened()).for_each(|(sum, v)| *sum += w * v);
             }
-            for (qy, sums) in ys.clone().zip(&mut sums) {
-                let w = down.weight(qy, j);
-                if w != 0.0 {
-                    sums.iter_mut().flatten().zip(filtered.as_flattened()).for_each(|(sum, v)| *sum += w * v);
+        }
+        let mut own = [0.0; 3];
+        for (qy, row) in ys.clone().zip(&mut residuals) {
+            for (qx, residual) in xs.clone().zip(row) {
+                let at = qy * targets.width + qx;
+                let (made, target) = (&view.made[at], &targets.data[3 * at..]);
+                *residual = std::array::from_fn(|c| {
+                    let prediction = (made[c] as f32).mul_add(1.0 / (ONE * ONE), residual[c]);
+                    judge(prediction / 255.0, target[c])
+                });
+                if [qx, qy] == [x, y] {
+                    own = *residual;
                 }
             }
         }
-        pulls.fill([0.0; 3]);
-        let mut own = [0.0; 3];
-        for (qy, sums) in ys.zip(&sums) {
-            for (qx, sum) in xs.clone().zip(sums) {
-                let target = &targets.data[3 * (qy * targets.width + qx)..];
-                let residual: [f32; 3] = std::array::from_fn(|c| judge(sum[c] / 255.0, target[c]));
-                if [qx, qy] == [x, y] {
-                    own = residual;
-                }
-                for (k, pull) in pulls.iter_mut().enumerate() {
-                    let w = inverse.x.weight(qx, left + k % columns) * inverse.y.weight(qy, top + k / columns);
-                    (0..3).for_each(|c| pull[c] += w * residual[c]);
+        for b in 0..rows {
+            let mut asked = [[0.0f32; 3]; MOST];
+            for (qy, row) in ys.clone().zip(&residuals) {
+                let w = inverse.y.weight(qy, top + b);
+                asked.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, r)| *sum += w * r);
+            }
+            for (a, pull) in pulls[b * columns..][..columns].iter_mut().enumerate() {
+                *pull = [0.0; 3];
+                for (qx, asked) in xs.clone().zip(&asked) {
+                    let w = inverse.x.weight(qx, left + a);
+                    (0..3).for_each(|c| pull[c] += w * asked[c]);
                 }
             }
         }
@@ -140,12 +145,31 @@ impl Memory {
 
     /// Remembers the fresh sub-rays of an LR pixel.
     pub(crate) fn remember(&mut self, view: usize, x: usize, y: usize, colours: &[[f32; 3]]) {
-        let [i, j] = self.block(view, x, y);
+        // A block at the edge may lie off its LR pixel's centre.
+        const REACH: usize = Memory::REACH + 1;
+        let [left, top] = self.block(view, x, y);
         let columns = self.side[0];
         let view = &mut self.views[view];
-        for (row, colours) in view.rendered.chunks_exact_mut(3 * view.width).skip(j).zip(colours.chunks_exact(columns)) {
-            for (pixel, colour) in row[3 * i..].as_chunks_mut::<3>().0.iter_mut().zip(colours) {
-                *pixel = colour.map(to_u8);
+        let operator = &view.kernel.operator;
+        let (xs, ys) = (near(x, REACH, operator.x.outputs()), near(y, REACH, operator.y.outputs()));
+        for (b, colours) in colours.chunks_exact(columns).enumerate() {
+            let mut change = [[0i64; 3]; 2 * REACH + 1];
+            let remembered = view.rendered[3 * ((top + b) * view.width + left)..].as_chunks_mut::<3>().0;
+            for (a, (pixel, fresh)) in remembered.iter_mut().zip(colours).enumerate() {
+                let old = std::mem::replace(pixel, fresh.map(to_u8));
+                for (qx, sum) in xs.clone().zip(&mut change) {
+                    let w = whole(operator.x.weight(qx, left + a));
+                    (0..3).for_each(|c| sum[c] += w * (i64::from(pixel[c]) - i64::from(old[c])));
+                }
+            }
+            if change.as_flattened().iter().all(|d| *d == 0) {
+                continue;
+            }
+            for qy in ys.clone() {
+                let w = whole(operator.y.weight(qy, top + b));
+                for (made, change) in view.made[qy * operator.x.outputs()..][xs.clone()].iter_mut().zip(&change) {
+                    (0..3).for_each(|c| made[c] += w * change[c]);
+                }
             }
         }
     }
@@ -166,9 +190,47 @@ impl Memory {
         for view in &mut self.views {
             let (own, after) = rest.split_at(view.rendered.len());
             view.rendered.copy_from_slice(own);
+            view.make();
             rest = after;
         }
     }
+}
+
+impl Remembered {
+    /// Applies the kernel to all of it.
+    fn make(&mut self) {
+        let (across, down) = (&self.kernel.operator.x, &self.kernel.operator.y);
+        let mut narrow = vec![[0i64; 3]; across.outputs() * self.height];
+        for (row, sums) in self.rendered.chunks_exact(3 * self.width).zip(narrow.chunks_exact_mut(across.outputs())) {
+            for (i, sum) in sums.iter_mut().enumerate() {
+                let (first, weights) = across.run(i);
+                for (pixel, &w) in row[3 * first..].as_chunks::<3>().0.iter().zip(weights) {
+                    (0..3).for_each(|c| sum[c] += whole(w) * i64::from(pixel[c]));
+                }
+            }
+        }
+        self.made.clear();
+        self.made.resize(across.outputs() * down.outputs(), [0; 3]);
+        for (j, sums) in self.made.chunks_exact_mut(across.outputs()).enumerate() {
+            let (first, weights) = down.run(j);
+            for (row, &w) in narrow[first * across.outputs()..].chunks_exact(across.outputs()).zip(weights) {
+                sums.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, v)| *sum += whole(w) * v);
+            }
+        }
+    }
+}
+
+/// Outputs up to `reach` beside one, of so many.
+fn near(at: usize, reach: usize, end: usize) -> std::ops::Range<usize> {
+    at.saturating_sub(reach)..(at + reach + 1).min(end)
+}
+
+/// What weights of 1 are in fixed point.
+const ONE: f32 = (1 << 20) as f32;
+
+/// A weight in fixed point.
+fn whole(weight: f32) -> i64 {
+    (weight * ONE + 0.5f32.copysign(weight)) as i64
 }
 
 #[cfg(test)]
@@ -230,6 +292,26 @@ mod tests {
         other.add(&picture(8, 6), Arc::new(Kernel::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         other.restore(&bytes);
         assert!(other.parts().eq(memory.parts()));
+    }
+
+    /// What the kernel makes follows what is remembered, at any scale and also at the edges.
+    #[test]
+    fn what_is_made_follows() {
+        for (low, high) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((20, 13), (21, 14))]
+        {
+            for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
+                let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
+                let mut memory = Memory::new(side);
+                memory.add(&picture(high.0, high.1), Arc::new(Kernel::new(Resampling::new(filter, high, low))));
+                for k in 0..low.0 * low.1 {
+                    let colours: Vec<[f32; 3]> = (0..side[0] * side[1]).map(|i| [(i * 7 + k) as f32 % 1.0, 0.3, 1.0]).collect();
+                    memory.remember(0, k % low.0, k / low.0, &colours);
+                }
+                let followed = memory.views[0].made.clone();
+                memory.views[0].make();
+                assert_eq!(memory.views[0].made, followed, "{filter:?} {low:?} {high:?}");
+            }
+        }
     }
 
     /// Every HR pixel belongs to some block, so none is left unseen.

@@ -26,6 +26,10 @@ pub struct Params {
     pub jitter: bool,
     /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.
     pub order: Option<Order>,
+    /// How many times as often a pixel with detail around it is drawn as a flat one, in random order. What a pixel teaches weighs less by
+    /// as much, so that the expectation stays. Without it: 10 for `grid`, 1 for `mlp`, which goes through all pixels in turn.
+    #[schemars(range(min = 1.0, max = 100.0))]
+    pub detail: Option<f64>,
     /// Steps at the start that draw from the middle half of each picture's width and height alone, where something is to be seen.
     /// Without it: 0 for `grid`, 1000 for `mlp`.
     #[schemars(range(min = 0))]
@@ -38,9 +42,9 @@ pub struct Params {
     /// have.
     #[schemars(range(min = 1))]
     pub rays: Option<u64>,
-    /// Most rays in a step.
+    /// Most rays in a step. Without it: 4,096 for `grid`, 2,048 for `mlp`.
     #[schemars(range(min = 1, max = 1_048_576))]
-    pub batch: u32,
+    pub batch: Option<u32>,
     /// `grid`: samples a step aims at while space is full of fog and rays are expensive.
     #[schemars(range(min = 1024, max = 16_777_216))]
     pub samples: u32,
@@ -121,11 +125,12 @@ impl Default for Params {
             supervision: None,
             jitter: false,
             order: None,
+            detail: None,
             crop_steps: None,
             members: 1,
             rays: None,
-            batch: 2_048,
-            samples: 32_768,
+            batch: None,
+            samples: 65_536,
             rate: None,
             level_rate: 0.8,
             network_rate: 1e-2,
@@ -184,6 +189,9 @@ impl Params {
         if self.field == FieldKind::Grid && self.hidden.is_some_and(|h| !(16..=128).contains(&h)) {
             return Err("parameter hidden: the grid's networks are 16 to 128 wide".to_owned());
         }
+        if self.order() == Order::Epochs && self.detail.is_some_and(|d| d > 1.0) {
+            return Err("parameter detail: an epoch goes through all pixels evenly; choose order random".to_owned());
+        }
         // What belongs to the other field would be silently without effect.
         let default = Self::default();
         let foreign: &[(&str, bool)] = match self.field {
@@ -237,9 +245,19 @@ impl Params {
         self.or(self.order, Order::Random, Order::Epochs)
     }
 
+    /// Most rays in a step.
+    pub fn batch(&self) -> u32 {
+        self.or(self.batch, 4_096, 2_048)
+    }
+
+    /// How much more often what has detail is drawn.
+    pub fn detail(&self) -> f64 {
+        if self.order() == Order::Epochs { 1.0 } else { self.or(self.detail, 10.0, 1.0) }
+    }
+
     /// Groups of rays that are drawn from the middle of the pictures, at `group` rays each.
     pub fn crop_groups(&self, group: u64) -> u64 {
-        u64::from(self.or(self.crop_steps, 0, 1000)) * (u64::from(self.batch) / group).max(1)
+        u64::from(self.or(self.crop_steps, 0, 1000)) * (u64::from(self.batch()) / group).max(1)
     }
 
     /// Rays over all members, where an epoch has so many.
@@ -278,7 +296,7 @@ impl Params {
     pub fn grid_training(&self, rays: u64) -> TrainingOptions {
         TrainingOptions {
             rays,
-            batch: self.batch as usize,
+            batch: self.batch() as usize,
             samples: self.samples as usize,
             rate: self.or(self.rate, 4e-2, 5e-4),
             level_rate: self.level_rate,
@@ -298,7 +316,7 @@ impl Params {
         let epochs = rays.div_ceil(epoch.max(1));
         torch_field::MlpTraining {
             rays,
-            batch: self.batch as usize,
+            batch: self.batch() as usize,
             rate: self.or(self.rate, 4e-2, 5e-4),
             final_rate: self.or(self.final_rate, 0.25, 0.01),
             schedule: match self.schedule {

@@ -31,7 +31,7 @@ pub enum Order {
     Epochs,
 }
 
-/// Supersampling: a training pixel is drawn at random, and sub-rays are cast through it.
+/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-rays are cast through it.
 ///
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
 /// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises the
@@ -49,8 +49,61 @@ pub struct Supersampling {
     jitter: bool,
     order: Order,
     crop_groups: u64,
+    focus: Focus,
     seed: u64,
     memory: Option<Memory>,
+}
+
+/// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
+/// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
+struct Focus {
+    /// Numbers of the pixels with detail, among those of all views.
+    detailed: Vec<u64>,
+    /// Share of the draws that are even, over all pixels; the others are among the detailed ones.
+    even: f32,
+    /// Weights of a flat and of a detailed pixel's loss.
+    weights: [f32; 2],
+}
+
+/// Range of a channel over 3×3 pixels below which they are flat.
+const FLAT: f32 = 8.0 / 255.0;
+
+impl Focus {
+    /// Detailed pixels are drawn `detail` times as often as flat ones.
+    fn new(detail: f64, pixels: u64, detailed: Vec<u64>) -> Self {
+        let share = detailed.len() as f64 / pixels.max(1) as f64;
+        let even = if detail > 1.0 && share > 0.0 { 1.0 / (detail - 1.0).mul_add(share, 1.0) } else { 1.0 };
+        let weights = [1.0 / even, 1.0 / (even * detail)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
+        Self { detailed, even: even as f32, weights }
+    }
+
+    /// Draws the number of a pixel.
+    fn draw(&self, pixels: u64, draws: &mut Draws) -> u64 {
+        if self.even == 1.0 || draws.uniform() < self.even {
+            draws.below(pixels)
+        } else {
+            self.detailed[draws.below(self.detailed.len() as u64) as usize]
+        }
+    }
+
+    /// Weight of a pixel's loss.
+    fn weight(&self, pixel: u64) -> f32 {
+        self.weights[usize::from(self.even < 1.0 && self.detailed.binary_search(&pixel).is_ok())]
+    }
+}
+
+/// Which pixels aren't flat, in order.
+fn detailed(picture: &Picture) -> impl Iterator<Item = usize> + '_ {
+    let near = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
+    (0..picture.width * picture.height).filter(move |&pixel| {
+        let (x, y) = (pixel % picture.width, pixel / picture.width);
+        (0..picture.channels).any(|c| {
+            let around = near(y, picture.height).flat_map(|j| near(x, picture.width).map(move |i| (i, j)));
+            let value = |(i, j): (usize, usize)| picture.data[(j * picture.width + i) * picture.channels + c];
+            let (low, high) = around.map(value).fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
+            high - low > FLAT
+        })
+    })
 }
 
 struct TrainingView {
@@ -81,6 +134,8 @@ pub struct SupersamplingOptions {
     pub order: Order,
     /// Pixels at the start that come from the middle half of each picture's width and height alone.
     pub crop_groups: u64,
+    /// How many times as often a pixel with detail is drawn as a flat one, in random order.
+    pub detail: f64,
     /// Seed of what is drawn.
     pub seed: u64,
 }
@@ -109,6 +164,7 @@ impl Supersampling {
         let mut memory = None;
         let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
+        let mut with_detail = Vec::new();
         let mut ready = Vec::with_capacity(pictures.len());
         for (view, mut picture) in views.views.iter().zip(pictures) {
             match options.supervision {
@@ -126,6 +182,9 @@ impl Supersampling {
                 }
             }
             let before = pixels;
+            if options.detail > 1.0 {
+                with_detail.extend(detailed(&picture).map(|pixel| before + pixel as u64));
+            }
             pixels += (picture.width * picture.height) as u64;
             let (k, r) = (view.camera.intrinsics, view.camera.rotation());
             let corner = r * glam::DVec3::new(-k.cx / k.fx, k.cy / k.fy, -1.0);
@@ -138,9 +197,9 @@ impl Supersampling {
                 down: (-r.y_axis / k.fy).to_array(),
             });
         }
-        let SupersamplingOptions { coarse, jitter, order, crop_groups, seed, .. } = *options;
-        let background = views.background;
-        Self { views: ready, pixels, background, full, side: full, coarse, jitter, order, crop_groups, seed, memory }
+        let SupersamplingOptions { coarse, jitter, order, crop_groups, detail, seed, .. } = *options;
+        let (background, focus) = (views.background, Focus::new(detail, pixels, with_detail));
+        Self { views: ready, pixels, background, full, side: full, coarse, jitter, order, crop_groups, focus, seed, memory }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -171,7 +230,7 @@ impl Supersampling {
                 let group = group - self.crop_groups;
                 shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels)
             }
-            _ => draws.below(self.pixels),
+            _ => self.focus.draw(self.pixels, &mut draws),
         };
         let view = self.views.partition_point(|v| v.before <= at) - 1;
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
@@ -272,20 +331,22 @@ impl radiance::Supervision for Supersampling {
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
         let share = 1.0 / colours.len() as f32;
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
+        let is_cropped = group < self.crop_groups;
+        let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(memory) = self.kernel() {
             let at = [pixel % picture.width, pixel / picture.width];
             let own = memory.pull(index, at, colours, picture, unclipped_residual, gradients);
-            gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= 2.0 / 3.0);
-            return own.iter().map(|&r| f64::from(r) * f64::from(r) / 3.0).sum();
+            gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
+            return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
         let mut loss = 0.0;
         for c in 0..3 {
             let target = if picture.channels == 4 { sample[c] + (1.0 - sample[3]) * behind[c] } else { sample[c] };
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
             let residual = mean - target;
-            loss += f64::from(residual) * f64::from(residual) / 3.0;
+            loss += f64::from(weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
-                gradient[c] = residual * share * (2.0 / 3.0);
+                gradient[c] = weight * residual * share * (2.0 / 3.0);
             }
         }
         loss
@@ -319,6 +380,7 @@ mod tests {
             jitter: false,
             order: Order::Random,
             crop_groups: 0,
+            detail: 1.0,
             seed: 9,
         }
     }
@@ -431,9 +493,30 @@ mod tests {
         let white = Picture::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
         let mut gradients = [[0.0; 3]; 4];
-        assert_eq!(supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients), 0.0);
+        assert!(supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
         assert!(supersampling.judge(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
+    }
+
+    /// Pixels with detail are drawn as often as asked for, and the weighted loss expects what even draws do.
+    #[test]
+    fn focus_keeps_the_expectation() {
+        let mut flat = Picture::new(20, 10, 3, vec![0.5; 600]);
+        flat.data[3 * (3 * 20 + 4)] = 0.9;
+        assert!(detailed(&flat).eq((2..5).flat_map(|y| (3..6).map(move |x| 20 * y + x))), "what is around a dot");
+        let focus = Focus::new(7.0, 200, detailed(&flat).map(|p| p as u64).collect());
+        let (mut counts, draws) = ([0u32; 200], 400_000);
+        (0..draws).for_each(|k| counts[focus.draw(200, &mut Draws::new(1, 2, k)) as usize] += 1);
+        for (pixel, &count) in (0..200).zip(&counts) {
+            let mean = f64::from(count) * 200.0 / draws as f64 * f64::from(focus.weight(pixel));
+            assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");
+        }
+        let (dot, elsewhere) = (counts[3 * 20 + 4], counts[6 * 20..].iter().sum::<u32>());
+        let often = f64::from(dot) / (f64::from(elsewhere) / 80.0);
+        assert!((often - 7.0).abs() < 0.6, "{often}");
+        for even in [Focus::new(1.0, 200, vec![3]), Focus::new(5.0, 200, Vec::new())] {
+            assert!(even.weight(3) == 1.0 && even.even == 1.0);
+        }
     }
 
     /// 1, 2, 4 … sub-rays a side, each for an equal part of the coarse share, and then all.
