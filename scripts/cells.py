@@ -7,8 +7,8 @@ import sys
 
 
 def dataset(data: pathlib.Path, scene: str) -> pathlib.Path:
-    """The folder of a scene: DATA/nerf_synthetic/SCENE or DATA/SCENE."""
-    for folder in (data / "nerf_synthetic" / scene, data / scene):
+    """The folder of a scene: DATA/nerf_synthetic/SCENE, DATA/nerf_llff_data/SCENE or DATA/SCENE."""
+    for folder in (data / "nerf_synthetic" / scene, data / "nerf_llff_data" / scene, data / scene):
         if folder.is_dir():
             return folder
     sys.exit(f"no scene {scene} in {data}: set DATA=DIR to a folder that has it")

@@ -23,6 +23,7 @@ parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
 parser.add_argument("--protocols", nargs="+", default=list(BUDGET), help="LR width x scale")
 parser.add_argument("--supervision", nargs="+", default=["average", "kernel"])
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/quality.json"))
+parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
 parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further parameters for every cell")
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
 options = parser.parse_args()
@@ -30,18 +31,20 @@ options = parser.parse_args()
 
 def cell(scene: str, protocol: str, supervision: str) -> dict:
     lr, scale = protocol.split("x")
-    page = options.out.parent / "quality" / f"{scene}-{protocol}-{supervision}"
+    page = options.out.parent / "quality" / "-".join([scene, protocol, supervision] + [options.split] * bool(options.split))
     rays, members = BUDGET.get(protocol, OTHER_BUDGET)
     rays = round(rays * AVERAGE_RAYS) if supervision == "average" else rays
     # Far above the trained resolution the field is smooth within a pixel, and one ray shows it all.
     sub_rays = 2 if float(scale) < 3 else 1
     settings = {"lr": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "members": members}
     settings["sub_rays"] = sub_rays
+    settings |= {"split": options.split} if options.split else {}
     settings |= dict(setting.split("=", 1) for setting in options.set)
     settings = [f"{name}={value}" for name, value in settings.items()]
     folder = cells.dataset(options.data, scene)
     row = cells.run(options.nerf_sr, page, folder, settings, options.data / "weights")
-    return {"scene": scene, "protocol": protocol, "supervision": supervision} | row
+    split = {"split": options.split} if options.split else {}
+    return {"scene": scene, "protocol": protocol, "supervision": supervision} | split | row
 
 
 def line(name: str, protocol: str, supervision: str, row: dict) -> str:

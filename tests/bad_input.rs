@@ -47,7 +47,7 @@ fn datasets_that_cannot_be_used() {
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
         &[],
         3,
-        &["transforms_test.json", "expected a folder"],
+        &["transforms_test.json", "is not there; a Blender data set has"],
     );
     refused(
         |_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(),
@@ -62,7 +62,7 @@ fn datasets_that_cannot_be_used() {
         },
         &[],
         3,
-        &["frame 1 (r_1)", "train/r_1.png", "not a whole PNG"],
+        &["frame r_1", "train/r_1.png", "not a whole picture"],
     );
     let first_number = |d: &Path| {
         let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
@@ -224,4 +224,27 @@ fn command_lines_that_cannot_be_used() {
     stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[]).fails(2, &["--input data", "known: dataset"]);
     stage("prep", "{}", &[("dataset", Path::new("/nowhere"))], &project.path("o"), &[]).fails(3, &["/nowhere", "no such folder"]);
     stage("prep", "{}", &[("dataset", Path::new("."))], &project.path("."), &[]).fails(2, &["--output"]);
+}
+
+#[test]
+fn a_folder_without_photographs() {
+    refused(
+        |_, d| {
+            std::fs::remove_file(d.join("transforms_test.json")).unwrap();
+            std::fs::remove_file(d.join("transforms_train.json")).unwrap();
+        },
+        &[],
+        3,
+        &["data: no data set", "transforms.json (instant-ngp", "LLFF", "COLMAP"],
+    );
+    // Blender's form says its split; another doesn't.
+    refused(
+        |_, d| {
+            std::fs::remove_file(d.join("transforms_test.json")).unwrap();
+            std::fs::rename(d.join("transforms_train.json"), d.join("transforms.json")).unwrap();
+        },
+        &["-p", "split=given"],
+        2,
+        &["parameter split", "choose holdout or paper"],
+    );
 }

@@ -3,30 +3,18 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-use common::{Finished, Project, signal, stage, stage_command};
+use common::{Finished, Project, demo_train, manifest, signal, stage, stage_command};
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
 const PARAMS: &str = r#"{"supervision": "kernel", "members": 2, "rays": 900000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
 
-fn scene(project: &Project) -> std::path::PathBuf {
-    let (data, scene) = (project.path("data"), project.path("scene"));
-    assert_eq!(stage("demo-scene", r#"{"size": 48, "train": 8, "test": 1, "samples": 1}"#, &[], &data, &[]).code, 0);
-    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
-    scene.join("train")
-}
-
-fn manifest(folder: &Path) -> String {
-    std::fs::read_to_string(folder.join("artifact.json")).unwrap()
-}
-
 #[test]
 fn training_killed_at_any_moment_ends_in_the_same_bytes() {
     let project = Project::tiny();
-    let train = scene(&project);
+    let train = demo_train(&project, 8);
     let inputs = [("scene", train.as_path())];
     let whole = project.path("whole");
     assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
@@ -56,7 +44,7 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
 #[test]
 fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let project = Project::tiny();
-    let train = scene(&project);
+    let train = demo_train(&project, 8);
     let inputs = [("scene", train.as_path())];
     let (output, work) = (project.path("out"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];

@@ -3,32 +3,20 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::Duration;
 
-use common::{Project, stage, stage_command};
+use common::{Project, demo_train, manifest, stage, stage_command};
 
 /// All of the published shape, in miniature; long enough to be stopped on the way.
 const PARAMS: &str = r#"{"field": "mlp", "hidden": 16, "layers": 5, "position_octaves": 4, "direction_octaves": 1, "coarse_samples": 8,
     "fine_samples": 8, "batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1}"#;
 
-fn scene(project: &Project) -> PathBuf {
-    let (data, scene) = (project.path("data"), project.path("scene"));
-    assert_eq!(stage("demo-scene", r#"{"size": 48, "train": 6, "test": 1, "samples": 1}"#, &[], &data, &[]).code, 0);
-    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
-    scene.join("train")
-}
-
-fn manifest(folder: &Path) -> String {
-    std::fs::read_to_string(folder.join("artifact.json")).unwrap()
-}
-
 /// Equal bytes at one and two threads, and after an interruption.
 #[test]
 fn trains_to_the_same_bytes_however_it_is_run() {
     let project = Project::tiny();
-    let train = scene(&project);
+    let train = demo_train(&project, 6);
     let inputs = [("scene", train.as_path())];
     let [one, two, stopped, work] = ["one", "two", "stopped", "work"].map(|name| project.path(name));
     assert_eq!(stage("train-ss", PARAMS, &inputs, &one, &["--threads", "1"]).code, 0);
@@ -58,7 +46,7 @@ fn trains_to_the_same_bytes_however_it_is_run() {
 #[test]
 fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
-    let train = scene(&project);
+    let train = demo_train(&project, 6);
     let run = |name: &str, seed: u64, restarts: u32| {
         let more = format!(r#""rate": 1.0, "seed": {seed}, "restarts": {restarts}, "batch": 64"#);
         let params = PARAMS.replace(r#""batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1"#, &more);
@@ -77,7 +65,7 @@ fn a_collapse_is_told_and_starts_over_when_asked_to() {
 #[test]
 fn mistakes_are_one_line() {
     let project = Project::tiny();
-    let train = scene(&project);
+    let train = demo_train(&project, 6);
     let out = project.path("out");
     let inputs = [("scene", train.as_path())];
     stage("train-ss", PARAMS, &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);

@@ -20,7 +20,7 @@ fn every_command_plans() {
     let project =
         Project::new(&std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("pipeline.yaml")).unwrap());
     // Folders that the examples name.
-    for folder in ["my-scene", "weights", "../shared/data/nerf_synthetic/lego", "../shared/data/weights"] {
+    for folder in ["my-scene", "my-photographs", "weights", "../shared/data/nerf_synthetic/lego", "../shared/data/weights"] {
         let target = project.path("project").join(folder);
         std::fs::create_dir_all(&target).unwrap();
         std::fs::write(target.join("x"), "").unwrap();

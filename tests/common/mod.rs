@@ -158,6 +158,20 @@ pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output:
     command
 }
 
+/// LR pictures of a small demo scene at half the size.
+pub fn demo_train(project: &Project, views: u32) -> PathBuf {
+    let (data, scene) = (project.path("data"), project.path("scene"));
+    let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples": 1}}"#);
+    assert_eq!(stage("demo-scene", &params, &[], &data, &[]).code, 0);
+    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
+    scene.join("train")
+}
+
+/// What stands in an artifact's manifest: its whole content.
+pub fn manifest(folder: &Path) -> String {
+    std::fs::read_to_string(folder.join("artifact.json")).unwrap()
+}
+
 /// Sends a running stage a signal: "-TERM", "-KILL".
 pub fn signal(child: &std::process::Child, name: &str) {
     Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();

@@ -4,6 +4,8 @@
 //! * [`ssim`]: Gaussian window, reflected at the border or valid pixels only.
 //! * `lpips`: SqueezeNet, where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
+//! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
+//!   photographs are all there is, no HR truth exists, and this alone can be known.
 //!
 //! Means over views are means of per-view values. Open backgrounds are scored on white.
 
@@ -16,7 +18,9 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Palette, Picture, Rgba8, heat, read_exr, read_premultiplied, write_png};
+use pixels::{
+    DEGRADATION_FILE, Degradation, Filter, Palette, Picture, Resampling, Rgba8, heat, read_exr, read_premultiplied, write_png,
+};
 use rayon::prelude::*;
 use scene::{Background, View, Views};
 use schemars::JsonSchema;
@@ -70,6 +74,8 @@ pub struct MetricConventions {
     pub lpips: String,
     /// How depth was scored.
     pub depth: String,
+    /// How the view's LR picture was compared with.
+    pub low_resolution: String,
     /// What the error maps show.
     pub error_maps: String,
 }
@@ -78,16 +84,31 @@ pub struct MetricConventions {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Scores {
-    /// Peak signal-to-noise ratio in dB; higher is better.
-    pub psnr: f64,
-    /// Structural similarity; higher is better.
-    pub ssim: f64,
+    /// Peak signal-to-noise ratio in dB, where there is HR truth; higher is better.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr: Option<f64>,
+    /// Structural similarity, where there is HR truth; higher is better.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ssim: Option<f64>,
     /// Learned perceptual distance; lower is better.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
     /// Depth errors, where there is true depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthError>,
+    /// The shrunk render against the view's LR picture, where there is one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub low_resolution: Option<LowScores>,
+}
+
+/// A render shrunk to LR against the view's LR picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct LowScores {
+    /// Peak signal-to-noise ratio in dB.
+    pub psnr: f64,
+    /// Structural similarity.
+    pub ssim: f64,
 }
 
 /// One view's scores.
@@ -132,42 +153,86 @@ impl Stage for Eval {
         let (views_in, truth_in) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
         let perceptual = Perceptual::new(context.optional_input("weights"))?;
+        let is_known = truth_in.path(DEGRADATION_FILE).exists();
+        let made: Option<Degradation> = if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
+        let filter = made.map_or(Filter::Box, |d| d.kernel.filter());
+        let job = Job { context, params, perceptual: &perceptual, filter, views: (views_in, &views), truth: (truth_in, &truth) };
         let progress = context.progress("scoring", truth.views.len() as u64);
-        let scored = truth
-            .views
-            .par_iter()
-            .map(|true_view| -> anyhow::Result<ViewScores> {
-                context.check_interrupt()?;
-                let name = &true_view.camera.name;
-                let view = views.views.iter().find(|v| v.camera.name == *name);
-                let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
-                let expected = read_view(truth_in, true_view, truth.background)?;
-                let found = read_view(views_in, view, views.background)?;
-                let size = |p: &Picture| format!("{}×{}", p.width, p.height);
-                if size(&expected) != size(&found) {
-                    let message = format!(
-                        "view {name}: rendered at {} where the truth has {}; set size in render-depth",
-                        size(&found),
-                        size(&expected)
-                    );
-                    return Err(Failure::BadInput(message).into());
-                }
-                let error_map = format!("errors/{name}.png");
-                write_png(&context.output_path(&error_map)?, &draw_error(&found, &expected, params.error_range as f32))?;
-                let scores = Scores {
-                    psnr: psnr(&found, &expected),
-                    ssim: ssim(&found, &expected, params.ssim_border),
-                    lpips: perceptual.distance(&found, &expected)?,
-                    depth: score_depth((views_in, view), (truth_in, true_view))?,
-                };
-                progress.add(1);
-                Ok(ViewScores { name: name.clone(), scores, error_map })
-            })
-            .collect::<anyhow::Result<Vec<_>>>()?;
+        let score = |view: &View| -> anyhow::Result<ViewScores> {
+            context.check_interrupt()?;
+            let scores = job.score(view)?;
+            progress.add(1);
+            Ok(scores)
+        };
+        let scored = truth.views.par_iter().map(score).collect::<anyhow::Result<Vec<_>>>()?;
         let mean = mean_of(&scored);
-        let metrics = Metrics { conventions: conventions(params, truth.background, &perceptual), mean, views: scored };
+        let metrics = Metrics { conventions: conventions(params, truth.background, &perceptual, made), mean, views: scored };
         context.write_json("metrics.json", &metrics)?;
         context.write_summary(&summary(&metrics, &perceptual))
+    }
+}
+
+/// What scoring a view needs.
+struct Job<'a> {
+    context: &'a Context,
+    params: &'a Params,
+    perceptual: &'a Perceptual,
+    /// What made the LR pictures, as far as is known.
+    filter: Filter,
+    views: (&'a GivenInput, &'a Views),
+    truth: (&'a GivenInput, &'a Views),
+}
+
+impl Job<'_> {
+    fn score(&self, true_view: &View) -> anyhow::Result<ViewScores> {
+        let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
+        let name = &true_view.camera.name;
+        let view = views.views.iter().find(|v| v.camera.name == *name);
+        let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
+        let found = read_view(views_in, view, view.image.as_ref(), views.background)?;
+        let expected = match &true_view.image {
+            None => None,
+            some => Some(read_view(truth_in, true_view, some.as_ref(), truth.background)?),
+        };
+        let low = match &true_view.low_resolution {
+            None => None,
+            some => Some(read_view(truth_in, true_view, some.as_ref(), truth.background)?),
+        };
+        let wanted = (true_view.camera.intrinsics.width as usize, true_view.camera.intrinsics.height as usize);
+        if wanted != (found.width, found.height) {
+            let message = format!(
+                "view {name}: rendered at {}×{} where the truth has {}×{}; set size in render-depth",
+                found.width, found.height, wanted.0, wanted.1
+            );
+            return Err(Failure::BadInput(message).into());
+        }
+        let size = |p: &Picture| (p.width, p.height);
+        if let Some(expected) = expected.as_ref().filter(|e| size(e) != wanted) {
+            let message =
+                format!("view {name}: its picture has {}×{} pixels, its camera others", expected.width, expected.height);
+            return Err(Failure::BadInput(message).into());
+        }
+        let shrunk = low.as_ref().map(|low| Resampling::new(self.filter, size(&found), size(low)).apply(&found));
+        let (shown, against) = match (&expected, &shrunk, &low) {
+            (Some(expected), ..) => (&found, expected),
+            (None, Some(shrunk), Some(low)) => (shrunk, low),
+            _ => return Err(Failure::BadInput(format!("truth: view {name} has no picture at all")).into()),
+        };
+        let error_map = format!("errors/{name}.png");
+        write_png(&self.context.output_path(&error_map)?, &draw_error(shown, against, self.params.error_range as f32))?;
+        let border = self.params.ssim_border;
+        let scores = Scores {
+            psnr: expected.as_ref().map(|e| psnr(&found, e)),
+            ssim: expected.as_ref().map(|e| ssim(&found, e, border)),
+            lpips: expected.as_ref().map(|e| self.perceptual.distance(&found, e)).transpose()?.flatten(),
+            depth: score_depth((views_in, view), (truth_in, true_view))?,
+            low_resolution: shrunk
+                .iter()
+                .zip(&low)
+                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low), ssim: ssim(shrunk, low, border) })
+                .next(),
+        };
+        Ok(ViewScores { name: name.clone(), scores, error_map })
     }
 }
 
@@ -178,10 +243,10 @@ pub fn psnr(found: &Picture, expected: &Picture) -> f64 {
     (-10.0 * (sum / found.data.len() as f64).log10()).min(100.0)
 }
 
-/// A view's picture over its background, clamped to [0, 1].
-fn read_view(input: &GivenInput, view: &View, background: Background) -> anyhow::Result<Picture> {
+/// A picture of a view over its background, clamped to [0, 1].
+fn read_view(input: &GivenInput, view: &View, file: Option<&String>, background: Background) -> anyhow::Result<Picture> {
     let place = format!("view {}", view.camera.name);
-    let name = view.image.as_ref().with_context(|| "it has no image").bad_input(&place)?;
+    let name = file.with_context(|| "it has no image").bad_input(&place)?;
     let path = input.path(name);
     let mut picture = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
     picture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
@@ -217,18 +282,21 @@ fn mean_of(views: &[ViewScores]) -> Scores {
     };
     let depth = |value: &dyn Fn(&DepthError) -> f64| mean(&|s| s.depth.as_ref().map(value));
     Scores {
-        psnr: mean(&|s| Some(s.psnr)).unwrap_or_default(),
-        ssim: mean(&|s| Some(s.ssim)).unwrap_or_default(),
+        psnr: mean(&|s| s.psnr),
+        ssim: mean(&|s| s.ssim),
         lpips: mean(&|s| s.lpips),
         depth: depth(&|d| d.mean_absolute).map(|mean_absolute| DepthError {
             mean_absolute,
             median_absolute: depth(&|d| d.median_absolute).unwrap_or_default(),
             missed: depth(&|d| d.missed).unwrap_or_default(),
         }),
+        low_resolution: mean(&|s| s.low_resolution.map(|l| l.psnr))
+            .zip(mean(&|s| s.low_resolution.map(|l| l.ssim)))
+            .map(|(psnr, ssim)| LowScores { psnr, ssim }),
     }
 }
 
-fn conventions(params: &Params, background: Background, perceptual: &Perceptual) -> MetricConventions {
+fn conventions(params: &Params, background: Background, perceptual: &Perceptual, made: Option<Degradation>) -> MetricConventions {
     let on = if background == Background::Black { "black" } else { "white" };
     let border = match params.ssim_border {
         Border::Reflect => "borders reflected",
@@ -240,21 +308,27 @@ fn conventions(params: &Params, background: Background, perceptual: &Perceptual)
         ssim: format!("Gaussian 11×11, σ 1.5, {border}, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels"),
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
+        low_resolution: format!(
+            "the render shrunk by {}, against the view's LR picture",
+            made.map_or_else(|| "a box, for want of a better guess".to_owned(), |d| format!("{:?}", d.kernel).to_lowercase())
+        ),
         error_maps: format!("mean absolute error of R, G, B; brightest at {}", params.error_range),
     }
 }
 
 fn summary(metrics: &Metrics, perceptual: &Perceptual) -> String {
     let mean = &metrics.mean;
-    let lpips = mean.lpips.map_or_else(|| perceptual.missing().to_owned(), |v| format!("{v:.4}"));
-    let depth = mean.depth.map(|d| format!(" · depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute));
-    format!(
-        "PSNR {:.2} dB · SSIM {:.4} · LPIPS {lpips}{} · {} views",
-        mean.psnr,
-        mean.ssim,
-        depth.unwrap_or_default(),
-        metrics.views.len()
-    )
+    let mut parts = Vec::new();
+    if let (Some(psnr), Some(ssim)) = (mean.psnr, mean.ssim) {
+        let lpips = mean.lpips.map_or_else(|| perceptual.missing().to_owned(), |v| format!("{v:.4}"));
+        parts.push(format!("PSNR {psnr:.2} dB · SSIM {ssim:.4} · LPIPS {lpips}"));
+    }
+    parts.extend(mean.depth.map(|d| format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)));
+    if let (Some(low), None) = (mean.low_resolution, mean.psnr) {
+        parts.push(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", low.psnr, low.ssim));
+    }
+    parts.push(format!("{} views", metrics.views.len()));
+    parts.join(" · ")
 }
 
 /// LPIPS, or the reason why there is none.

@@ -1,14 +1,14 @@
 //! `prep`: posed images → scene. Makes HR ground truth and, from it, the LR images that training may see.
 //!
-//! * `blender`: reads `transforms_{train,test}.json` and what they name.
 //! * `sizes`: LR and HR size from `lr`, `hr`, `scale`.
 //! * `degrade`: HR and LR pictures of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see; `hull`: tighter, from alpha, where that is allowed.
 //!
+//! The photographs are read by the crate `dataset`, whatever form their folder has.
+//!
 //! The scene has four subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `cameras/`
 //! (the test cameras at HR size, no pictures), `truth/` (HR test images, depth), `references/` (HR training images).
 
-mod blender;
 mod bounds;
 mod degrade;
 mod hull;
@@ -18,17 +18,17 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Rgba8, SampleType, read_exr, read_png, write_exr, write_png};
+use dataset::{Dataset, Format, Frame, Split};
+use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
-use scene::{Background, Bounds, Camera, Intrinsics, VIEWS_FILE, View, Views};
+use scene::{Background, Bounds, Camera, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use blender::{Dataset, DatasetError, Frame};
 pub use bounds::bounds_of;
 pub use degrade::{LowResolution, degrade};
 pub use hull::{GRID, carve};
-pub use sizes::{SizeError, Sizes, sizes};
+pub use sizes::{SizeError, Sizes, enlarged, sizes};
 
 /// Parameters of `prep`.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
@@ -43,8 +43,11 @@ pub struct Params {
     /// HR width over LR width; not needed where `lr` and `hr` are given. Without any of them: 2.
     #[schemars(range(min = 1.0, max = 16.0))]
     pub scale: Option<f64>,
-    /// How LR images are made from HR ones.
-    pub kernel: Kernel,
+    /// Whether, and how, LR images are made from HR ones. `none`: the photographs are LR images themselves, and there is no HR truth.
+    /// Without it: `none` for COLMAP and transforms.json, people's own photographs, where no `lr` is asked for; else by `kernel`.
+    pub degrade: Option<Degrade>,
+    /// How LR images are made from HR ones; where nothing is made, what is taken to have made them. Without it: `lanczos`, there `box`.
+    pub kernel: Option<Kernel>,
     /// What lies behind the scene; `alpha` keeps it open.
     pub background: Background,
     /// Distance along rays before which there is nothing; without it: from the cameras.
@@ -55,6 +58,8 @@ pub struct Params {
     pub far: Option<f64>,
     /// `alpha` carves a visual hull from the LR images' alpha: faster training, but information the paper's method doesn't see.
     pub hull: HullSource,
+    /// Which views are trained on and which are for testing. Without it: what the data set says, else `holdout`.
+    pub split: Option<SplitKind>,
     /// At most so many test views, spread evenly; without it: all.
     #[schemars(range(min = 1))]
     pub test_views: Option<u32>,
@@ -68,13 +73,44 @@ impl Default for Params {
             lr: None,
             hr: None,
             scale: None,
-            kernel: Kernel::Lanczos,
+            degrade: None,
+            kernel: None,
             background: Background::White,
             near: None,
             far: None,
             hull: HullSource::None,
+            split: None,
             test_views: None,
             references: 1,
+        }
+    }
+}
+
+/// How LR images come about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Degrade {
+    /// They are what is given.
+    None,
+    /// From HR images, by that kernel.
+    Lanczos,
+    /// From HR images, by that kernel.
+    Bicubic,
+    /// From HR images, by that kernel.
+    Box,
+    /// From HR images, by that kernel.
+    Avg,
+}
+
+impl Degrade {
+    /// Its kernel, where there is one.
+    fn kernel(self) -> Option<Kernel> {
+        match self {
+            Self::None => None,
+            Self::Lanczos => Some(Kernel::Lanczos),
+            Self::Bicubic => Some(Kernel::Bicubic),
+            Self::Box => Some(Kernel::Box),
+            Self::Avg => Some(Kernel::Avg),
         }
     }
 }
@@ -88,6 +124,21 @@ pub enum HullSource {
     /// The LR images' alpha.
     Alpha,
 }
+
+/// Ways to part views for training from views for testing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SplitKind {
+    /// As the data set itself says.
+    Given,
+    /// Every eighth view, the first among them, is for testing alone: what a figure needs to be honest.
+    Holdout,
+    /// All views are for both, references excepted, which aren't tested: the paper's way with photographs.
+    Paper,
+}
+
+/// One view in so many is held out.
+const HOLD_OUT_EVERY: usize = 8;
 
 /// `scene.json`: what `prep` found and chose, for people.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -103,7 +154,9 @@ pub struct SceneSummary {
     pub lr: [u32; 2],
     /// HR over LR, per axis.
     pub scale: [f64; 2],
-    /// How LR images were made.
+    /// Whether LR images were made from HR ones.
+    pub has_truth: bool,
+    /// How LR images were made, or are taken to have been made.
     pub kernel: Kernel,
     /// What lies behind the scene.
     pub background: Background,
@@ -115,6 +168,8 @@ pub struct SceneSummary {
     pub test: usize,
     /// Whether test views have true depth.
     pub has_depth: bool,
+    /// What was found and chosen, a line each.
+    pub notes: Vec<String>,
 }
 
 /// The stage.
@@ -126,10 +181,7 @@ impl Stage for Prep {
     const SUMMARY: &'static str = "Makes a scene of posed images: LR images to train on, HR ground truth, cameras and bounds.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![(
-            "dataset",
-            Input::required(&["dataset"], "folder with transforms_train.json and transforms_test.json (Blender format)"),
-        )]
+        vec![("dataset", Input::required(&["dataset"], "posed photographs: Blender's form, transforms.json, LLFF or COLMAP"))]
     }
 
     fn output() -> Output {
@@ -141,43 +193,108 @@ impl Stage for Prep {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let folder = context.input("dataset")?.folder();
-        let train = Dataset::read(folder, "train").bad_input("dataset")?;
-        let mut test = Dataset::read(folder, "test").bad_input("dataset")?;
+        let set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
+        let mut split = split(&set, params).map_err(Failure::Usage)?;
         if let Some(most) = params.test_views {
-            let (most, all) = (most as usize, test.frames.len());
+            let (most, all) = (most as usize, split.test.len());
             if most < all {
-                test.frames = (0..most).map(|i| test.frames[i * all / most].clone()).collect();
+                split.test = (0..most).map(|i| split.test[i * all / most]).collect();
             }
         }
-        let first = read_png(&train.frames[0].image).bad_input(frame_place("train", 0, &train.frames[0]))?;
-        let native = (first.width as u32, first.height as u32);
-        let sizes = sizes(native, params.lr, params.hr, params.scale).usage("parameters")?;
-        if params.kernel == Kernel::Avg && !sizes.is_integer() {
-            let message = format!("parameter kernel: avg needs a whole scale, not {:?} → {:?}; choose box", sizes.hr, sizes.lr);
-            return Err(Failure::Usage(message).into());
+        let first = set.frames[split.train[0]].pinhole().bad_input("dataset")?;
+        let native = (first.width, first.height);
+        let making = Making::new(&set, params).map_err(Failure::Usage)?;
+        let sizes = if making.has_truth {
+            sizes(native, params.lr, params.hr, params.scale)
+        } else {
+            enlarged(native, params.hr, params.scale)
+        };
+        let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
+        let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
+        notes.iter().for_each(|note| context.say(note));
+        if making.kernel == Kernel::Avg {
+            let all = split.train.iter().chain(&split.test).map(|&i| set.frames[i].pinhole().map(|k| job.sizes_of(&k)));
+            if let Some(odd) = all.collect::<Result<Vec<_>, _>>().bad_input("dataset")?.iter().find(|s| !s.is_integer()) {
+                let message = format!("parameter kernel: avg needs a whole scale, not {:?} → {:?}; choose box", odd.hr, odd.lr);
+                return Err(Failure::Usage(message).into());
+            }
         }
-        Job { context, params, sizes, native }.run(&train, &test)
+        let chosen = |numbers: &[usize]| numbers.iter().map(|&i| &set.frames[i]).collect::<Vec<_>>();
+        job.run(&set, notes, &chosen(&split.train), &chosen(&split.test))
     }
 }
 
-fn frame_place(split: &str, index: usize, frame: &Frame) -> String {
-    format!("transforms_{split}.json: frame {index} ({})", frame.name)
+/// Which frames are for what.
+fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
+    let count = set.frames.len();
+    match (params.split, &set.split) {
+        (Some(SplitKind::Given) | None, Some(given)) => Ok(given.clone()),
+        (Some(SplitKind::Given), None) => {
+            Err("parameter split: the data set doesn't say which views are for testing; choose holdout or paper".to_owned())
+        }
+        (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
+        (Some(SplitKind::Paper), _) => {
+            let mut split = Split::all(count);
+            // References are the first training views.
+            split.test.drain(..(params.references as usize).min(count.saturating_sub(1)));
+            Ok(split)
+        }
+    }
+}
+
+/// Whether LR images are made, and by which kernel they are, or are taken to have been.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Making {
+    has_truth: bool,
+    kernel: Kernel,
+}
+
+impl Making {
+    fn new(set: &Dataset, params: &Params) -> Result<Self, String> {
+        let is_benchmark = matches!(set.format, Format::Blender | Format::Llff);
+        let has_truth = match params.degrade {
+            Some(degrade) => degrade != Degrade::None,
+            None => is_benchmark || params.lr.is_some(),
+        };
+        let by_degrade = params.degrade.and_then(Degrade::kernel);
+        if let (Some(one), Some(other)) = (by_degrade, params.kernel.filter(|k| by_degrade.is_some_and(|d| d != *k))) {
+            return Err(format!("parameter kernel: {other:?} where degrade is {one:?}; give one of them"));
+        }
+        if !has_truth && params.lr.is_some() {
+            return Err("parameter lr: without degradation the photographs' own size is the LR size; leave lr out".to_owned());
+        }
+        if !has_truth && params.kernel == Some(Kernel::Avg) {
+            return Err("parameter kernel: avg makes LR images and can't be assumed; choose box".to_owned());
+        }
+        let default = if has_truth { Kernel::Lanczos } else { Kernel::Box };
+        Ok(Self { has_truth, kernel: by_degrade.or(params.kernel).unwrap_or(default) })
+    }
+}
+
+/// Where in the data set a complaint belongs.
+fn place(frame: &Frame) -> String {
+    format!("frame {}", frame.name)
 }
 
 /// Everything the steps of one run share.
 struct Job<'a> {
     context: &'a Context,
     params: &'a Params,
+    making: Making,
+    /// Those of the first training view, and its own size.
     sizes: Sizes,
     native: (u32, u32),
 }
 
 impl Job<'_> {
-    fn run(&self, train: &Dataset, test: &Dataset) -> anyhow::Result<()> {
-        let progress = self.context.progress("preparing", (train.frames.len() + test.frames.len()) as u64);
-        let train_cameras = self.cameras(train, self.native);
-        let mut bounds = bounds_of(&train_cameras);
+    fn run(&self, set: &Dataset, notes: Vec<String>, train: &[&Frame], test: &[&Frame]) -> anyhow::Result<()> {
+        let progress = self.context.progress("preparing", (train.len() + test.len()) as u64);
+        let cameras = |frames: &[&Frame]| -> anyhow::Result<Vec<Camera>> {
+            frames.iter().map(|f| Ok(f.camera(f.pinhole().bad_input("dataset")?))).collect()
+        };
+        let train_cameras = cameras(train)?;
+        let depths: Vec<_> = train.iter().map(|f| f.depths).collect();
+        let mut bounds = bounds_of(&train_cameras, &depths);
         for (name, given, bound) in [("near", self.params.near, &mut bounds.near), ("far", self.params.far, &mut bounds.far)] {
             if let Some(value) = given {
                 if !value.is_finite() {
@@ -191,33 +308,31 @@ impl Job<'_> {
             return Err(Failure::Usage(message).into());
         }
 
-        let references = (self.params.references as usize).min(train.frames.len());
-        let train_pictures = (0..train.frames.len())
-            .into_par_iter()
-            .map(|i| -> anyhow::Result<LowResolution> {
+        let references = if self.making.has_truth { (self.params.references as usize).min(train.len()) } else { 0 };
+        let train_pictures = train
+            .par_iter()
+            .enumerate()
+            .map(|(i, frame)| -> anyhow::Result<LowResolution> {
                 self.context.check_interrupt()?;
-                let (hr, lr) = self.pictures("train", i, &train.frames[i])?;
-                self.write_low("train/images", &train.frames[i].name, &lr)?;
-                if i < references {
-                    self.write_high("references", &train.frames[i].name, &hr)?;
+                let (hr, lr) = self.pictures(frame)?;
+                self.write_low("train/images", &frame.name, &lr)?;
+                if let Some(hr) = hr.filter(|_| i < references) {
+                    self.write_high("references", &frame.name, &hr)?;
                 }
                 progress.add(1);
                 Ok(lr)
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
-        let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.params.kernel));
+        let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
         let mut views = Views::new(self.params.background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
-            .map(|c| {
-                let camera = c.resized(self.sizes.lr.0, self.sizes.lr.1);
-                View { image: Some(low_name(&c.name)), ..View::camera_only(camera) }
-            })
+            .map(|c| View { image: Some(low_name(&c.name)), ..View::camera_only(self.resized(c, |s| s.lr)) })
             .collect();
         if self.params.hull == HullSource::Alpha {
             let cameras: Vec<Camera> = views.views.iter().map(|v| v.camera.clone()).collect();
             let alphas: Vec<Vec<f32>> = train_pictures.iter().map(LowResolution::alpha).collect();
-            let footprint = degrade::footprint(self.params.kernel);
+            let footprint = degrade::footprint(self.making.kernel);
             bounds = hull::tightened(&bounds, &cameras, &alphas, footprint).bad_input("hull: alpha")?;
             if self.params.near.is_none() && self.params.far.is_none() {
                 bounds = bounds::with_range(bounds, &train_cameras);
@@ -232,10 +347,12 @@ impl Job<'_> {
         }
         drop(train_pictures);
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
-        let degradation = Degradation { kernel: self.params.kernel, hr: self.sizes.hr.into() };
-        self.context.write_json(&format!("train/{DEGRADATION_FILE}"), &degradation)?;
+        let degradation = Degradation { kernel: self.making.kernel, hr: self.sizes.hr.into() };
+        for subtree in ["train", "truth"] {
+            self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &degradation)?;
+        }
 
-        let high = |c: &Camera| c.resized(self.sizes.hr.0, self.sizes.hr.1);
+        let high = |c: &Camera| self.resized(c, |s| s.hr);
         let reference_views = train_cameras[..references]
             .iter()
             .map(|c| View { image: Some(format!("images/{}.png", c.name)), ..View::camera_only(high(c)) })
@@ -245,56 +362,78 @@ impl Job<'_> {
             self.context.write_json(&format!("references/{VIEWS_FILE}"), &views)?;
         }
 
-        (0..test.frames.len())
-            .into_par_iter()
-            .map(|i| {
+        test.par_iter()
+            .map(|frame| {
                 self.context.check_interrupt()?;
-                let frame = &test.frames[i];
-                let (hr, lr) = self.pictures("test", i, frame)?;
-                self.write_high("truth", &frame.name, &hr)?;
+                let (hr, lr) = self.pictures(frame)?;
+                if let Some(hr) = &hr {
+                    self.write_high("truth", &frame.name, hr)?;
+                }
                 self.write_low("truth/low", &frame.name, &lr)?;
-                if let Some(depth) = &frame.depth {
-                    self.write_depth(depth, &frame.name).bad_input(frame_place("test", i, frame))?;
+                if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
+                    self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(place(frame))?;
                 }
                 progress.add(1);
                 Ok(())
             })
             .collect::<anyhow::Result<Vec<()>>>()?;
-        let truth: Vec<View> = self
-            .cameras(test, self.native)
+        let truth: Vec<View> = cameras(test)?
             .iter()
-            .zip(&test.frames)
+            .zip(test)
             .map(|(c, frame)| View {
                 camera: high(c),
-                image: Some(format!("images/{}.png", c.name)),
-                depth: frame.depth.as_ref().map(|_| format!("depth/{}.exr", c.name)),
-                low_resolution: Some(format!("low/{}.{}", c.name, degrade::extension(self.params.kernel))),
+                image: self.making.has_truth.then(|| format!("images/{}.png", c.name)),
+                depth: frame.depth.as_ref().filter(|_| self.making.has_truth).map(|_| format!("depth/{}.exr", c.name)),
+                low_resolution: Some(format!("low/{}.{}", c.name, degrade::extension(self.making.kernel))),
             })
             .collect();
         let cameras = truth.iter().map(|v| View::camera_only(v.camera.clone())).collect();
         self.context.write_json(&format!("truth/{VIEWS_FILE}"), &Views::new(self.params.background, bounds, truth))?;
         self.context.write_json(&format!("cameras/{VIEWS_FILE}"), &Views::new(self.params.background, bounds, cameras))?;
-        self.summarise(train, test, bounds)
+        self.summarise(set, notes, train, test, bounds)
     }
 
-    fn cameras(&self, dataset: &Dataset, (width, height): (u32, u32)) -> Vec<Camera> {
-        let intrinsics = Intrinsics::from_angle_x(width, height, dataset.camera_angle_x);
-        let camera = |f: &Frame| Camera { name: f.name.clone(), intrinsics, camera_to_world: f.camera_to_world };
-        dataset.frames.iter().map(camera).collect()
+    /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
+    fn sizes_of(&self, native: &scene::Intrinsics) -> Sizes {
+        let of = |length: u32, first: u32, target: u32| {
+            ((f64::from(length) * f64::from(target) / f64::from(first)).round() as u32).max(1)
+        };
+        let size = |target: (u32, u32)| (of(native.width, self.native.0, target.0), of(native.height, self.native.1, target.1));
+        Sizes { lr: size(self.sizes.lr), hr: size(self.sizes.hr) }
     }
 
-    fn pictures(&self, split: &str, index: usize, frame: &Frame) -> anyhow::Result<(Rgba8, LowResolution)> {
-        let image = read_png(&frame.image).bad_input(frame_place(split, index, frame))?;
-        let size = (image.width as u32, image.height as u32);
-        if size != self.native {
-            let message = format!(
-                "{}: {size:?} pixels where the first has {:?}; all images must be of one size",
-                frame_place(split, index, frame),
-                self.native
-            );
-            return Err(Failure::BadInput(message).into());
+    fn resized(&self, camera: &Camera, which: impl Fn(Sizes) -> (u32, u32)) -> Camera {
+        let (width, height) = which(self.sizes_of(&camera.intrinsics));
+        camera.resized(width, height)
+    }
+
+    /// The HR picture, where there is one, and the LR picture.
+    fn pictures(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LowResolution)> {
+        let (image, pinhole) = frame.photograph().bad_input(place(frame))?;
+        if !self.making.has_truth {
+            return Ok((None, LowResolution::Bytes(image)));
         }
-        Ok(degrade(&image, &self.sizes, self.params.kernel))
+        let (hr, lr) = degrade(&image, &self.sizes_of(&pinhole), self.making.kernel);
+        Ok((Some(hr), lr))
+    }
+
+    /// What was chosen, in a line.
+    fn choice(&self, split: &Split) -> String {
+        let Sizes { lr, hr } = self.sizes;
+        let kernel = format!("{:?}", self.making.kernel).to_lowercase();
+        let both = split.train.iter().filter(|i| split.test.contains(i)).count();
+        let parts = match both {
+            0 => format!("{} views to train on, {} others to test", split.train.len(), split.test.len()),
+            _ => format!("{} views to train on, {} to test, {both} of them for both", split.train.len(), split.test.len()),
+        };
+        if self.making.has_truth {
+            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
+        } else {
+            format!(
+                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR is {}×{}",
+                lr.0, lr.1, hr.0, hr.1
+            )
+        }
     }
 
     fn write_high(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
@@ -302,7 +441,7 @@ impl Job<'_> {
     }
 
     fn write_low(&self, folder: &str, name: &str, image: &LowResolution) -> anyhow::Result<()> {
-        let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.params.kernel)))?;
+        let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.making.kernel)))?;
         match image {
             LowResolution::Bytes(image) => write_png(&path, image)?,
             LowResolution::Floats(picture) => {
@@ -323,11 +462,10 @@ impl Job<'_> {
     }
 
     /// True depth at HR size: that of the nearest native pixel centre, since averaging depths across an edge invents surfaces.
-    fn write_depth(&self, source: &Path, name: &str) -> anyhow::Result<()> {
+    fn write_depth(&self, source: &Path, name: &str, (width, height): (usize, usize)) -> anyhow::Result<()> {
         let native = read_exr(source)?;
         let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", source.display()));
         let (depth, opacity) = (channel("Z")?, channel("A")?);
-        let (width, height) = (self.sizes.hr.0 as usize, self.sizes.hr.1 as usize);
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
         let channels =
@@ -348,34 +486,43 @@ impl Job<'_> {
         )
     }
 
-    fn summarise(&self, train: &Dataset, test: &Dataset, bounds: Bounds) -> anyhow::Result<()> {
+    fn summarise(
+        &self,
+        set: &Dataset,
+        notes: Vec<String>,
+        train: &[&Frame],
+        test: &[&Frame],
+        bounds: Bounds,
+    ) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let scale = [f64::from(hr.0) / f64::from(lr.0), f64::from(hr.1) / f64::from(lr.1)];
         self.context.write_json(
             "scene.json",
             &SceneSummary {
-                format: "blender".to_owned(),
+                format: set.format.to_string(),
                 native: self.native.into(),
                 hr: hr.into(),
                 lr: lr.into(),
                 scale,
-                kernel: self.params.kernel,
+                has_truth: self.making.has_truth,
+                kernel: self.making.kernel,
                 background: self.params.background,
                 bounds,
-                train: train.frames.len(),
-                test: test.frames.len(),
-                has_depth: test.frames.iter().any(|f| f.depth.is_some()),
+                train: train.len(),
+                test: test.len(),
+                has_depth: self.making.has_truth && test.iter().any(|f| f.depth.is_some()),
+                notes,
             },
         )?;
         self.context.write_summary(&format!(
             "{} training views at {}×{} from {}×{} ({:?}), {} test views; rays from {:.2} to {:.2}",
-            train.frames.len(),
+            train.len(),
             lr.0,
             lr.1,
             hr.0,
             hr.1,
-            self.params.kernel,
-            test.frames.len(),
+            self.making.kernel,
+            test.len(),
             bounds.near,
             bounds.far
         ))

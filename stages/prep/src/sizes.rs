@@ -76,6 +76,22 @@ pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option
     Ok(Sizes { lr: (lr, height(lr)), hr: (hr, height(hr)) })
 }
 
+/// LR and HR size where the photographs are the LR images: HR from `hr` or `scale`.
+pub fn enlarged(native: (u32, u32), hr: Option<u32>, scale: Option<f64>) -> Result<Sizes, SizeError> {
+    let scale = match (hr, scale) {
+        (Some(hr), Some(scale)) if (f64::from(native.0) * scale).round() != f64::from(hr) => {
+            return Err(SizeError::Contradiction { lr: native.0, hr, scale });
+        }
+        (Some(hr), _) => f64::from(hr) / f64::from(native.0),
+        (None, scale) => scale.unwrap_or(2.0),
+    };
+    if scale < 1.0 {
+        return Err(SizeError::TooLarge { name: "lr", asked: native.0, larger: "hr", limit: hr.unwrap_or_default() });
+    }
+    let times = |length: u32| (f64::from(length) * scale).round() as u32;
+    Ok(Sizes { lr: native, hr: (times(native.0), times(native.1)) })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -96,6 +112,17 @@ mod tests {
         assert_eq!(sizes(native, None, None, None), Ok(Sizes { lr: (400, 400), hr: native }));
         assert_eq!(sizes((504, 378), None, None, Some(4.0)), Ok(Sizes { lr: (126, 95), hr: (504, 378) }));
         assert!(!sizes((504, 378), None, None, Some(4.0)).unwrap().is_integer());
+    }
+
+    #[test]
+    fn photographs_can_be_the_lr_images() {
+        let expected = Sizes { lr: (90, 61), hr: (135, 92) };
+        for (hr, scale) in [(Some(135), None), (None, Some(1.5)), (Some(135), Some(1.5))] {
+            assert_eq!(enlarged((90, 61), hr, scale), Ok(expected));
+        }
+        assert_eq!(enlarged((90, 61), None, None).map(|s| s.hr), Ok((180, 122)));
+        assert!(matches!(enlarged((90, 61), Some(80), None), Err(SizeError::TooLarge { name: "lr", asked: 90, limit: 80, .. })));
+        assert!(matches!(enlarged((90, 61), Some(200), Some(2.0)), Err(SizeError::Contradiction { .. })));
     }
 
     #[test]

@@ -55,10 +55,11 @@ pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
 /// A table of means, one row a point, the best figure of each column in bold.
 fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
-    let columns: [(&str, &str, usize, bool); 6] = [
+    let columns: [(&str, &str, usize, bool); 7] = [
         ("PSNR ↑ dB", "psnr", 2, true),
         ("SSIM ↑", "ssim", 4, true),
         ("LPIPS ↓", "lpips", 4, false),
+        ("PSNR at LR ↑ dB", "low_resolution/psnr", 2, true),
         ("depth error ↓ mean", "depth/mean_absolute", 4, false),
         ("median", "depth/median_absolute", 4, false),
         ("missed", "depth/missed", 4, false),
@@ -77,7 +78,7 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
                         @for (_, path, digits, up) in columns {
                             @match mean(point, path) {
                                 Some(value) => td class=(if points.len() > 1 && value == best(path, up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
-                                None if path == "lpips" => td { "weights not given" },
+                                None if path == "lpips" && mean(point, "psnr").is_some() => td { "weights not given" },
                                 None => td { "–" },
                             }
                         }
@@ -134,15 +135,19 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
             found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
         };
         let number = |key: &str, digits: usize| {
-            scores["scores"][key].as_f64().map(|v| format!("{v:.digits$}")).unwrap_or_else(|| "–".to_owned())
+            scores["scores"]
+                .pointer(key)
+                .and_then(Value::as_f64)
+                .map(|v| format!("{v:.digits$}"))
+                .unwrap_or_else(|| "–".to_owned())
         };
         rows.push(html! {
-            h3 { "View " (name) " " small { "PSNR " (number("psnr", 2)) " dB · SSIM " (number("ssim", 4)) } }
+            h3 { "View " (name) " " small { "PSNR " (number("/psnr", 2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr", 2)) " dB" } }
             div class="row" {
                 (figure("lr", low.clone().map(|l| l.0), caption("LR", &low)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
-                (figure("px", error.map(|b| data_uri(&b)), "error".to_owned()))
+                (figure("px", error.map(|b| data_uri(&b)), if expected.is_some() { "error" } else { "error at LR" }.to_owned()))
                 (figure("px", depth.map(|d| uri_of(&d)), "depth (warm is near)".to_owned()))
             }
         });

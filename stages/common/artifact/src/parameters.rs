@@ -65,6 +65,10 @@ impl Schema {
     /// The words a parameter may be, where it is a choice: the validator itself only says that no alternative fits.
     fn choices(&self, name: &str) -> Option<Vec<String>> {
         let property = self.properties()?.get(name)?;
+        // What may be left out is a choice between its kind and null.
+        let is_null = |one: &&Value| one.get("type").is_some_and(|t| t == "null");
+        let inner = property.get("anyOf").and_then(Value::as_array).and_then(|of| of.iter().find(|one| !is_null(one)));
+        let property = inner.unwrap_or(property);
         let definition = property.get("$ref").and_then(Value::as_str).and_then(|r| self.schema.pointer(r.strip_prefix('#')?));
         let definition = definition.unwrap_or(property);
         if let Some(words) = definition.get("enum").and_then(Value::as_array) {
@@ -89,7 +93,8 @@ mod tests {
             "additionalProperties": false,
             "properties": {
                 "scale": {"type": "integer", "minimum": 1, "default": 2},
-                "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"}
+                "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
+                "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}], "default": null}
             },
             "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"}, {"const": "lanczos", "type": "string"}]}}
         }))
@@ -102,16 +107,17 @@ mod tests {
 
     #[test]
     fn defaults_are_filled_in() {
-        assert_eq!(resolve(&json!({"scale": 4})).unwrap(), json!({"kernel": "lanczos", "scale": 4}));
+        assert_eq!(resolve(&json!({"scale": 4})).unwrap(), json!({"assumed": null, "kernel": "lanczos", "scale": 4}));
     }
 
     #[test]
     fn unknown_names_types_and_ranges_are_refused() {
         for (given, name, word) in [
-            (json!({"kernal": "box"}), "kernal", "known: kernel, scale"),
+            (json!({"kernal": "box"}), "kernal", "known: assumed, kernel, scale"),
             (json!({"scale": 0}), "scale", "minimum"),
             (json!({"scale": "two"}), "scale", "integer"),
             (json!({"kernel": "gauss"}), "kernel", r#""gauss" is not one of "box", "lanczos""#),
+            (json!({"assumed": "gauss"}), "assumed", r#""gauss" is not one of "box", "lanczos""#),
         ] {
             let problems = resolve(&given).unwrap_err();
             assert_eq!(problems[0].name, name);

@@ -1,0 +1,475 @@
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use artifact::relative_path;
+use glam::{DMat3, DQuat, DVec3};
+use scene::Intrinsics;
+
+use crate::bytes::Bytes;
+use crate::frame::{names, pose_from_world_to_camera};
+use crate::photograph::{fitted, look};
+use crate::{Dataset, DatasetError, Distortion, Format, Frame, Lens, read_text};
+
+/// A reconstruction as COLMAP writes it (its documentation, "Output format").
+#[derive(Debug, Default)]
+struct Model {
+    cameras: BTreeMap<u32, Lens>,
+    images: Vec<Image>,
+    points: BTreeMap<u64, DVec3>,
+}
+
+#[derive(Debug)]
+struct Image {
+    /// World to camera; axes right, down, forward.
+    rotation: DMat3,
+    translation: DVec3,
+    camera: u32,
+    name: String,
+    /// Points that it sees.
+    points: Vec<u64>,
+}
+
+/// Folders below `sparse` that hold a model, by name; `None` where there is none.
+pub(crate) fn models(folder: &Path) -> Option<Vec<PathBuf>> {
+    let sparse = folder.join("sparse");
+    let mut found: Vec<PathBuf> = std::fs::read_dir(&sparse).ok()?.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
+    found.sort();
+    found.insert(0, sparse);
+    let is_model = |p: &PathBuf| ["bin", "txt"].iter().any(|e| p.join("images").with_extension(e).is_file());
+    found.retain(is_model);
+    (!found.is_empty()).then_some(found)
+}
+
+/// Reads the model with most images, the first of several, and the pictures that it names.
+pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, DatasetError> {
+    let mut chosen: Option<(&PathBuf, Model)> = None;
+    let mut sizes = Vec::new();
+    for path in models {
+        let model = Model::read(path)?;
+        sizes.push(format!("{} has {}", path.strip_prefix(folder).unwrap_or(path).display(), model.images.len()));
+        if chosen.as_ref().is_none_or(|(_, best)| model.images.len() > best.images.len()) {
+            chosen = Some((path, model));
+        }
+    }
+    let (path, mut model) = chosen.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
+    let list = path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
+    // By name: the order in which COLMAP happened to register them means nothing.
+    model.images.sort_by(|a, b| a.name.cmp(&b.name));
+    let mut notes =
+        vec![format!("COLMAP: {} photographs of {}", model.images.len(), path.strip_prefix(folder).unwrap_or(path).display())];
+    if models.len() > 1 {
+        notes.push(format!("of {} models the one with most images is taken: {}", models.len(), sizes.join(", ")));
+    }
+    let pictures = if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
+    let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
+    for (index, image) in model.images.iter().enumerate() {
+        let of_frame = |reason: String| DatasetError::Frame { path: list.clone(), index, file: image.name.clone(), reason };
+        let file = relative_path(&image.name).map_err(of_frame)?;
+        if !pictures.join(&file).is_file() {
+            missing.push(&image.name);
+            continue;
+        }
+        frames.push(model.frame(image, pictures.join(&file)).map_err(of_frame)?);
+        files.push(file);
+    }
+    if frames.is_empty() {
+        let reason = match missing.first() {
+            Some(first) => format!("not one of its {} pictures is in {}, first {first}", missing.len(), pictures.display()),
+            None => "it has no images; at least one is needed".to_owned(),
+        };
+        return Err(DatasetError::format(&list, reason));
+    }
+    if let Some(first) = missing.first() {
+        notes.push(format!("{} of {} images have no picture and are left out, first {first}", missing.len(), model.images.len()));
+    }
+    for (frame, name) in frames.iter_mut().zip(names(&list, &files)?) {
+        frame.name = name;
+    }
+    Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
+}
+
+impl Model {
+    fn read(folder: &Path) -> Result<Self, DatasetError> {
+        let mut model = Self::default();
+        if folder.join("images.bin").is_file() {
+            let bytes = |name: &str| {
+                let path = folder.join(name);
+                std::fs::read(&path).map(|b| (path.clone(), b)).map_err(|source| DatasetError::Io { path, source })
+            };
+            let (path, cameras) = bytes("cameras.bin")?;
+            model.binary_cameras(&mut Bytes::new(&path, &cameras))?;
+            let (path, images) = bytes("images.bin")?;
+            model.binary_images(&mut Bytes::new(&path, &images))?;
+            if folder.join("points3D.bin").is_file() {
+                let (path, points) = bytes("points3D.bin")?;
+                model.binary_points(&mut Bytes::new(&path, &points))?;
+            }
+        } else {
+            model.text_cameras(&folder.join("cameras.txt"))?;
+            model.text_images(&folder.join("images.txt"))?;
+            if folder.join("points3D.txt").is_file() {
+                model.text_points(&folder.join("points3D.txt"))?;
+            }
+        }
+        Ok(model)
+    }
+
+    fn binary_cameras(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(24, "cameras")? {
+            let id = bytes.u32("a camera")?;
+            let model = bytes.u32("a camera")?;
+            let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
+            let Some((name, count)) = MODELS.get(model as usize) else {
+                return Err(bytes.error(format!("camera {id} has model {model}, which COLMAP doesn't have")));
+            };
+            let parameters = (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
+            let lens = lens(name, width, height, &parameters).map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
+            self.cameras.insert(id, lens);
+        }
+        end(bytes, "cameras")
+    }
+
+    fn binary_images(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(73, "images")? {
+            let id = bytes.u32("an image")?;
+            let (turn, translation) = (bytes.f64s::<4>("an image")?, bytes.f64s::<3>("an image")?);
+            let camera = bytes.u32("an image")?;
+            let name = bytes.text("an image's name")?.to_owned();
+            let rotation = rotation(turn).map_err(|reason| bytes.error(format!("image {id} ({name}): {reason}")))?;
+            let mut points = Vec::new();
+            for _ in 0..bytes.count(24, "points of an image")? {
+                bytes.take(16, "a point of an image")?;
+                points.push(bytes.u64("a point of an image")?);
+            }
+            self.images.push(Image { rotation, translation: translation.into(), camera, name, points });
+        }
+        end(bytes, "images")
+    }
+
+    fn binary_points(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
+        for _ in 0..bytes.count(51, "points")? {
+            let id = bytes.u64("a point")?;
+            self.points.insert(id, bytes.f64s::<3>("a point")?.into());
+            bytes.take(11, "a point")?;
+            let track = bytes.count(8, "images of a point")?;
+            bytes.take(8 * track, "a point's images")?;
+        }
+        end(bytes, "points")
+    }
+
+    fn text_cameras(&mut self, path: &Path) -> Result<(), DatasetError> {
+        for line in Line::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+            let id = line.number(0, "camera id")?;
+            let name = line.words.get(1).copied().unwrap_or_default();
+            let (width, height) = (line.number(2, "width")?, line.number(3, "height")?);
+            let parameters = (4..line.words.len()).map(|i| line.number(i, "parameter")).collect::<Result<Vec<f64>, _>>()?;
+            let lens = lens(name, width, height, &parameters).map_err(|reason| line.error(reason))?;
+            self.cameras.insert(id, lens);
+        }
+        Ok(())
+    }
+
+    fn text_images(&mut self, path: &Path) -> Result<(), DatasetError> {
+        let text = read_text(path)?;
+        // Two lines an image; the second, its points, may be empty.
+        let mut lines = Line::all(path, &text);
+        while let Some(line) = lines.next() {
+            if line.words.is_empty() {
+                continue;
+            }
+            let turn = [1, 2, 3, 4].map(|i| line.number(i, "rotation"));
+            let [w, x, y, z] = turn;
+            let rotation = rotation([w?, x?, y?, z?]).map_err(|reason| line.error(reason))?;
+            let translation =
+                DVec3::new(line.number(5, "translation")?, line.number(6, "translation")?, line.number(7, "translation")?);
+            let camera = line.number(8, "camera id")?;
+            if line.words.len() < 10 {
+                return Err(line.error("an image's name is missing"));
+            }
+            let name = line.words[9..].join(" ");
+            let mut points = Vec::new();
+            if let Some(second) = lines.next() {
+                for i in (2..second.words.len()).step_by(3) {
+                    // -1 where no point of the model is seen.
+                    let id: i64 = second.number(i, "point id")?;
+                    points.extend(u64::try_from(id).ok());
+                }
+            }
+            self.images.push(Image { rotation, translation, camera, name, points });
+        }
+        Ok(())
+    }
+
+    fn text_points(&mut self, path: &Path) -> Result<(), DatasetError> {
+        for line in Line::all(path, &read_text(path)?).filter(|l| !l.words.is_empty()) {
+            let id = line.number(0, "point id")?;
+            let at = DVec3::new(line.number(1, "x")?, line.number(2, "y")?, line.number(3, "z")?);
+            self.points.insert(id, at);
+        }
+        Ok(())
+    }
+
+    fn frame(&self, image: &Image, picture: PathBuf) -> Result<Frame, String> {
+        let lens = self.cameras.get(&image.camera).ok_or_else(|| format!("there is no camera {}", image.camera))?;
+        let stored = look(&picture).map_err(|e| e.to_string())?;
+        let (lens, turned) = fitted(*lens, stored).map_err(|reason| format!("{reason} (camera {})", image.camera))?;
+        let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
+        let depths = depths(image, &self.points);
+        let frame = Frame { name: String::new(), image: picture, turned, mask: None, depth: None, lens, camera_to_world, depths };
+        frame.check().map(|()| frame)
+    }
+}
+
+/// 0.1 and 99.9 % of the depths of what an image sees: a few points are always wrong.
+fn depths(image: &Image, points: &BTreeMap<u64, DVec3>) -> Option<[f64; 2]> {
+    let seen: BTreeSet<u64> = image.points.iter().copied().collect();
+    let depth = |id: &u64| points.get(id).map(|p| (image.rotation * *p + image.translation).z);
+    let mut depths: Vec<f64> = seen.iter().filter_map(depth).filter(|d| d.is_finite() && *d > 0.0).collect();
+    depths.sort_unstable_by(f64::total_cmp);
+    let last = depths.len().checked_sub(1)?;
+    let share = |s: f64| depths[(s * last as f64).round() as usize];
+    let (near, far) = (share(0.001), share(0.999));
+    (near < far).then_some([near, far])
+}
+
+/// COLMAP's camera models in the order of their numbers, and how many parameters each has.
+const MODELS: [(&str, usize); 11] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+];
+
+fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
+    let size = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0).ok_or_else(|| format!("its size is {width}×{height}"));
+    let (columns, rows) = (size(width)?, size(height)?);
+    let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) = match (model, parameters) {
+        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 3], [0.0; 2]),
+        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], [0.0; 3], [0.0; 2]),
+        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], [k, 0.0, 0.0], [0.0; 2]),
+        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], [k1, k2, 0.0], [0.0; 2]),
+        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy], [cx, cy], [k1, k2, 0.0], [p1, p2]),
+        _ => match MODELS.iter().find(|(name, _)| *name == model) {
+            Some((_, count)) if *count != parameters.len() => {
+                return Err(format!("{model} has {count} parameters, not {}", parameters.len()));
+            }
+            Some(_) => return Err(format!("camera model {model} is not supported; undistort first (colmap image_undistorter)")),
+            None => return Err(format!("camera model {model:?} is none of COLMAP's")),
+        },
+    };
+    let intrinsics = Intrinsics { width: columns, height: rows, fx: focal[0], fy: focal[1], cx: centre[0], cy: centre[1] };
+    Ok(Lens { intrinsics, distortion: Distortion { radial, tangential } })
+}
+
+/// The rotation of a quaternion (w, x, y, z), which needn't have unit length.
+fn rotation([w, x, y, z]: [f64; 4]) -> Result<DMat3, String> {
+    let quaternion = DQuat::from_xyzw(x, y, z, w);
+    let length = quaternion.length();
+    if !(length.is_finite() && length > 1e-9) {
+        return Err(format!("its rotation ({w}, {x}, {y}, {z}) is none"));
+    }
+    Ok(DMat3::from_quat(quaternion * (1.0 / length)))
+}
+
+fn end(bytes: &Bytes<'_>, what: &str) -> Result<(), DatasetError> {
+    if bytes.is_empty() {
+        Ok(())
+    } else {
+        Err(bytes.error(format!("there is more after the last of the {what}; is it another file?")))
+    }
+}
+
+/// A line of a text file, without those that begin with `#`.
+struct Line<'a> {
+    path: &'a Path,
+    number: usize,
+    words: Vec<&'a str>,
+}
+
+impl<'a> Line<'a> {
+    fn all(path: &'a Path, text: &'a str) -> impl Iterator<Item = Self> {
+        let lines = text.lines().enumerate().filter(|(_, line)| !line.starts_with('#'));
+        lines.map(move |(i, line)| Self { path, number: i + 1, words: line.split_whitespace().collect() })
+    }
+
+    fn error(&self, reason: impl std::fmt::Display) -> DatasetError {
+        DatasetError::format(self.path, format!("line {}: {reason}", self.number))
+    }
+
+    fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> Result<T, DatasetError> {
+        let Some(word) = self.words.get(index) else { return Err(self.error(format!("{what} is missing"))) };
+        word.parse().map_err(|_| self.error(format!("{what}: {word:?} is not a number of its kind")))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photograph::tests::write_png;
+
+    const CAMERAS: &str =
+        "# Camera list\n1 SIMPLE_RADIAL 80 60 70 40 30 -0.1\n2 OPENCV 80 60 70 71 41 29 0.1 0.01 0.001 -0.002\n";
+    const IMAGES: &str = "# Image list\n7 1 0 0 0 0 0 3 1 b 1.png\n10 10 5 20 20 6 30 30 -1\n3 0 0 0 2 1 2 3 2 a.png\n\n";
+    const POINTS: &str = "5 0 0 1 255 0 0 0.1 7 0\n6 0 0 2 255 0 0 0.1 7 1\n";
+
+    fn binary() -> [Vec<u8>; 3] {
+        let mut cameras = 2u64.to_le_bytes().to_vec();
+        for (id, model, parameters) in
+            [(1u32, 2u32, &[70., 40., 30., -0.1][..]), (2, 4, &[70., 71., 41., 29., 0.1, 0.01, 0.001, -0.002])]
+        {
+            cameras.extend([id.to_le_bytes(), model.to_le_bytes()].concat());
+            cameras.extend([80u64.to_le_bytes(), 60u64.to_le_bytes()].concat());
+            cameras.extend(parameters.iter().flat_map(|p: &f64| p.to_le_bytes()));
+        }
+        let mut images = 2u64.to_le_bytes().to_vec();
+        for (id, pose, camera, name, points) in [
+            (7u32, [1., 0., 0., 0., 0., 0., 3.0f64], 1u32, "b 1.png", &[5u64, 6, u64::MAX][..]),
+            (3, [0., 0., 0., 2., 1., 2., 3.], 2, "a.png", &[]),
+        ] {
+            images.extend(id.to_le_bytes());
+            images.extend(pose.iter().flat_map(|p| p.to_le_bytes()));
+            images.extend(camera.to_le_bytes());
+            images.extend(name.as_bytes());
+            images.push(0);
+            images.extend((points.len() as u64).to_le_bytes());
+            for (i, point) in points.iter().enumerate() {
+                images.extend([10.0 * (i + 1) as f64; 2].iter().flat_map(|p| p.to_le_bytes()));
+                images.extend(point.to_le_bytes());
+            }
+        }
+        let mut points = 2u64.to_le_bytes().to_vec();
+        for (id, z) in [(5u64, 1.0f64), (6, 2.0)] {
+            points.extend(id.to_le_bytes());
+            points.extend([0.0, 0.0, z].iter().flat_map(|p| p.to_le_bytes()));
+            points.extend([255, 0, 0]);
+            points.extend(0.1f64.to_le_bytes());
+            points.extend(1u64.to_le_bytes());
+            points.extend([7u32.to_le_bytes(), 0u32.to_le_bytes()].concat());
+        }
+        [cameras, images, points]
+    }
+
+    fn folder(model: &str, files: &[(&str, &[u8])]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        add(&dir, model, files);
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        for name in ["a.png", "b 1.png"] {
+            write_png(&dir.path().join("images").join(name), 40, 30);
+        }
+        dir
+    }
+
+    fn add(dir: &tempfile::TempDir, model: &str, files: &[(&str, &[u8])]) {
+        let sparse = dir.path().join(model);
+        std::fs::create_dir_all(&sparse).unwrap();
+        files.iter().for_each(|(name, bytes)| std::fs::write(sparse.join(name), bytes).unwrap());
+    }
+
+    fn text<'a>(cameras: &'a str, images: &'a str, points: &'a str) -> [(&'static str, &'a [u8]); 3] {
+        [("cameras.txt", cameras.as_bytes()), ("images.txt", images.as_bytes()), ("points3D.txt", points.as_bytes())]
+    }
+
+    #[test]
+    fn binary_and_text_are_the_same() {
+        let [cameras, images, points] = binary();
+        let binary = folder("sparse/0", &[("cameras.bin", &cameras), ("images.bin", &images), ("points3D.bin", &points)]);
+        let text = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
+        let (one, other) = (Dataset::read(binary.path()).unwrap(), Dataset::read(text.path()).unwrap());
+        assert_eq!(one.notes, other.notes);
+        assert!(one.notes.contains(&"2 photographs have lens distortion, which is undone".to_owned()), "{:?}", one.notes);
+        let relative = |set: &Dataset| -> Vec<Frame> {
+            set.frames.iter().map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() }).collect()
+        };
+        assert_eq!(relative(&one), relative(&other));
+        let [a, b] = &one.frames[..] else { panic!("two frames") };
+        assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
+        // Pictures of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0, 1) at depth 1 + 3.
+        assert_eq!(b.lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0 });
+        assert_eq!(b.lens.distortion.radial, [-0.1, 0.0, 0.0]);
+        assert_eq!(b.depths, Some([4.0, 5.0]));
+        assert_eq!(b.camera_to_world, [[1., 0., 0., 0.], [0., -1., 0., 0.], [0., 0., -1., -3.]]);
+        assert_eq!(a.lens.distortion, Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] });
+        assert_eq!(a.depths, None);
+        assert!((a.camera_to_world[0][3] - 1.0).abs() < 1e-12 && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_largest_model_is_taken_and_said() {
+        let small = "1 1 0 0 0 0 0 3 1 a.png\n\n";
+        let dir = folder("sparse/0", &text(CAMERAS, small, ""));
+        add(&dir, "sparse/1", &text(CAMERAS, IMAGES, POINTS));
+        let set = Dataset::read(dir.path()).unwrap();
+        assert_eq!(set.frames.len(), 2);
+        assert!(set.notes[0].contains("sparse/1"), "{:?}", set.notes);
+        assert!(set.notes[1].contains("sparse/0 has 1, sparse/1 has 2"), "{:?}", set.notes);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let reads = |cameras: &str, images: &str| Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path());
+        for (from, to, words) in [
+            ("SIMPLE_RADIAL", "FOV", "line 2: FOV has 5 parameters"),
+            ("SIMPLE_RADIAL 80 60 70 40 30 -0.1", "SIMPLE_RADIAL_FISHEYE 80 60 70 40 30 -0.1", "not supported"),
+            ("SIMPLE_RADIAL", "ROUND", "none of COLMAP's"),
+            ("1 SIMPLE_RADIAL", "9 SIMPLE_RADIAL", "frame 1 (b 1.png): there is no camera 1"),
+            ("80 60 70 40", "0 60 70 40", "its size is 0×60"),
+            ("80 60 70 40", "80 80 70 40", "another shape"),
+            ("70 40 30 -0.1", "nan 40 30 -0.1", "fx is NaN"),
+            ("30 -0.1", "30 inf", "a coefficient of distortion is inf"),
+            ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
+        ] {
+            let message = reads(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();
+            assert!(message.contains(words), "{message}");
+        }
+        for (from, to, words) in [
+            ("7 1 0 0 0", "7 0 0 0 0", "line 2: its rotation (0, 0, 0, 0) is none"),
+            ("a.png", "../a.png", "not a path inside"),
+            (" 1 b 1.png", "", "line 2: camera id is missing"),
+            (" b 1.png", "", "line 2: an image's name is missing"),
+        ] {
+            let message = reads(CAMERAS, &IMAGES.replace(from, to)).unwrap_err().to_string();
+            assert!(message.contains(words), "{message}");
+        }
+        let gone = reads(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
+        assert!(gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"), "{:?}", gone.notes);
+        let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
+        assert!(none.contains("not one of its 2 pictures"), "{none}");
+        assert!(reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images"));
+    }
+
+    #[test]
+    fn binaries_cut_anywhere_or_with_other_bytes_are_errors_and_no_panic() {
+        let whole = binary();
+        let read = |files: &[Vec<u8>; 3]| {
+            let named = [("cameras.bin", &files[0][..]), ("images.bin", &files[1][..]), ("points3D.bin", &files[2][..])];
+            Dataset::read(folder("sparse/0", &named).path())
+        };
+        assert!(read(&whole).is_ok());
+        for file in 0..3 {
+            for end in 0..whole[file].len() {
+                let mut cut = whole.clone();
+                cut[file].truncate(end);
+                assert!(read(&cut).is_err(), "{file} {end}");
+            }
+            for place in 0..whole[file].len() {
+                let mut other = whole.clone();
+                other[file][place] ^= 0xff;
+                // Many are still a model; none may panic or allocate what isn't there.
+                drop(read(&other));
+            }
+            let mut longer = whole.clone();
+            longer[file].push(0);
+            assert!(read(&longer).unwrap_err().to_string().contains("there is more after the last"));
+        }
+        let mut huge = whole.clone();
+        huge[1][..8].copy_from_slice(&u64::MAX.to_le_bytes());
+        assert!(read(&huge).unwrap_err().to_string().contains("can't be in the"));
+    }
+}

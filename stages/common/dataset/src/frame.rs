@@ -1,0 +1,118 @@
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use glam::{DMat3, DVec3};
+use scene::{Camera, CameraError, Intrinsics};
+
+use crate::{DatasetError, Lens};
+
+/// A posed photograph.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Unique within the data set; fit for a file's name.
+    pub name: String,
+    /// The picture: PNG, JPEG or EXR.
+    pub image: PathBuf,
+    /// Whether it has to be turned as its EXIF data ask to be what its camera saw.
+    pub turned: bool,
+    /// What is to be left out of it: black there, white elsewhere.
+    pub mask: Option<PathBuf>,
+    /// True depth (EXR, channels `Z` and `A`), where the data has it.
+    pub depth: Option<PathBuf>,
+    /// What it was taken with; its size is the picture's.
+    pub lens: Lens,
+    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
+    pub camera_to_world: [[f64; 4]; 3],
+    /// Depth of the nearest and of the farthest point that it is known to see, along its axis, where the data says so.
+    pub depths: Option<[f64; 2]>,
+}
+
+impl Frame {
+    /// The camera with these intrinsics: those of the lens, of [`Frame::pinhole`], or resized ones.
+    pub fn camera(&self, intrinsics: Intrinsics) -> Camera {
+        Camera { name: self.name.clone(), intrinsics, camera_to_world: self.camera_to_world }
+    }
+
+    /// Refuses what no camera can be.
+    pub(crate) fn check(&self) -> Result<(), String> {
+        self.camera(self.lens.intrinsics).check().map_err(|e: CameraError| e.to_string())?;
+        self.lens.distortion.check()
+    }
+}
+
+/// Camera axes as columns and the centre, row by row.
+pub(crate) fn pose([right, up, back]: [DVec3; 3], centre: DVec3) -> [[f64; 4]; 3] {
+    [0, 1, 2].map(|k| [right[k], up[k], back[k], centre[k]])
+}
+
+/// The pose of a world-to-camera motion x' = R·x + t with axes right, down, forward (COLMAP, OpenCV).
+pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> [[f64; 4]; 3] {
+    let back = rotation.transpose();
+    pose([back.x_axis, -back.y_axis, -back.z_axis], -(back * translation))
+}
+
+/// Names for pictures, by their paths inside the data set: the files' names alone where those differ, else with their folders.
+pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
+    let text = |index: usize, part: Option<&std::ffi::OsStr>| {
+        part.and_then(|p| p.to_str()).map(str::to_owned).ok_or_else(|| DatasetError::Frame {
+            path: list.to_path_buf(),
+            index,
+            file: paths[index].display().to_string(),
+            reason: "its name is not UTF-8; rename the file".to_owned(),
+        })
+    };
+    let stem = |(index, path): (usize, &PathBuf)| text(index, path.file_stem());
+    let short = paths.iter().enumerate().map(stem).collect::<Result<Vec<_>, _>>()?;
+    if first_twice(&short).is_none() {
+        return Ok(short);
+    }
+    let joined = |(index, path): (usize, &PathBuf)| {
+        let whole = path.with_extension("");
+        let parts = whole.iter().map(|part| text(index, Some(part))).collect::<Result<Vec<_>, _>>()?;
+        Ok(parts.join("_"))
+    };
+    let long = paths.iter().enumerate().map(joined).collect::<Result<Vec<_>, DatasetError>>()?;
+    match first_twice(&long) {
+        None => Ok(long),
+        Some(index) => Err(DatasetError::Frame {
+            path: list.to_path_buf(),
+            index,
+            file: paths[index].display().to_string(),
+            reason: format!("a second view named {:?}; file names must differ", short[index]),
+        }),
+    }
+}
+
+/// The first that was there before.
+fn first_twice(names: &[String]) -> Option<usize> {
+    let mut seen = BTreeSet::new();
+    names.iter().position(|name| !seen.insert(name))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_as_short_as_can_be() {
+        let of = |paths: &[&str]| names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>());
+        assert_eq!(of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
+        assert_eq!(of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
+        assert!(of(&["x/a.jpg", "x/a.png"]).unwrap_err().to_string().contains("frame 1 (x/a.png): a second view named \"a\""));
+    }
+
+    /// A point in front of an OpenCV camera is seen by ours at the same pixel.
+    #[test]
+    fn axes_are_turned() {
+        let rotation = DMat3::from_axis_angle(DVec3::new(0.3, -0.5, 0.8).normalize(), 1.1);
+        let translation = DVec3::new(0.2, -0.4, 3.0);
+        let point = DVec3::new(0.3, 0.1, -0.2);
+        let seen = rotation * point + translation;
+        let intrinsics = scene::Intrinsics { width: 100, height: 80, fx: 90.0, fy: 95.0, cx: 48.0, cy: 41.0 };
+        let camera = Camera { name: "c".into(), intrinsics, camera_to_world: pose_from_world_to_camera(rotation, translation) };
+        let (x, y, depth) = camera.project(point).unwrap();
+        assert!((x - (48.0 + 90.0 * seen.x / seen.z)).abs() < 1e-9);
+        assert!((y - (41.0 + 95.0 * seen.y / seen.z)).abs() < 1e-9);
+        assert!((depth - seen.z).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,169 @@
+//! Posed photographs as folders have them. The form is found by looking: [`Dataset::read`] takes
+//!
+//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json` and `transforms_test.json`, one angle for all, PNG;
+//! * **transforms** (instant-ngp, nerfstudio): `transforms.json`, intrinsics for all or for each, lens distortion, masks;
+//! * **LLFF**: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …);
+//! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
+//!
+//! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and a [`Lens`];
+//! [`Frame::photograph`] reads its picture, upright as its poses have it and with the lens's distortion undone.
+//!
+//! Units: lengths are those of the poses; pixels count from the stored picture's top left corner, whose first pixel has its centre
+//! at (0.5, 0.5). Everything a file says is checked: sizes before anything is allocated, paths before anything is opened.
+//!
+//! ```no_run
+//! let set = dataset::Dataset::read("my-photographs".as_ref())?;
+//! println!("{}: {} photographs", set.format, set.frames.len());
+//! let (picture, intrinsics) = set.frames[0].photograph()?;
+//! # Ok::<(), dataset::DatasetError>(())
+//! ```
+
+mod blender;
+mod bytes;
+mod colmap;
+mod frame;
+mod lens;
+mod llff;
+mod photograph;
+mod split;
+mod transforms;
+
+use std::fmt;
+use std::io;
+use std::path::{Path, PathBuf};
+
+pub use frame::Frame;
+pub use lens::{Distortion, Lens};
+pub use split::Split;
+
+/// Posed photographs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Dataset {
+    /// How the folder has them.
+    pub format: Format,
+    /// All of them: in the file's order, or by name where a file has none.
+    pub frames: Vec<Frame>,
+    /// What the folder itself says of which are for training and which for testing.
+    pub split: Option<Split>,
+    /// What was found and chosen, a line each, for people.
+    pub notes: Vec<String>,
+}
+
+/// Forms of folders.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// `transforms_train.json` and `transforms_test.json`.
+    Blender,
+    /// `transforms.json`.
+    Transforms,
+    /// `poses_bounds.npy`.
+    Llff,
+    /// `sparse/N`.
+    Colmap,
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Blender => "blender",
+            Self::Transforms => "transforms",
+            Self::Llff => "llff",
+            Self::Colmap => "colmap",
+        })
+    }
+}
+
+/// A data set that can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum DatasetError {
+    /// The folder has none of the forms.
+    #[error(
+        "{path}: no data set; expected transforms_train.json and transforms_test.json (Blender), transforms.json (instant-ngp, \
+         nerfstudio), poses_bounds.npy (LLFF), or sparse/0 (COLMAP)"
+    )]
+    Unknown {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A file can't be read.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// A file isn't of its form.
+    #[error("{path}: {reason}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with its place, and what to do.
+        reason: String,
+    },
+    /// Something about one frame.
+    #[error("{path}: frame {index} ({file}): {reason}")]
+    Frame {
+        /// The file that lists the frames.
+        path: PathBuf,
+        /// The frame, counted from 0.
+        index: usize,
+        /// What that file calls it.
+        file: String,
+        /// What is wrong and what to do.
+        reason: String,
+    },
+    /// A picture that can't be read.
+    #[error(transparent)]
+    Pixels(#[from] pixels::PixelError),
+}
+
+impl DatasetError {
+    fn format(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Format { path: path.to_path_buf(), reason: reason.into() }
+    }
+}
+
+impl Dataset {
+    /// Reads a folder, whichever form it has. Pictures are looked at for their size alone.
+    pub fn read(folder: &Path) -> Result<Self, DatasetError> {
+        let has = |name: &str| folder.join(name).is_file();
+        // The most explicit form first: a folder often has what its poses were made from, too.
+        let mut set = if has("transforms_train.json") {
+            blender::read(folder)?
+        } else if has("transforms.json") {
+            transforms::read(folder)?
+        } else if has("poses_bounds.npy") {
+            llff::read(folder)?
+        } else if let Some(models) = colmap::models(folder) {
+            colmap::read(folder, &models)?
+        } else {
+            return Err(DatasetError::Unknown { path: folder.to_path_buf() });
+        };
+        set.note_what_is_special();
+        Ok(set)
+    }
+
+    /// Says what is done to pictures that aren't all alike, upright and from a pinhole.
+    fn note_what_is_special(&mut self) {
+        let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
+        let (distorted, turned) = (count(&|f| !f.lens.distortion.is_none()), count(&|f| f.turned));
+        let size = |f: &Frame| (f.lens.intrinsics.width, f.lens.intrinsics.height);
+        let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
+        if distorted > 0 {
+            self.notes.push(format!("{distorted} photographs have lens distortion, which is undone"));
+        }
+        if turned > 0 {
+            self.notes.push(format!("{turned} photographs are turned upright, as their EXIF data ask"));
+        }
+        if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
+            let text = |(w, h): &(u32, u32)| format!("{w}×{h}");
+            self.notes.push(format!("photographs of {} sizes, from {} to {}", sizes.len(), text(first), text(last)));
+        }
+    }
+}
+
+/// A whole text file.
+fn read_text(path: &Path) -> Result<String, DatasetError> {
+    std::fs::read_to_string(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })
+}

@@ -1,0 +1,174 @@
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+use glam::DVec3;
+use scene::Intrinsics;
+
+use crate::frame::{names, pose};
+use crate::photograph::{Stored, fitted, is_picture, look};
+use crate::{Dataset, DatasetError, Format, Frame, Lens};
+
+/// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal length), near and far.
+const NUMBERS: usize = 17;
+
+/// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the pictures beside it, sorted by name.
+pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+    let path = folder.join("poses_bounds.npy");
+    let rows = read_numbers(&path)?;
+    let (pictures, from) = pictures(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
+    let files: Vec<PathBuf> = pictures.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
+    let names = names(&path, &files)?;
+    let mut frames = Vec::with_capacity(rows.len());
+    for (index, ((row, image), name)) in rows.iter().zip(pictures).zip(names).enumerate() {
+        let file = name.clone();
+        let of_frame = |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
+        let frame = look(&image)
+            .map_err(|e| e.to_string())
+            .and_then(|stored| frame(row, stored, name, image))
+            .and_then(|frame| frame.check().map(|()| frame));
+        frames.push(frame.map_err(of_frame)?);
+    }
+    let notes = vec![format!("LLFF (poses_bounds.npy): {} photographs from {from}", frames.len())];
+    Ok(Dataset { format: Format::Llff, frames, split: None, notes })
+}
+
+fn frame(row: &[f64; NUMBERS], stored: Stored, name: String, image: PathBuf) -> Result<Frame, String> {
+    let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
+    let (down, right, back, centre, inside) = (column(0), column(1), column(2), column(3), column(4));
+    let [height, width, focal] = inside.to_array();
+    let whole = |value: f64, name: &str| {
+        if (1.0..=f64::from(u32::MAX)).contains(&value) { Ok(value.round() as u32) } else { Err(format!("{name} is {value}")) }
+    };
+    let (width, height) = (whole(width, "width")?, whole(height, "height")?);
+    let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+    let (lens, turned) = fitted(Lens::pinhole(Intrinsics { width, height, fx: focal, fy: focal, cx, cy }), stored)?;
+    let (near, far) = (row[15], row[16]);
+    if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
+        return Err(format!("its bounds are {near} and {far}; 0 < near < far is expected"));
+    }
+    let camera_to_world = pose([right, -down, back], centre);
+    Ok(Frame { name, image, turned, mask: None, depth: None, lens, camera_to_world, depths: Some([near, far]) })
+}
+
+/// All pictures of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
+fn pictures(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
+    let mut folders = vec!["images".to_owned()];
+    folders.extend((2..=64).map(|n| format!("images_{n}")));
+    let mut seen = Vec::new();
+    for name in folders {
+        let Ok(entries) = std::fs::read_dir(folder.join(&name)) else { continue };
+        let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_picture(p)).collect();
+        files.sort();
+        if files.len() == count {
+            return Ok((files, name));
+        }
+        seen.push(format!("{name} has {}", files.len()));
+    }
+    let seen = if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
+    Err(format!("{count} poses, but {seen}; pictures and poses must be as many"))
+}
+
+/// The array's rows.
+fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
+    let io = |source| DatasetError::Io { path: path.to_path_buf(), source };
+    let mut bytes = Vec::new();
+    std::fs::File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(io)?;
+    let bad = |reason: String| DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"));
+    let file = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(e.to_string()))?;
+    let shape = file.shape().to_vec();
+    let rows = match shape[..] {
+        // A claim of more numbers than there are bytes isn't believed.
+        [rows, columns] if columns == NUMBERS as u64 && rows > 0 && rows <= bytes.len() as u64 => rows as usize,
+        _ => return Err(bad(format!("its shape is {shape:?}"))),
+    };
+    let by_columns = file.header().order() == npyz::Order::Fortran;
+    let kind = file.dtype().descr();
+    let numbers: Vec<f64> = if kind.contains("f8") {
+        file.into_vec().map_err(|e| bad(e.to_string()))?
+    } else {
+        let singles: Vec<f32> = file.into_vec().map_err(|e| bad(format!("{e}; it holds {kind}")))?;
+        singles.into_iter().map(f64::from).collect()
+    };
+    let at = |row: usize, column: usize| if by_columns { column * rows + row } else { row * NUMBERS + column };
+    let number = |row, column| numbers.get(at(row, column)).copied().unwrap_or(f64::NAN);
+    Ok((0..rows).map(|row| std::array::from_fn(|column| number(row, column))).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photograph::tests::write_png;
+
+    /// A camera at (1, 2, 3) with axes right = x, up = y, back = z.
+    const ROW: [f64; NUMBERS] = [0., 1., 0., 1., 60., -1., 0., 0., 2., 80., 0., 0., 1., 3., 70., 1.5, 9.];
+
+    fn npy(rows: &[[f64; NUMBERS]]) -> Vec<u8> {
+        let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, {NUMBERS}), }}", rows.len());
+        let padded = format!("{header:<117}\n");
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        bytes.extend((padded.len() as u16).to_le_bytes());
+        bytes.extend(padded.as_bytes());
+        bytes.extend(rows.iter().flatten().flat_map(|v| v.to_le_bytes()));
+        bytes
+    }
+
+    fn folder(bytes: &[u8], images: &[(&str, u32)]) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("poses_bounds.npy"), bytes).unwrap();
+        for (folder, count) in images {
+            std::fs::create_dir(dir.path().join(folder)).unwrap();
+            for i in 0..*count {
+                write_png(&dir.path().join(folder).join(format!("IMG_{i}.png")), 40, 30);
+            }
+        }
+        dir
+    }
+
+    #[test]
+    fn axes_and_sizes_are_turned_into_ours() {
+        let dir = folder(&npy(&[ROW, ROW]), &[("images", 3), ("images_4", 2)]);
+        let set = Dataset::read(dir.path()).unwrap();
+        assert_eq!((set.format, set.frames.len()), (Format::Llff, 2));
+        assert!(set.notes[0].contains("images_4"), "{:?}", set.notes);
+        let frame = &set.frames[1];
+        assert_eq!(frame.name, "IMG_1");
+        assert_eq!(frame.camera_to_world, [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.]]);
+        assert_eq!(frame.lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0 });
+        assert_eq!(frame.depths, Some([1.5, 9.0]));
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        let mut bad_pose = ROW;
+        bad_pose[0] = f64::NAN;
+        let mut bad_range = ROW;
+        bad_range[15] = 10.0;
+        let mut bad_width = ROW;
+        bad_width[9] = -3.0;
+        for (bytes, images, words) in [
+            (npy(&[ROW, ROW]), 3, "2 poses, but images has 3"),
+            (npy(&[ROW, ROW])[..200].to_vec(), 2, "not a NumPy array"),
+            (b"nothing of the kind".to_vec(), 2, "not a NumPy array"),
+            (npy(&[ROW, bad_pose]), 2, "frame 1 (IMG_1): camera_to_world[0][1] is NaN"),
+            (npy(&[bad_range, ROW]), 2, "frame 0 (IMG_0): its bounds are 10 and 9"),
+            (npy(&[bad_width, ROW]), 2, "width is -3"),
+        ] {
+            let message = Dataset::read(folder(&bytes, &[("images", images)]).path()).unwrap_err().to_string();
+            assert!(message.contains(words) && message.contains("poses_bounds.npy"), "{message}");
+        }
+        // A header that claims more than there is.
+        let mut claimed = npy(&[ROW]);
+        let place = claimed.windows(7).position(|w| w == b"(1, 17)").unwrap();
+        claimed[place + 1] = b'9';
+        let message = Dataset::read(folder(&claimed, &[("images", 9)]).path()).unwrap_err().to_string();
+        assert!(message.contains("not a NumPy array"), "{message}");
+    }
+
+    #[test]
+    fn any_bytes_are_an_error_and_no_panic() {
+        let whole = npy(&[ROW]);
+        for end in 0..whole.len() {
+            assert!(Dataset::read(folder(&whole[..end], &[("images", 1)]).path()).is_err(), "{end}");
+        }
+    }
+}

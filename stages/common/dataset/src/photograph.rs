@@ -1,0 +1,264 @@
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
+use pixels::{PixelError, Rgba8, read_exr, srgb_from_linear, to_u8};
+use scene::Intrinsics;
+
+use crate::{DatasetError, Frame, Lens};
+
+/// More pixels than any photograph has.
+const MAX_PIXELS: u64 = 1 << 28;
+
+/// Whether a file's name is that of a picture.
+pub(crate) fn is_picture(path: &Path) -> bool {
+    let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
+    path.is_file() && matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
+}
+
+fn is_exr(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
+}
+
+/// A PNG or JPEG whose header has been read, by what it is, whatever its name says.
+fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
+    let io = |source| PixelError::Io { path: path.to_path_buf(), source };
+    let mut reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(io)?;
+    let mut limits = Limits::default();
+    limits.max_alloc = Some(8 * MAX_PIXELS);
+    reader.limits(limits);
+    match reader.format() {
+        Some(ImageFormat::Png | ImageFormat::Jpeg) => Ok(reader),
+        _ => Err(PixelError::Format { path: path.to_path_buf(), reason: "neither PNG, JPEG nor EXR".to_owned() }),
+    }
+}
+
+/// What a picture's header says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Stored {
+    /// Columns and rows.
+    pub(crate) size: (u32, u32),
+    /// Whether its EXIF data ask for a quarter turn.
+    pub(crate) is_sideways: bool,
+}
+
+/// Looks at a picture's header.
+pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
+    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+    if is_exr(path) {
+        let image = read_exr(path)?;
+        return Ok(Stored { size: (image.width as u32, image.height as u32), is_sideways: false });
+    }
+    let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
+    let (width, height) = decoder.dimensions();
+    if u64::from(width) * u64::from(height) > MAX_PIXELS || width == 0 || height == 0 {
+        return Err(format(format!("{width}×{height} pixels")));
+    }
+    Ok(Stored { size: (width, height), is_sideways: decoder.orientation().is_ok_and(is_sideways) })
+}
+
+fn is_sideways(turn: Orientation) -> bool {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
+}
+
+/// The lens for the stored picture, whose size may differ from what was said of it, but not in shape; and whether the picture has to be
+/// turned as its EXIF data ask. Poses are commonly found for pictures as they are stored, so it is turned only where its shape fits no
+/// other way.
+pub(crate) fn fitted(lens: Lens, stored: Stored) -> Result<(Lens, bool), String> {
+    let k = lens.intrinsics;
+    let (width, height) = stored.size;
+    let fits = |(width, height): (u32, u32)| {
+        let (across, down) = (f64::from(width) / f64::from(k.width.max(1)), f64::from(height) / f64::from(k.height.max(1)));
+        // A smaller copy's sides are rounded.
+        (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
+    };
+    if (k.width, k.height) == stored.size {
+        Ok((lens, false))
+    } else if fits((width, height)) {
+        Ok((lens.resized(width, height), false))
+    } else if stored.is_sideways && fits((height, width)) {
+        Ok((lens.resized(height, width), true))
+    } else {
+        Err(format!("the picture has {width}×{height} pixels, its camera {}×{}: another shape", k.width, k.height))
+    }
+}
+
+/// The picture as it is stored, or turned as its EXIF data ask.
+fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
+    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+    if is_exr(path) {
+        return encoded(path);
+    }
+    let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
+    let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|e| format(format!("not a whole picture ({e})")))?;
+    if turned {
+        image.apply_orientation(turn);
+    }
+    let image = image.into_rgba8();
+    Ok(Rgba8::new(image.width() as usize, image.height() as usize, image.into_raw()))
+}
+
+/// An EXR's linear light, display-encoded.
+fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
+    let image = read_exr(path)?;
+    let missing = |name: &str| PixelError::Format { path: path.to_path_buf(), reason: format!("no channel {name}") };
+    let [r, g, b] = ["R", "G", "B"].map(|name| image.channel(name).ok_or_else(|| missing(name)));
+    let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
+    let pixel = |i: usize| {
+        let alpha = a.map_or(1.0, |a| a[i]);
+        // EXR files keep premultiplied colours, ours straight ones.
+        let encode = |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
+        let straight = |v: f32| if alpha > 0.0 { encode(v) } else { 0 };
+        [straight(r[i]), straight(g[i]), straight(b[i]), to_u8(alpha)]
+    };
+    Ok(Rgba8::new(image.width, image.height, (0..image.width * image.height).flat_map(pixel).collect()))
+}
+
+impl Frame {
+    /// The picture with its lens's distortion undone, as sharp as it was, and the pinhole camera that would have taken it: of the same
+    /// size, with a border cut off where the lens saw no more.
+    pub fn photograph(&self) -> Result<(Rgba8, Intrinsics), DatasetError> {
+        let pinhole = self.pinhole()?;
+        let image = read(&self.image, self.turned)?;
+        let k = self.lens.intrinsics;
+        if (image.width, image.height) != (k.width as usize, k.height as usize) {
+            let reason =
+                format!("{}×{} pixels, but {}×{} when it was first looked at", image.width, image.height, k.width, k.height);
+            return Err(PixelError::Format { path: self.image.clone(), reason }.into());
+        }
+        let has_distortion = !self.lens.distortion.is_none();
+        Ok((if has_distortion { undistorted(&image, &self.lens, &pinhole) } else { image }, pinhole))
+    }
+
+    /// The pinhole camera of [`Frame::photograph`], without looking at the picture.
+    pub fn pinhole(&self) -> Result<Intrinsics, DatasetError> {
+        self.lens.undistorted().ok_or_else(|| {
+            let reason = format!("its distortion {:?} can't be undone; are the coefficients right?", self.lens.distortion);
+            DatasetError::format(&self.image, reason)
+        })
+    }
+}
+
+/// The picture that a pinhole camera would have taken, by cubic interpolation (Catmull and Rom 1974).
+fn undistorted(image: &Rgba8, lens: &Lens, pinhole: &Intrinsics) -> Rgba8 {
+    let mut data = Vec::with_capacity(image.data.len());
+    for y in 0..image.height {
+        for x in 0..image.width {
+            let at = lens.source(pinhole, x as f64 + 0.5, y as f64 + 0.5);
+            data.extend(cubic(image, at[0] - 0.5, at[1] - 0.5));
+        }
+    }
+    Rgba8::new(image.width, image.height, data)
+}
+
+/// Weights of the four samples around a place between the second and the third.
+fn catmull_rom(t: f64) -> [f64; 4] {
+    let (t2, t3) = (t * t, t * t * t);
+    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
+}
+
+fn cubic(image: &Rgba8, x: f64, y: f64) -> [u8; 4] {
+    let (left, top) = (x.floor(), y.floor());
+    let (across, down) = (catmull_rom(x - left), catmull_rom(y - top));
+    let place = |first: f64, k: usize, end: usize| ((first + k as f64 - 1.0).max(0.0) as usize).min(end - 1);
+    let mut sum = [0.0; 4];
+    for (j, wy) in down.iter().enumerate() {
+        let row = place(top, j, image.height) * image.width;
+        for (i, wx) in across.iter().enumerate() {
+            let pixel = &image.data[4 * (row + place(left, i, image.width))..][..4];
+            (0..4).for_each(|c| sum[c] += wx * wy * f64::from(pixel[c]));
+        }
+    }
+    sum.map(|v| (v + 0.5) as u8)
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use crate::Distortion;
+
+    /// A picture whose red says the column and whose green says the row.
+    fn ramp(width: usize, height: usize) -> Rgba8 {
+        let pixel = |i: usize| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, 90, 255];
+        Rgba8::new(width, height, (0..width * height).flat_map(pixel).collect())
+    }
+
+    pub(crate) fn write_png(path: &Path, width: usize, height: usize) {
+        pixels::write_png(path, &ramp(width, height)).unwrap();
+    }
+
+    #[test]
+    fn a_jpeg_is_read_by_what_it_is() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a.png");
+        let image = ramp(32, 16);
+        let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]).collect();
+        let mut bytes = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95)
+            .encode(&rgb, 32, 16, image::ExtendedColorType::Rgb8)
+            .unwrap();
+        std::fs::write(&path, &bytes).unwrap();
+        assert_eq!(look(&path).unwrap(), Stored { size: (32, 16), is_sideways: false });
+        let read = super::read(&path, false).unwrap();
+        let worst = read.data.iter().zip(&image.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        assert!(worst < 12, "{worst}");
+        for end in 0..bytes.len() {
+            std::fs::write(&path, &bytes[..end]).unwrap();
+            drop(super::read(&path, false));
+        }
+        // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's shape says so, else left alone.
+        let mut turned = bytes[..2].to_vec();
+        turned.extend(b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0");
+        turned.extend(&bytes[2..]);
+        std::fs::write(&path, &turned).unwrap();
+        let stored = look(&path).unwrap();
+        assert_eq!(stored, Stored { size: (32, 16), is_sideways: true });
+        let lens = |width, height| Lens::pinhole(Intrinsics::from_angle_x(width, height, 0.5));
+        assert_eq!(fitted(lens(32, 16), stored).unwrap(), (lens(32, 16), false));
+        assert_eq!(fitted(lens(64, 32), stored).unwrap(), (lens(64, 32).resized(32, 16), false));
+        assert_eq!(fitted(lens(16, 32), stored).unwrap(), (lens(16, 32), true));
+        assert!(fitted(lens(32, 32), stored).unwrap_err().contains("another shape"));
+        let upright = super::read(&path, true).unwrap();
+        assert_eq!((upright.width, upright.height), (16, 32));
+        assert!(upright.data[0] < 20 && upright.data[1] > 200, "its bottom left corner is now its top left one");
+        std::fs::write(&path, "no picture").unwrap();
+        assert!(look(&path).unwrap_err().to_string().contains("a.png"));
+        let other = dir.path().join("a.tiff");
+        std::fs::write(&other, "no picture").unwrap();
+        assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
+    }
+
+    /// A pinhole picture seen through a lens and undone is the pinhole picture again.
+    #[test]
+    fn distortion_is_undone() {
+        let intrinsics = Intrinsics { width: 120, height: 90, fx: 110.0, fy: 108.0, cx: 61.0, cy: 44.0 };
+        let distortion = Distortion { radial: [-0.12, 0.02, 0.0], tangential: [0.002, -0.001] };
+        let lens = Lens { intrinsics, distortion };
+        // Smooth in the direction of the ray, so that what each lens sees is known exactly.
+        let colour = |[u, v]: [f64; 2]| [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255];
+        // Where a distorted position comes from, by fixed-point iteration.
+        let ray = |x: f64, y: f64| {
+            let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
+            let mut at = seen;
+            for _ in 0..50 {
+                let there = distortion.distort(at);
+                at = [at[0] + seen[0] - there[0], at[1] + seen[1] - there[1]];
+            }
+            at
+        };
+        let picture = |of: &dyn Fn(f64, f64) -> [f64; 2]| {
+            let pixel = |i: usize| colour(of((i % 120) as f64 + 0.5, (i / 120) as f64 + 0.5));
+            Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
+        };
+        let pinhole = lens.undistorted().unwrap();
+        assert!(pinhole.fx != intrinsics.fx);
+        let expected = picture(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
+        let found = undistorted(&picture(&ray), &lens, &pinhole);
+        let worst = found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        assert!(worst <= 3, "{worst}");
+    }
+}

@@ -1,0 +1,311 @@
+use std::path::{Path, PathBuf};
+
+use artifact::relative_path;
+use scene::Intrinsics;
+use serde::Deserialize;
+
+use crate::frame::names;
+use crate::photograph::{Stored, fitted, look};
+use crate::{Dataset, DatasetError, Distortion, Format, Frame, Lens, Split, read_text};
+
+/// `transforms.json`. What a frame doesn't say for itself holds for all.
+#[derive(Deserialize)]
+struct Transforms {
+    #[serde(flatten)]
+    shared: LensEntry,
+    frames: Vec<FrameEntry>,
+    /// nerfstudio's own split, by file name.
+    train_filenames: Option<Vec<String>>,
+    test_filenames: Option<Vec<String>>,
+    val_filenames: Option<Vec<String>>,
+}
+
+#[derive(Clone, Default, Deserialize)]
+struct LensEntry {
+    camera_model: Option<String>,
+    camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    w: Option<f64>,
+    h: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    is_fisheye: Option<bool>,
+}
+
+#[derive(Deserialize)]
+struct FrameEntry {
+    file_path: String,
+    mask_path: Option<String>,
+    depth_file_path: Option<String>,
+    /// `None` is a NaN: Python writes them, JSON has none.
+    transform_matrix: Vec<Vec<Option<f64>>>,
+    #[serde(flatten)]
+    own: LensEntry,
+}
+
+/// What to do about a picture that isn't there.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Missing {
+    /// It is an error.
+    Refused,
+    /// The frame is left out, and that is said.
+    LeftOut,
+}
+
+/// A file's frames.
+pub(crate) struct Read {
+    pub(crate) frames: Vec<Frame>,
+    /// The first of the frames whose picture isn't there, and how many there are.
+    missing: (Option<String>, usize),
+    split: Option<Split>,
+}
+
+/// Reads `transforms.json`: instant-ngp's form and nerfstudio's.
+pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+    let path = folder.join("transforms.json");
+    let Read { frames, missing, split } = read_file(folder, &path, Missing::LeftOut)?;
+    let mut notes = vec![format!("transforms.json (instant-ngp, nerfstudio): {} photographs", frames.len())];
+    if let (Some(first), count) = missing {
+        notes.push(format!("{count} of {} frames have no picture and are left out, first {first}", frames.len() + count));
+    }
+    if frames.iter().any(|f| f.mask.is_some()) {
+        notes.push(format!("{} frames have a mask", frames.iter().filter(|f| f.mask.is_some()).count()));
+    }
+    Ok(Dataset { format: Format::Transforms, frames, split, notes })
+}
+
+/// Reads a file of frames.
+pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Result<Read, DatasetError> {
+    let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e.to_string()))?;
+    if transforms.frames.is_empty() {
+        return Err(DatasetError::format(path, "`frames` is empty; at least one view is needed"));
+    }
+    let (mut frames, mut files) = (Vec::new(), Vec::new());
+    let (mut first_missing, mut missing) = (None, 0);
+    for (index, entry) in transforms.frames.iter().enumerate() {
+        let of_frame =
+            |reason: String| DatasetError::Frame { path: path.to_path_buf(), index, file: entry.file_path.clone(), reason };
+        let file = picture_file(folder, &entry.file_path).map_err(of_frame)?;
+        if !folder.join(&file).is_file() {
+            if on_missing == Missing::Refused {
+                let shown = folder.join(&file).display().to_string();
+                return Err(of_frame(format!("{shown} is not there; remove the frame or restore the file")));
+            }
+            first_missing.get_or_insert_with(|| entry.file_path.clone());
+            missing += 1;
+            continue;
+        }
+        frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
+        files.push(file);
+    }
+    if frames.is_empty() {
+        let first = first_missing.unwrap_or_default();
+        return Err(DatasetError::format(path, format!("not one of its {missing} pictures is there, first {first}")));
+    }
+    for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
+        frame.name = name;
+    }
+    let split = given_split(&transforms, &files);
+    Ok(Read { frames, missing: (first_missing, missing), split })
+}
+
+/// The split by file names, where there is one for both. What is for validation is for testing where nothing else is.
+fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
+    let numbers = |names: &Vec<String>| -> Vec<usize> {
+        let named: Vec<PathBuf> = names.iter().filter_map(|n| relative_path(n).ok()).collect();
+        files.iter().enumerate().filter(|(_, f)| named.contains(f)).map(|(i, _)| i).collect()
+    };
+    let train = numbers(transforms.train_filenames.as_ref()?);
+    let test = numbers(transforms.test_filenames.as_ref().or(transforms.val_filenames.as_ref())?);
+    (!train.is_empty() && !test.is_empty()).then_some(Split { train, test })
+}
+
+/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those become `null`, so that the frame can be named.
+fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
+    serde_json::from_str(text).or_else(|error| {
+        if text.contains("NaN") || text.contains("Infinity") {
+            let readable = text.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null");
+            serde_json::from_str(&readable).map_err(|_| error)
+        } else {
+            Err(error)
+        }
+    })
+}
+
+/// The picture's path inside the folder. NeRF's files leave `.png` out.
+fn picture_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
+    let mut file = relative_path(text)?;
+    let known = ["png", "jpg", "jpeg", "exr"];
+    let has_one = file.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()));
+    if !has_one && !folder.join(&file).is_file() {
+        // `set_extension` would cut a name like `r.0`.
+        file.as_mut_os_string().push(".png");
+    }
+    Ok(file)
+}
+
+fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry) -> Result<Frame, String> {
+    let mut camera_to_world = [[0.0; 4]; 3];
+    let matrix = &entry.transform_matrix;
+    if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
+        return Err("transform_matrix must have 4 rows of 4 numbers".to_owned());
+    }
+    for (row, values) in camera_to_world.iter_mut().enumerate() {
+        for (column, value) in values.iter_mut().enumerate() {
+            *value = matrix[row][column].unwrap_or(f64::NAN);
+        }
+    }
+    let image = folder.join(file);
+    let beside = |text: &Option<String>| -> Result<Option<PathBuf>, String> {
+        let Some(text) = text else { return Ok(None) };
+        let path = folder.join(relative_path(text)?);
+        if path.is_file() {
+            Ok(Some(path))
+        } else {
+            Err(format!("{} is not there; remove the entry or restore the file", path.display()))
+        }
+    };
+    let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
+    let (lens, turned) = lens(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
+    let frame = Frame { name: String::new(), image, turned, mask, depth, lens, camera_to_world, depths: None };
+    frame.check().map_err(|reason| format!("transform_matrix: {reason}"))?;
+    Ok(frame)
+}
+
+impl LensEntry {
+    /// What is said here, and where nothing is, what `other` says.
+    fn or(&self, other: &Self) -> Self {
+        macro_rules! both {
+            ($($name:ident),*) => { Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* } };
+        }
+        both!(camera_model, camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, p1, p2, is_fisheye)
+    }
+}
+
+/// The lens of a picture, and whether that has to be turned.
+fn lens(entry: &LensEntry, stored: Stored) -> Result<(Lens, bool), String> {
+    let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
+    if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model) {
+        return Err(format!("camera_model {model:?} is not supported; undistort the pictures first (colmap image_undistorter)"));
+    }
+    if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k != 0.0) {
+        return Err("fisheye lenses are not supported; undistort the pictures first".to_owned());
+    }
+    // The size that the numbers are for; the stored picture may be a smaller copy.
+    let whole = |value: Option<f64>, name: &str, stored: u32| match value {
+        None => Ok(stored),
+        Some(v) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
+        Some(v) => Err(format!("{name} is {v}; a picture has at least one pixel")),
+    };
+    let (width, height) = (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
+    let focal = |length: Option<f64>, angle: Option<f64>, name: &str, size: u32| match (length, angle) {
+        (Some(length), _) => Ok(Some(length)),
+        (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => {
+            Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
+        }
+        (None, Some(angle)) => {
+            let focal = 0.5 / (0.5 * angle).tan();
+            Err(format!("{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"))
+        }
+        (None, None) => Ok(None),
+    };
+    let fx = focal(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
+    let fy = focal(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
+    let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
+        return Err("no focal length: neither fl_x nor camera_angle_x is given".to_owned());
+    };
+    let (cx, cy) = (entry.cx.unwrap_or(0.5 * f64::from(width)), entry.cy.unwrap_or(0.5 * f64::from(height)));
+    let said = Lens {
+        intrinsics: Intrinsics { width, height, fx, fy, cx, cy },
+        distortion: Distortion {
+            radial: [entry.k1, entry.k2, entry.k3].map(Option::unwrap_or_default),
+            tangential: [entry.p1, entry.p2].map(Option::unwrap_or_default),
+        },
+    };
+    fitted(said, stored)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::photograph::tests::write_png;
+
+    const POSE: &str = r#""transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"#;
+
+    fn set(json: &str) -> Result<Dataset, DatasetError> {
+        let dir = tempfile::tempdir().unwrap();
+        std::fs::write(dir.path().join("transforms.json"), json).unwrap();
+        std::fs::create_dir(dir.path().join("images")).unwrap();
+        for name in ["a", "b"] {
+            write_png(&dir.path().join(format!("images/{name}.png")), 40, 30);
+        }
+        Dataset::read(dir.path())
+    }
+
+    fn frames(head: &str, first: &str) -> String {
+        format!(
+            r#"{{{head}, "frames": [{{"file_path": "images/a.png", {first} {POSE}}}, {{"file_path": "./images/b.png", {POSE}}},
+                {{"file_path": "images/gone.png", {POSE}}}]}}"#
+        )
+    }
+
+    #[test]
+    fn what_a_frame_says_goes_before_what_holds_for_all() {
+        let head =
+            r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1, "p2": 0.01, "camera_model": "OPENCV""#;
+        let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
+        let of = |i: usize| set.frames[i].lens;
+        assert_eq!(of(0).intrinsics, Intrinsics { width: 40, height: 30, fx: 60.0, fy: 52.0, cx: 21.0, cy: 14.0 });
+        assert_eq!(of(1).intrinsics.fx, 50.0);
+        assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
+        assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
+        assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
+        assert!(
+            set.notes.iter().any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")),
+            "{:?}",
+            set.notes
+        );
+    }
+
+    /// Numbers for the original hold for a smaller copy of it.
+    #[test]
+    fn smaller_copies_keep_their_angle() {
+        let set = set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
+        assert_eq!(set.frames[0].lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 50.0, fy: 50.0, cx: 20.0, cy: 15.0 });
+    }
+
+    #[test]
+    fn a_split_of_its_own_is_kept() {
+        let head = r#""fl_x": 50, "train_filenames": ["images/b.png"], "test_filenames": ["./images/a.png"]"#;
+        assert_eq!(set(&frames(head, "")).unwrap().split, Some(Split { train: vec![1], test: vec![0] }));
+        assert_eq!(set(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        for (head, first, words) in [
+            (r#""w": 40"#, "", "no focal length"),
+            (r#""fl_x": -5"#, "", "fx is -5"),
+            (r#""fl_x": 50, "camera_model": "OPENCV_FISHEYE""#, "", "OPENCV_FISHEYE"),
+            (r#""fl_x": 50, "k4": 0.1"#, "", "fisheye"),
+            (r#""fl_x": 50, "w": 40, "h": 40"#, "", "another shape"),
+            (r#""fl_x": 50, "w": 0"#, "", "w is 0"),
+            (r#""fl_x": 50"#, r#""mask_path": "masks/a.png","#, "masks/a.png is not there"),
+            (r#""fl_x": 50"#, r#""mask_path": "../a.png","#, "not a path inside"),
+            (r#""camera_angle_x": 7"#, "", "between 0 and π"),
+        ] {
+            let message = set(&frames(head, first)).unwrap_err().to_string();
+            assert!(message.contains(words) && message.contains("frame 0 (images/a.png)"), "{message}");
+        }
+        let nothing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
+        assert!(set(nothing).unwrap_err().to_string().contains("not one of its 1 pictures is there"));
+    }
+}

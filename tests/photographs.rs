@@ -1,0 +1,184 @@
+//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR pictures.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::{Project, stage};
+use glam::{DMat3, DQuat, DVec3};
+use serde_json::{Value, json};
+
+const WIDTH: u32 = 32;
+const ANGLE: f64 = 0.691_111_2;
+
+/// Names, poses (right, up, back and centre as columns) and opaque pictures of a demo scene's training views, in `folder/images`.
+fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
+    let data = project.path("data");
+    if !data.exists() {
+        let params = format!(r#"{{"size": {WIDTH}, "train": 20, "test": 1, "samples": 2}}"#);
+        assert_eq!(stage("demo-scene", &params, &[], &data, &[]).code, 0);
+    }
+    let text = std::fs::read_to_string(data.join("transforms_train.json")).unwrap();
+    let transforms: Value = serde_json::from_str(&text).unwrap();
+    assert!((transforms["camera_angle_x"].as_f64().unwrap() - ANGLE).abs() < 1e-9);
+    let images = project.path(folder).join("images");
+    std::fs::create_dir_all(&images).unwrap();
+    let frames = transforms["frames"].as_array().unwrap().iter();
+    let mut views: Vec<_> = frames
+        .map(|frame| {
+            let name = Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned();
+            let picture = pixels::read_premultiplied(&data.join(format!("train/{name}.png"))).unwrap().over(1.0);
+            pixels::write_png(&images.join(format!("{name}.png")), &picture.to_rgba8()).unwrap();
+            let number = |row: usize, column: usize| frame["transform_matrix"][row][column].as_f64().unwrap();
+            let column = |c: usize| DVec3::new(number(0, c), number(1, c), number(2, c));
+            (name, DMat3::from_cols(column(0), column(1), column(2)), column(3))
+        })
+        .collect();
+    // By name, as LLFF has them and as COLMAP's are put.
+    views.sort_by(|a, b| a.0.cmp(&b.0));
+    views
+}
+
+fn focal() -> f64 {
+    0.5 * f64::from(WIDTH) / (0.5 * ANGLE).tan()
+}
+
+fn as_transforms(project: &Project) -> PathBuf {
+    let views = photographs(project, "transforms");
+    let frames: Vec<Value> = views
+        .iter()
+        .map(|(name, axes, centre)| {
+            let row = |k: usize| [axes.x_axis[k], axes.y_axis[k], axes.z_axis[k], centre[k]];
+            let matrix = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+            json!({"file_path": format!("images/{name}.png"), "transform_matrix": matrix})
+        })
+        .collect();
+    let text = json!({"fl_x": focal(), "w": WIDTH, "h": WIDTH, "frames": frames}).to_string();
+    let folder = project.path("transforms");
+    std::fs::write(folder.join("transforms.json"), text).unwrap();
+    folder
+}
+
+fn as_colmap(project: &Project) -> PathBuf {
+    let views = photographs(project, "colmap");
+    let sparse = project.path("colmap/sparse/0");
+    std::fs::create_dir_all(&sparse).unwrap();
+    let centre = 0.5 * f64::from(WIDTH);
+    std::fs::write(sparse.join("cameras.txt"), format!("1 SIMPLE_PINHOLE {WIDTH} {WIDTH} {} {centre} {centre}\n", focal()))
+        .unwrap();
+    let mut images = "# as COLMAP registers them: in no order\n".to_owned();
+    for (id, (name, axes, centre)) in views.iter().enumerate().rev() {
+        // World to camera, with axes right, down, forward.
+        let rotation = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
+        let (q, t) = (DQuat::from_mat3(&rotation), -(rotation * *centre));
+        images += &format!("{} {} {} {} {} {} {} {} 1 {name}.png\n\n", id + 1, q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+    }
+    std::fs::write(sparse.join("images.txt"), images).unwrap();
+    project.path("colmap")
+}
+
+fn as_llff(project: &Project) -> PathBuf {
+    let views = photographs(project, "llff");
+    let mut numbers: Vec<f64> = Vec::new();
+    for (_, axes, centre) in &views {
+        let inside = [f64::from(WIDTH), f64::from(WIDTH), focal()];
+        for k in 0..3 {
+            numbers.extend([-axes.y_axis[k], axes.x_axis[k], axes.z_axis[k], centre[k], inside[k]]);
+        }
+        numbers.extend([2.0, 6.0]);
+    }
+    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}", views.len());
+    let mut bytes = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
+    bytes.extend(format!("{header:<117}\n").bytes());
+    bytes.extend(numbers.iter().flat_map(|v| v.to_le_bytes()));
+    let folder = project.path("llff");
+    std::fs::write(folder.join("poses_bounds.npy"), bytes).unwrap();
+    folder
+}
+
+fn views(folder: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(folder.join("views.json")).unwrap();
+    serde_json::from_str::<Value>(&text).unwrap()["views"].as_array().unwrap().clone()
+}
+
+#[test]
+fn every_form_gives_the_same_cameras_and_pictures() {
+    let project = Project::tiny();
+    let folders = [as_transforms(&project), as_colmap(&project), as_llff(&project)];
+    let mut scenes = Vec::new();
+    for (i, folder) in folders.iter().enumerate() {
+        let scene = project.path(&format!("scene-{i}"));
+        let made = stage("prep", r#"{"degrade": "none", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
+        assert_eq!(made.code, 0, "{}", made.stderr);
+        let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
+        for words in ["17 views to train on, 3 others to test", "as if made by box; HR is 48×48", "20 photographs"] {
+            assert!(summary.contains(words), "{words} isn't in {summary}");
+        }
+        scenes.push(scene);
+    }
+    for subtree in ["train", "cameras"] {
+        let first = views(&scenes[0].join(subtree));
+        assert_eq!(first.len(), if subtree == "train" { 17 } else { 3 });
+        for scene in &scenes[1..] {
+            for (a, b) in first.iter().zip(views(&scene.join(subtree))) {
+                assert_eq!(a["camera"]["name"], b["camera"]["name"]);
+                let numbers = |v: &Value| -> Vec<f64> {
+                    let pose =
+                        v["camera"]["camera_to_world"].as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().clone());
+                    let inside = v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
+                    pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
+                };
+                let worst = numbers(a).iter().zip(numbers(&b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                assert!(worst < 1e-6, "{subtree} {worst}");
+            }
+        }
+    }
+    let picture = |scene: &Path| std::fs::read(scene.join("train/images/r_3.png")).unwrap();
+    assert!(scenes.iter().all(|s| picture(s) == picture(&scenes[0])));
+}
+
+/// COLMAP's folder and no option: views at twice the size of photographs that nobody has larger, scored by what can be known.
+#[test]
+fn one_command_makes_hr_views_of_lr_photographs() {
+    let project = Project::tiny();
+    as_colmap(&project);
+    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("default: [eval]", "default: [report]");
+    project.replace("  eval:", "  report:\n    inputs: {run: eval}\n  eval:");
+    project.replace("rays: 60000", "rays: 500000");
+    project.ok(&["run", "-i", "dataset=./colmap"]);
+    let metrics = project.object(&project.output_of("eval", &["-i", "dataset=./colmap"])[0]).join("metrics.json");
+    let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+    let mean = &metrics["mean"];
+    assert!(mean.get("psnr").is_none() && mean.get("ssim").is_none(), "{mean}");
+    // What is far above a page of the mean colour's; wrong poses end there.
+    assert!(mean["low_resolution"]["psnr"].as_f64().unwrap() > 19.0, "{mean}");
+    let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
+    assert!(page.contains("render, 64 px") && page.contains("PSNR at LR") && !page.contains("ground truth"), "no such page");
+}
+
+#[test]
+fn contradictions_are_refused() {
+    let project = Project::tiny();
+    let folder = as_transforms(&project);
+    let out = project.path("out");
+    let refused = |params: &str, words: &[&str]| stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
+    refused(r#"{"degrade": "none", "lr": 16}"#, &["parameter lr", "leave lr out"]);
+    refused(r#"{"degrade": "none", "kernel": "avg"}"#, &["parameter kernel", "choose box"]);
+    refused(r#"{"degrade": "box", "kernel": "lanczos"}"#, &["parameter kernel", "give one of them"]);
+    refused(r#"{"degrade": "none", "hr": 16}"#, &["32", "larger than", "16"]);
+}
+
+/// The paper's split: all views for training and all but the references for testing.
+#[test]
+fn the_papers_split_leaves_references_out() {
+    let project = Project::tiny();
+    let folder = as_llff(&project);
+    let scene = project.path("scene");
+    let made = stage("prep", r#"{"split": "paper", "references": 3}"#, &[("dataset", &folder)], &scene, &[]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
+    let name = |subtree: &str, i: usize| views(&scene.join(subtree))[i]["camera"]["name"].clone();
+    assert_eq!((name("truth", 0), name("references", 2)), (json!("r_11"), json!("r_10")));
+}
