@@ -38,9 +38,10 @@ else
 endif
 	cargo test --release --workspace --doc
 
-lint: setup ## rustfmt, clippy; cargo-deny and typos where installed
+lint: setup ## rustfmt, clippy with and without libtorch; cargo-deny and typos where installed
 	cargo fmt --all --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p eval --no-default-features --all-targets -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 
@@ -61,7 +62,7 @@ PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  --out $(or $(OUT),out/quality.json)
+	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/quality.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/ablation.json)

@@ -20,6 +20,8 @@ PARTS = [
     ("as it is", []),
     ("supervision: average", ["supervision=average"]),
     ("supervision: refiltered", ["supervision=refiltered"]),
+    ("all pixels drawn alike", ["detail=1"]),
+    ("detail drawn 30 times as often", ["detail=30"]),
     ("two fields, half the rays each", ["members=2"]),
     ("no supersampling", ["supersample=1"]),
     ("3×3 sub-rays", ["supersample=3"]),
@@ -33,9 +35,8 @@ PARTS = [
     ("finest level 512", ["finest=512"]),
     ("grid rate 1e-2", ["rate=0.01"]),
     ("network rate 4e-2", ["network_rate=0.04"]),
-    ("4,096 rays a step", ["batch=4096"]),
-    ("1,024 rays a step", ["batch=1024"]),
-    ("131,072 samples a step in fog", ["samples=131072"]),
+    ("32,768 samples a step", ["train-ss.samples=32768"]),
+    ("131,072 samples a step", ["train-ss.samples=131072", "batch=8192"]),
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
     ("no weight averaging", ["averaging=0"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
@@ -44,14 +45,14 @@ PARTS = [
     ("alpha hull", ["hull=alpha"]),
 ]
 # Rays of the curve's points: about 15 seconds to 20 minutes on two cores.
-CURVE = [1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 48_000_000, 96_000_000, 192_000_000]
+CURVE = [750_000, 1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 48_000_000, 96_000_000]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("table", choices=["ablation", "tradeoff", "seeds"])
 parser.add_argument("--data", type=pathlib.Path, help="folder with nerf_synthetic/SCENE (or SCENE)")
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
 parser.add_argument("--protocol", default="100x2", help="LR width x scale")
-parser.add_argument("--rays", type=int, default=30_000_000, help="rays of each training of the ablation")
+parser.add_argument("--rays", type=int, default=12_000_000, help="rays of each training of the ablation")
 parser.add_argument("--variants", type=int, help="only the first so many rows")
 parser.add_argument("--out", type=pathlib.Path, required=True)
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")

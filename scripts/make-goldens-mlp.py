@@ -2,9 +2,11 @@
 """Makes the golden file of the paper's field (`torch-field`), from PyTorch's own layers and optimiser: run by `make goldens`.
 
 The networks, the sampling and the compositing are built here from their published description. Inputs and weights come from the
-counter-based draws of `radiance::uniform`, which are repeated here, so only outputs are kept: one safetensors file.
+counter-based draws of `radiance::uniform`, which are repeated here, so only outputs are kept: one safetensors file. Besides, two
+small checkpoints for tests/checkpoint.rs.
 """
 
+import collections
 import math
 import pathlib
 
@@ -153,3 +155,18 @@ path = ROOT / "stages/common/torch-field/src/goldens/mlp.safetensors"
 path.parent.mkdir(parents=True, exist_ok=True)
 save_file({name: x.detach().contiguous() for name, x in out.items()}, path, {"torch": torch.__version__.split("+")[0]})
 print(path, path.stat().st_size)
+
+# Checkpoints of the reference's shape, in miniature, for scripts/convert-checkpoint.py: tensor k holds k, k + 1/8, k + 2/8 …
+# The coarse one comes from several GPUs, the fine one has half precision and a transposed tensor.
+names = [f"xyz_encoding_{i + 1}.0" for i in range(6)] + ["sigma", "xyz_encoding_final", "dir_encoding.0", "rgb.0"]
+position, direction, width = 15, 9, 8
+inputs = [position, width, width, width, position + width, width, width, width, width + direction, width // 2]
+outputs = [width] * 6 + [1, width, width // 2, 3]
+for which, prefix, kind in (("Coarse", "module.", torch.float32), ("Fine", "", torch.float16)):
+    state = collections.OrderedDict()
+    for k, (name, i, o) in enumerate(zip(names, inputs, outputs)):
+        state[f"{prefix}{name}.weight"] = (k + torch.arange(o * i) / 8).reshape(o, i).to(kind)
+        state[f"{prefix}{name}.bias"] = (-k - torch.arange(o) / 8).to(kind)
+    if which == "Fine":
+        state["rgb.0.weight"] = state["rgb.0.weight"].t().contiguous().t()
+    torch.save(state, ROOT / f"tests/data/7_net_{which}.pth")

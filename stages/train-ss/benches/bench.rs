@@ -193,8 +193,10 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         rows.add(format!("train_rays_per_s_per_gflops{name}"), speed / rows.value("sgemm_gflops"), "rays/GFLOP");
         Ok(trainer.finish())
     };
-    let params = Params { rays: Some(rays), ..Params::default() };
+    // Rays drawn evenly over all pixels, so that the figure compares with others'; then as trainings really go.
+    let params = Params { rays: Some(rays), detail: Some(1.0), ..Params::default() };
     let field = run(&params, rows, "")?;
+    run(&Params { detail: None, ..params.clone() }, rows, "_by_detail")?;
     let short = Params { rays: Some(rays / 6), ..params.clone() };
     run(&short, rows, "_first_sixth")?;
     one_core(|| run(&short, rows, "_first_sixth_one_core"))?;

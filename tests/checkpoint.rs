@@ -1,0 +1,79 @@
+//! Checkpoints of the reference implementation, written by PyTorch itself (`make goldens`), become a field that is rendered.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use common::{Finished, Project, demo_train, stage};
+
+fn here(file: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(file)
+}
+
+fn convert(coarse: &Path, fine: &Path, out: &Path) -> Finished {
+    let script = here("scripts/convert-checkpoint.py");
+    Finished::of(Command::new("python3").arg(script).args([coarse, fine, out]).output().unwrap())
+}
+
+#[test]
+fn a_checkpoint_of_the_reference_is_rendered() {
+    let project = Project::tiny();
+    let [coarse, fine] = ["tests/data/7_net_Coarse.pth", "tests/data/7_net_Fine.pth"].map(here);
+    let field = project.path("field");
+    let done = convert(&coarse, &fine, &field);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+
+    // Layer k holds k, k + 1/8, …, row by row, whatever its precision and strides were.
+    let bytes = std::fs::read(field.join("field-0.safetensors")).unwrap();
+    let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    assert_eq!(tensors.len(), 40);
+    for network in ["coarse", "fine"] {
+        for (layer, shape, first) in
+            [("xyz_encoding_5.0", vec![8, 23], 4.0f32), ("sigma", vec![1, 8], 6.0), ("rgb.0", vec![3, 4], 9.0)]
+        {
+            let weight = tensors.tensor(&format!("{network}.{layer}.weight")).unwrap();
+            assert_eq!(weight.shape(), shape);
+            let (numbers, _) = weight.data().as_chunks::<4>();
+            for (i, number) in numbers.iter().enumerate() {
+                assert_eq!(f32::from_le_bytes(*number), first + i as f32 / 8.0, "{network}.{layer} {i}");
+            }
+        }
+    }
+
+    demo_train(&project, 6);
+    let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
+    let rendered = stage("render-depth", r#"{"size": 8}"#, &[("field", &field), ("cameras", &cameras)], &views, &[]);
+    assert_eq!(rendered.code, 0, "{}", rendered.stderr);
+    assert_eq!(views.join("images").read_dir().unwrap().count(), 1);
+}
+
+#[test]
+fn what_is_no_checkpoint_is_one_line() {
+    let project = Project::tiny();
+    let [coarse, fine] = ["tests/data/7_net_Coarse.pth", "tests/data/7_net_Fine.pth"].map(here);
+    let out = project.path("out");
+    let fails = |coarse: &Path, words: &[&str]| {
+        let said = convert(coarse, &fine, &out);
+        said.fails(1, words);
+        assert_eq!(said.stderr.lines().count(), 1, "{}", said.stderr);
+        assert!(!out.exists());
+    };
+    fails(&project.path("nowhere.pth"), &["nowhere.pth", "No such file"]);
+    fails(&here("Cargo.toml"), &["Cargo.toml", "not a checkpoint"]);
+    let bytes = std::fs::read(&coarse).unwrap();
+    let cut = project.path("cut.pth");
+    for length in [0, 1, bytes.len() / 3, bytes.len() - 1] {
+        std::fs::write(&cut, &bytes[..length]).unwrap();
+        fails(&cut, &["cut.pth", "not a"]);
+    }
+    // A pickle that would run something.
+    let hostile = project.path("hostile.pth");
+    let write = "import os, pickle, sys, zipfile\n\
+                 class Run:\n    def __reduce__(self): return os.system, ('touch ' + sys.argv[1] + '.ran',)\n\
+                 zipfile.ZipFile(sys.argv[1], 'w').writestr('x/data.pkl', pickle.dumps(Run()))\n";
+    assert!(Command::new("python3").args(["-c", write]).arg(&hostile).status().unwrap().success());
+    fails(&hostile, &["hostile.pth", "system"]);
+    assert!(!hostile.with_extension("pth.ran").exists());
+}
