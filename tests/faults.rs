@@ -3,13 +3,30 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::path::Path;
 use std::process::Stdio;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use common::{Finished, Project, demo_train, manifest, signal, stage, stage_command};
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
 const PARAMS: &str = r#"{"supervision": "kernel", "members": 2, "rays": 900000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
+
+/// When the last of a work folder's checkpoints was written.
+fn last_checkpoint(work: &Path) -> Option<SystemTime> {
+    let files = walkdir::WalkDir::new(work).into_iter().flatten().filter(|f| f.file_name() == "checkpoint.safetensors");
+    files.filter_map(|f| f.metadata().ok()?.modified().ok()).max()
+}
+
+/// Waits for what comes sooner or later, however slow the machine is just now.
+fn wait_until(mut happened: impl FnMut() -> bool) {
+    for _ in 0..2400 {
+        if happened() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(25));
+    }
+}
 
 #[test]
 fn training_killed_at_any_moment_ends_in_the_same_bytes() {
@@ -22,8 +39,12 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
     let (output, work) = (project.path("killed"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];
     let mut resumed = 0;
-    for milliseconds in [100, 1300, 700, 1500, 1250] {
+    for (round, milliseconds) in [100, 0, 300, 20, 700].into_iter().enumerate() {
+        let before = last_checkpoint(&work);
         let mut child = stage_command("train-ss", PARAMS, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        if round > 0 {
+            wait_until(|| last_checkpoint(&work) != before || child.try_wait().unwrap().is_some());
+        }
         std::thread::sleep(Duration::from_millis(milliseconds));
         if child.try_wait().unwrap().is_some() {
             break;
@@ -31,7 +52,7 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
         signal(&child, "-KILL");
         child.wait().unwrap();
         assert!(!output.exists(), "a killed stage leaves no output");
-        resumed += usize::from(work.join("member-0/checkpoint.safetensors").exists());
+        resumed += usize::from(last_checkpoint(&work).is_some());
     }
     assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
     if !output.exists() {
@@ -49,7 +70,9 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let (output, work) = (project.path("out"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];
     let child = stage_command("train-ss", PARAMS, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
-    std::thread::sleep(Duration::from_millis(600));
+    // Its folder is made just before the first step.
+    wait_until(|| work.join("member-0").is_dir());
+    std::thread::sleep(Duration::from_millis(100));
     signal(&child, "-TERM");
     let finished = Finished::of(child.wait_with_output().unwrap());
     assert_eq!(finished.code, 130, "{}", finished.stderr);
@@ -74,16 +97,7 @@ fn a_runner_killed_or_interrupted_goes_on() {
         let child = spawn();
         std::thread::sleep(Duration::from_millis(milliseconds));
         // However slow the machine is just now, the interruption comes while something is being trained.
-        let training = || {
-            let files = walkdir::WalkDir::new(project.path(".nerf-sr/partial")).into_iter().flatten();
-            files.into_iter().any(|f| f.file_name() == "checkpoint.safetensors")
-        };
-        for _ in 0..600 {
-            if name != "-INT" || training() {
-                break;
-            }
-            std::thread::sleep(Duration::from_millis(100));
-        }
+        wait_until(|| name != "-INT" || last_checkpoint(&project.path(".nerf-sr/partial")).is_some());
         signal(&child, name);
         let finished = Finished::of(child.wait_with_output().unwrap());
         if name == "-INT" {
