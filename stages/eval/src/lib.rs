@@ -189,15 +189,12 @@ impl Job<'_> {
         let name = &true_view.camera.name;
         let view = views.views.iter().find(|v| v.camera.name == *name);
         let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
-        let found = read_view(views_in, view, view.image.as_ref(), views.background)?;
-        let expected = match &true_view.image {
-            None => None,
-            some => Some(read_view(truth_in, true_view, some.as_ref(), truth.background)?),
+        let image = view.image.as_ref().with_context(|| format!("view {name}: it has no image")).bad_input("views")?;
+        let found = read_view(views_in, view, image, views.background)?;
+        let read_true = |file: &Option<String>| -> anyhow::Result<Option<Picture>> {
+            file.as_ref().map(|f| read_view(truth_in, true_view, f, truth.background)).transpose()
         };
-        let low = match &true_view.low_resolution {
-            None => None,
-            some => Some(read_view(truth_in, true_view, some.as_ref(), truth.background)?),
-        };
+        let (expected, low) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
         let wanted = (true_view.camera.intrinsics.width as usize, true_view.camera.intrinsics.height as usize);
         if wanted != (found.width, found.height) {
             let message = format!(
@@ -212,7 +209,12 @@ impl Job<'_> {
                 format!("view {name}: its picture has {}×{} pixels, its camera others", expected.width, expected.height);
             return Err(Failure::BadInput(message).into());
         }
-        let shrunk = low.as_ref().map(|low| Resampling::new(self.filter, size(&found), size(low)).apply(&found));
+        let shrunk = low.as_ref().map(|low| {
+            let mut shrunk = Resampling::new(self.filter, size(&found), size(low)).apply(&found);
+            // As 8 bits would: a kernel with negative lobes overshoots.
+            shrunk.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+            shrunk
+        });
         let (shown, against) = match (&expected, &shrunk, &low) {
             (Some(expected), ..) => (&found, expected),
             (None, Some(shrunk), Some(low)) => (shrunk, low),
@@ -244,10 +246,9 @@ pub fn psnr(found: &Picture, expected: &Picture) -> f64 {
 }
 
 /// A picture of a view over its background, clamped to [0, 1].
-fn read_view(input: &GivenInput, view: &View, file: Option<&String>, background: Background) -> anyhow::Result<Picture> {
+fn read_view(input: &GivenInput, view: &View, file: &str, background: Background) -> anyhow::Result<Picture> {
     let place = format!("view {}", view.camera.name);
-    let name = file.with_context(|| "it has no image").bad_input(&place)?;
-    let path = input.path(name);
+    let path = input.path(file);
     let mut picture = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
     picture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     Ok(picture)
