@@ -18,7 +18,7 @@ pub(crate) fn is_picture(path: &Path) -> bool {
     path.is_file() && matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
 }
 
-fn is_exr(path: &Path) -> bool {
+pub(crate) fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
 }
 

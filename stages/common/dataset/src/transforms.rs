@@ -5,7 +5,7 @@ use scene::Intrinsics;
 use serde::Deserialize;
 
 use crate::frame::names;
-use crate::photograph::{Stored, fitted, look};
+use crate::photograph::{Stored, fitted, is_exr, look};
 use crate::{Dataset, DatasetError, Distortion, Format, Frame, Lens, Split, read_text};
 
 /// `transforms.json`. What a frame doesn't say for itself holds for all.
@@ -76,8 +76,9 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     if let (Some(first), count) = missing {
         notes.push(format!("{count} of {} frames have no picture and are left out, first {first}", frames.len() + count));
     }
-    if frames.iter().any(|f| f.mask.is_some()) {
-        notes.push(format!("{} frames have a mask", frames.iter().filter(|f| f.mask.is_some()).count()));
+    let masked = frames.iter().filter(|f| f.mask.is_some()).count();
+    if masked > 0 {
+        notes.push(format!("{masked} frames have a mask, which nothing uses yet: all of their pictures is trained on"));
     }
     Ok(Dataset { format: Format::Transforms, frames, split, notes })
 }
@@ -174,6 +175,8 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
         }
     };
     let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
+    // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
+    let depth = depth.filter(|path| is_exr(path));
     let (lens, turned) = lens(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
     let frame = Frame { name: String::new(), image, turned, mask, depth, lens, camera_to_world, depths: None };
     frame.check().map_err(|reason| format!("transform_matrix: {reason}"))?;
