@@ -143,6 +143,10 @@ fn every_form_gives_the_same_cameras_and_pictures() {
 fn one_command_makes_hr_views_of_lr_photographs() {
     let project = Project::tiny();
     as_colmap(&project);
+    // One of them is a smaller copy.
+    let copy = project.path("colmap/images/r_3.png");
+    let small = pixels::resize_pillow(&pixels::read_png(&copy).unwrap(), 20, 20, pixels::Filter::Box);
+    pixels::write_png(&copy, &small).unwrap();
     project.replace("    parameters: {lr: 24, scale: 2}\n", "");
     project.replace("default: [eval]", "default: [report]");
     project.replace("  eval:", "  report:\n    inputs: {run: eval}\n  eval:");
