@@ -40,6 +40,7 @@ PARTS = [
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
     ("no weight averaging", ["averaging=0"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
+    ("distortion loss 0.01", ["distortion=0.01"]),
     ("grid decay 1e-6", ["grid_decay=0.000001"]),
     ("alpha supervision, averaged", ["background=alpha"]),
     ("alpha hull", ["hull=alpha"]),

@@ -186,3 +186,41 @@ fn the_papers_split_leaves_references_out() {
     let name = |subtree: &str, i: usize| views(&scene.join(subtree))[i]["camera"]["name"].clone();
     assert_eq!((name("truth", 0), name("references", 2)), (json!("r_11"), json!("r_10")));
 }
+
+/// A world without end, seen from the front and from all around: trained in NDC and in a contraction. Depth is the camera's z, whatever
+/// the field's own space, and the views are better than a box's, whose world ends.
+#[test]
+fn worlds_without_end_have_a_space_of_their_own() {
+    let project = Project::tiny();
+    project.replace("train: 12", "train: 30");
+    project.replace("rays: 60000", "rays: 400000");
+    let mean = |settings: &[&str]| -> (f64, f64) {
+        let settings = [&["-p", "backdrop=true"], settings].concat();
+        project.ok(&[&["run"], &settings[..]].concat());
+        let metrics = project.object(&project.output_of("eval", &settings)[0]).join("metrics.json");
+        let mean = serde_json::from_slice::<Value>(&std::fs::read(metrics).unwrap()).unwrap()["mean"].clone();
+        (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
+    };
+    for (views, space, least, depth_error) in [("forward", "ndc", 22.0, 0.7), ("around", "contraction", 18.0, 0.7)] {
+        let views = format!("views={views}");
+        let settings = |space: &str| {
+            vec![
+                "-p".to_owned(),
+                views.clone(),
+                "-p".into(),
+                space.to_owned(),
+                "-p".into(),
+                "near=2".into(),
+                "-p".into(),
+                "far=80".into(),
+            ]
+        };
+        let own = settings(&format!("space={space}"));
+        let (psnr, depth) = mean(&own.iter().map(String::as_str).collect::<Vec<_>>());
+        let boxed = settings("space=box");
+        let (psnr_of_box, _) = mean(&boxed.iter().map(String::as_str).collect::<Vec<_>>());
+        println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");
+        assert!(psnr > least && depth < depth_error, "{space}: {psnr} dB, depth off by {depth}");
+        assert!(psnr > psnr_of_box, "{space}: {psnr} dB, box {psnr_of_box}");
+    }
+}

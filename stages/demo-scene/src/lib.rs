@@ -44,14 +44,28 @@ pub struct Params {
     /// Rays a pixel along each axis, for anti-aliasing.
     #[schemars(range(min = 1, max = 16))]
     pub samples: u32,
+    /// Where cameras stand.
+    pub views: Layout,
+    /// Puts the things into a world without end: ground, towers far away, a sky.
+    pub backdrop: bool,
     /// Another seed puts other textures on the things and them in other places.
     pub seed: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: 200, train: 80, test: 10, samples: 4, seed: 0 }
+        Self { size: 200, train: 80, test: 10, samples: 4, views: Layout::Around, backdrop: false, seed: 0 }
     }
+}
+
+/// Where cameras stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Layout {
+    /// All around the things, looking at their middle.
+    Around,
+    /// In front of them, a step to the sides, up and down, all looking one way.
+    Forward,
 }
 
 /// The stage.
@@ -68,10 +82,11 @@ impl Stage for DemoScene {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let world = World::new(params.seed);
+        let world = if params.backdrop { world.with_backdrop() } else { world };
         let total = u64::from(params.train + params.test);
         let progress = context.progress("rendering", total);
         for (split, count) in [("train", params.train), ("test", params.test)] {
-            let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(split, i, count)).collect();
+            let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.views, split, i, count)).collect();
             context.output_path(&format!("{split}/."))?;
             (0..count)
                 .into_par_iter()
@@ -129,10 +144,23 @@ fn write_depth(path: &std::path::Path, frame: &Frame) -> Result<(), PixelError> 
     )
 }
 
-/// Camera `i` of `count`: training views spread evenly over the upper hemisphere, test views on a wavy circle between them.
-fn pose(split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
+/// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test views on a wavy circle between them.
+/// Forward: training views fill a square by the golden ratio, test views lie on a circle in it.
+fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let share = (f64::from(i) + 0.5) / f64::from(count);
+    let row = |r: &DMat3, centre: DVec3, k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]];
+    let matrix = |r: DMat3, centre: DVec3| [row(&r, centre, 0), row(&r, centre, 1), row(&r, centre, 2), [0.0, 0.0, 0.0, 1.0]];
+    if layout == Layout::Forward {
+        let (u, v) = if split == "train" {
+            (share - 0.5, (f64::from(i) * 0.618_033_988_75 + 0.5) % 1.0 - 0.5)
+        } else {
+            (0.3 * libm::cos(TAU * share), 0.3 * libm::sin(TAU * share))
+        };
+        // Looking along +y.
+        let axes = DMat3::from_cols(DVec3::X, DVec3::Z, -DVec3::Y);
+        return matrix(axes, DVec3::new(u, -DISTANCE, 0.3 + v));
+    }
     let (azimuth, height) = if split == "train" {
         // The golden angle; heights between just below the horizon and almost straight above.
         (f64::from(i) * PI * (3.0 - 5.0f64.sqrt()), -0.08 + 1.03 * share)
@@ -144,8 +172,7 @@ fn pose(split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     let back = centre.normalize();
     let right = DVec3::Z.cross(back).normalize();
     let r = DMat3::from_cols(right, back.cross(right), back);
-    let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]];
-    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+    matrix(r, centre)
 }
 
 #[cfg(test)]
@@ -155,7 +182,7 @@ mod tests {
     #[test]
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
-        let pose = pose("test", 3, 10);
+        let pose = pose(Layout::Around, "test", 3, 10);
         let frame = render::render(&world, &pose, CAMERA_ANGLE_X, 64, 2);
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
@@ -170,7 +197,7 @@ mod tests {
         // What a test view sees must be inside the training views' frusta, or near/far and hull would be guesses.
         let world = World::new(0);
         for i in 0..10 {
-            let frame = render::render(&world, &pose("test", i, 10), CAMERA_ANGLE_X, 48, 1);
+            let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), CAMERA_ANGLE_X, 48, 1);
             for k in 0..48 {
                 for (x, y) in [(k, 0), (k, 47), (0, k), (47, k)] {
                     assert_eq!(frame.colour.data[(y * 48 + x) * 4 + 3], 0, "view {i} is cut off at ({x}, {y})");
@@ -181,7 +208,7 @@ mod tests {
 
     #[test]
     fn seeds_differ() {
-        let view = |seed| render::render(&World::new(seed), &pose("test", 0, 10), CAMERA_ANGLE_X, 32, 1).colour;
+        let view = |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE_X, 32, 1).colour;
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
     }

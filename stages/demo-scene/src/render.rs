@@ -49,9 +49,11 @@ pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u3
     Frame { colour: Rgba8::new(size as usize, size as usize, colour), depth }
 }
 
-/// Light from the first surface along a ray; `None` where there is none.
+/// Light from the first surface along a ray, or from the sky; `None` where there is neither.
 fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option<DVec3> {
-    let hit = world.first_hit(origin, direction)?;
+    let Some(hit) = world.first_hit(origin, direction) else {
+        return world.sky.then(|| sky_light(direction) * clouds(direction));
+    };
     let point = origin + hit.t * direction;
     let normal = if hit.normal.dot(direction) > 0.0 { -hit.normal } else { hit.normal };
     let look = surface(hit.material, hit.local, hit.local_normal, world.seed);
@@ -71,6 +73,12 @@ fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option
         light = light * (1.0 - share) + seen * share;
     }
     Some(light)
+}
+
+/// Bands of cloud, so that the sky has something to be seen by.
+fn clouds(direction: DVec3) -> f64 {
+    let azimuth = libm::atan2(direction.y, direction.x);
+    1.0 + 0.25 * libm::sin(7.0 * azimuth + 3.0 * libm::sin(9.0 * direction.z)) * (1.0 - direction.z.abs())
 }
 
 /// What a mirror sees where nothing stands.

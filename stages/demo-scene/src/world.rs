@@ -51,6 +51,8 @@ pub(crate) struct Hit {
 pub struct World {
     groups: Vec<Group>,
     pub(crate) seed: u32,
+    /// Whether there is a sky, which every ray meets that meets nothing else.
+    pub(crate) sky: bool,
 }
 
 /// Top of the base.
@@ -134,7 +136,24 @@ impl World {
                 material: Material::Sign,
             },
         ]));
-        Self { groups, seed }
+        Self { groups, seed, sky: false }
+    }
+
+    /// The same things with a world around them that doesn't end: ground, towers far away, sky.
+    #[must_use]
+    pub fn with_backdrop(mut self) -> Self {
+        let thing = |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
+        let ground = FLOOR - 0.2;
+        self.groups.push(group(vec![thing(Shape::Drum(60.0, 0.05), DVec3::Z * (ground - 0.05), Material::Tiles)]));
+        for k in 0..9u32 {
+            // Scattered by the golden angle, between 7 and 20 units away.
+            let (angle, distance) = (f64::from(k + self.seed % 9) * 2.4, 7.0 + 1.6 * f64::from(k));
+            let half = DVec3::new(0.7, 0.9, 1.2 + 0.35 * f64::from(k % 4));
+            let foot = DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), ground);
+            self.groups.push(group(vec![thing(Shape::Block(half), foot + DVec3::Z * half.z, Material::Crate)]));
+        }
+        self.sky = true;
+        self
     }
 
     /// The first surface along a ray, beyond a tiny distance.

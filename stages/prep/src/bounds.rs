@@ -1,5 +1,122 @@
 use glam::{DMat3, DVec3};
-use scene::{Bounds, Camera};
+use scene::{Bounds, Camera, Frustum, Space};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Spaces a field can have, by name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SpaceKind {
+    /// A box around what the cameras look at: scenes that end.
+    Box,
+    /// Normalised device coordinates: forward-facing photographs, whose far parts need less detail.
+    Ndc,
+    /// The box, and all around it, ever coarser with the distance: cameras among what they see.
+    Contraction,
+}
+
+/// A space that can't be had.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum SpaceError {
+    /// Nothing says how near the scene comes.
+    #[error("parameter space: ndc needs to know how near and far each view sees, and the data set doesn't say; choose box")]
+    NoDepths,
+    /// Cameras that look every way.
+    #[error("parameter space: ndc needs cameras that look one way; choose box or contraction")]
+    NotForward,
+}
+
+/// Cameras that turn at most so far from their mean direction are forward-facing: cos 45°.
+const FORWARD: f64 = 0.707;
+/// What lies so many box halves from the box's middle needs more than a box.
+const BEYOND: f64 = 2.5;
+
+/// A posed view, and between which depths it sees anything, where that is known.
+pub type Sight = (Camera, Option<[f64; 2]>);
+
+/// Where the scene is, and the space that suits it: NDC where all cameras look one way and the depths they see are known, the
+/// contraction where something is known to lie far outside the box, else the box. A `kind` that is given is taken. The box is that of
+/// the training views; `others` are cameras that will look, too.
+pub fn place(training: &[Sight], others: &[Sight], kind: Option<SpaceKind>) -> Result<Bounds, SpaceError> {
+    let boxed = bounds_of(training);
+    let ndc = || -> Result<Bounds, SpaceError> {
+        let all = [training, others].concat();
+        let space = Space::Ndc(frustum(&all)?);
+        let around = around_frusta(&all).ok_or(SpaceError::NoDepths)?;
+        // The frustum's planes end rays; the range must not end them before.
+        Ok(Bounds { far: 3.0 * around.far, space, ..around })
+    };
+    match kind {
+        Some(SpaceKind::Box) => Ok(boxed),
+        Some(SpaceKind::Ndc) => ndc(),
+        Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
+        None => Ok(match ndc() {
+            Ok(bounds) => bounds,
+            Err(_) if reaches_beyond(&boxed, training) => contracted(boxed, training),
+            Err(_) => boxed,
+        }),
+    }
+}
+
+/// What all cameras see, from the middle of them: the frustum of NDC.
+fn frustum(sights: &[Sight]) -> Result<Frustum, SpaceError> {
+    let mean = |f: &dyn Fn(&Camera) -> DVec3| sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64;
+    let forward = mean(&Camera::forward).try_normalize().ok_or(SpaceError::NotForward)?;
+    let up = mean(&|c| c.rotation().y_axis);
+    let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
+    if sights.iter().any(|(c, _)| c.forward().dot(forward) < FORWARD) {
+        return Err(SpaceError::NotForward);
+    }
+    let (up, centre) = (right.cross(forward), mean(&Camera::centre));
+    let row = |i: usize| [right[i], up[i], -forward[i], centre[i]];
+    let mut frustum = Frustum {
+        camera_to_world: [row(0), row(1), row(2)],
+        min: [f64::INFINITY; 2],
+        max: [f64::NEG_INFINITY; 2],
+        near: f64::INFINITY,
+        far: 0.0,
+    };
+    for (camera, depths) in sights {
+        let [nearest, farthest] = depths.ok_or(SpaceError::NoDepths)?;
+        // Known depths are those of points that were found; twice as far may be more.
+        for corner in corners(camera, [0.9 * nearest, 2.0 * farthest]) {
+            let p = frustum.to_camera(corner);
+            if p.z <= 0.0 {
+                return Err(SpaceError::NotForward);
+            }
+            for (i, slope) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
+                (frustum.min[i], frustum.max[i]) = (frustum.min[i].min(slope), frustum.max[i].max(slope));
+            }
+            (frustum.near, frustum.far) = (frustum.near.min(p.z), frustum.far.max(p.z));
+        }
+    }
+    if frustum.is_valid() { Ok(frustum) } else { Err(SpaceError::NotForward) }
+}
+
+/// Whether more lies outside the box than a box can hold.
+fn reaches_beyond(bounds: &Bounds, sights: &[Sight]) -> bool {
+    let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+    let reach = BEYOND * 0.5 * bounds.longest_side();
+    let far =
+        |(camera, depths): &Sight| depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach);
+    2 * sights.iter().filter(|s| far(s)).count() > sights.len()
+}
+
+/// The same box with all around it: from where the nearest view sees something to far beyond the farthest.
+fn contracted(boxed: Bounds, sights: &[Sight]) -> Bounds {
+    let radius = 0.5 * boxed.longest_side();
+    let known = |pick: &dyn Fn([f64; 2]) -> f64| sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>();
+    let near = known(&|d| 0.5 * d[0]).into_iter().fold(0.05 * radius, f64::min);
+    let far = known(&|d| 10.0 * d[1]).into_iter().fold(100.0 * radius, f64::max);
+    Bounds { near, far, space: Space::Contraction, ..boxed }
+}
+
+/// The corners of what a camera sees between two depths.
+fn corners(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_ {
+    let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
+    let rays = [(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)].map(|(x, y)| camera.ray(x, y));
+    rays.into_iter().flat_map(move |ray| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray))))
+}
 
 /// A box around what all cameras look at, from the cameras alone where they say enough.
 ///
@@ -7,10 +124,11 @@ use scene::{Bounds, Camera};
 /// that a scene which fits into its views fits into the box. Cameras that look past each other (one view, a forward-facing
 /// row) leave the centre open along their axes. Then the box is around all that they see between the nearest and the farthest depth
 /// that is known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender scenes' habit.
-pub fn bounds_of(cameras: &[Camera], depths: &[Option<[f64; 2]>]) -> Bounds {
+fn bounds_of(sights: &[Sight]) -> Bounds {
+    let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;
-    for camera in cameras {
+    for camera in &cameras {
         let d = camera.forward();
         let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
         normal += across;
@@ -21,13 +139,13 @@ pub fn bounds_of(cameras: &[Camera], depths: &[Option<[f64; 2]>]) -> Bounds {
     // The determinant is 0 for parallel axes and 8/27 for axes from all sides.
     let centre = if crossing.determinant() > 1e-3 {
         normal.inverse() * right
-    } else if let Some(bounds) = around_frusta(cameras, depths) {
+    } else if let Some(bounds) = around_frusta(sights) {
         return bounds;
     } else {
-        let mean = |f: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(f).sum::<DVec3>() / count;
+        let mean = |f: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| f(c)).sum::<DVec3>() / count;
         mean(&|c| c.centre()) + 4.0 * mean(&|c| c.forward()).normalize_or(DVec3::NEG_Z)
     };
-    let reach = |camera: &Camera| {
+    let reach = |camera: &&Camera| {
         let k = &camera.intrinsics;
         let slope = (0.5 * f64::from(k.width) / k.fx).max(0.5 * f64::from(k.height) / k.fy);
         (camera.centre() - centre).length() * slope
@@ -39,33 +157,29 @@ pub fn bounds_of(cameras: &[Camera], depths: &[Option<[f64; 2]>]) -> Bounds {
         max: (centre + DVec3::splat(half)).to_array(),
         near: 0.0,
         far: 0.0,
+        space: Space::Box,
     };
     with_range(box_only, cameras)
 }
 
 /// A box around what each camera sees between its depths, a tenth more to either side. `None` where a camera has none.
-fn around_frusta(cameras: &[Camera], depths: &[Option<[f64; 2]>]) -> Option<Bounds> {
+fn around_frusta(sights: &[Sight]) -> Option<Bounds> {
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
-    for (camera, depths) in cameras.iter().zip(depths) {
+    for (camera, depths) in sights {
         let [nearest, farthest] = (*depths)?;
-        let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
         near = near.min(0.9 * nearest);
-        for (x, y) in [(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)] {
-            let ray = camera.ray(x, y);
-            for depth in [0.9 * nearest, 1.1 * farthest] {
-                let distance = depth / camera.depth_per_distance(&ray);
-                (min, max) = (min.min(ray.at(distance)), max.max(ray.at(distance)));
-                far = far.max(distance);
-            }
+        for corner in corners(camera, [0.9 * nearest, 1.1 * farthest]) {
+            (min, max) = (min.min(corner), max.max(corner));
+            far = far.max((corner - camera.centre()).length());
         }
     }
-    let bounds = Bounds { min: min.to_array(), max: max.to_array(), near, far };
+    let bounds = Bounds { min: min.to_array(), max: max.to_array(), near, far, space: Space::Box };
     bounds.is_valid().then_some(bounds)
 }
 
 /// The same box with near and far from its nearest and farthest point over all cameras.
-pub(crate) fn with_range(bounds: Bounds, cameras: &[Camera]) -> Bounds {
+pub(crate) fn with_range<'a>(bounds: Bounds, cameras: impl IntoIterator<Item = &'a Camera>) -> Bounds {
     let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for camera in cameras {
@@ -107,7 +221,7 @@ mod tests {
     fn the_box_is_around_what_all_cameras_see_at_any_scale() {
         for scale in [1e-6, 1.0, 1e6] {
             let target = scale * DVec3::new(0.5, -0.3, 0.2);
-            let bounds = bounds_of(&circle(target, 4.0 * scale), &[]);
+            let bounds = bounds_of(&sights(&circle(target, 4.0 * scale), None));
             let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
             assert!((centre - target).length() < 1e-6 * scale, "{bounds:?}");
             let half = 0.5 * (bounds.max[0] - bounds.min[0]) / scale;
@@ -118,7 +232,7 @@ mod tests {
 
     #[test]
     fn one_camera_has_a_box_too() {
-        let bounds = bounds_of(&[looking_at(DVec3::new(4.0, 0.0, 0.5), DVec3::ZERO)], &[None]);
+        let bounds = bounds_of(&[(looking_at(DVec3::new(4.0, 0.0, 0.5), DVec3::ZERO), None)]);
         assert!(bounds.near > 0.0 && bounds.far > bounds.near && bounds.far.is_finite());
     }
 
@@ -131,8 +245,7 @@ mod tests {
                 looking_at(from, from + DVec3::Y)
             })
             .collect();
-        let depths = vec![Some([2.0, 10.0]); 5];
-        let bounds = bounds_of(&row, &depths);
+        let bounds = bounds_of(&sights(&row, Some([2.0, 10.0])));
         for camera in &row {
             for (x, y) in [(0.0, 0.0), (100.0, 50.0), (50.0, 100.0), (50.0, 50.0)] {
                 let ray = camera.ray(x, y);
@@ -145,7 +258,50 @@ mod tests {
             }
         }
         assert!(bounds.max[1] < 11.1 && bounds.min[1] > 1.5, "{bounds:?}");
-        let unknown = bounds_of(&row, &[None; 5]);
+        let unknown = bounds_of(&sights(&row, None));
         assert!(unknown.is_valid() && unknown != bounds);
+    }
+
+    fn sights(cameras: &[Camera], depths: Option<[f64; 2]>) -> Vec<Sight> {
+        cameras.iter().map(|c| (c.clone(), depths)).collect()
+    }
+
+    /// What each camera sees between its depths lies in the frustum's cube, whatever the world's scale.
+    #[test]
+    fn cameras_that_look_one_way_get_ndc() {
+        for scale in [1e-3, 1.0, 1e3] {
+            let row: Vec<Camera> = (0..5)
+                .map(|i| looking_at(scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.1), scale * DVec3::new(0.4, 6.0, 0.0)))
+                .collect();
+            let bounds = place(
+                &sights(&row[1..], Some([2.0 * scale, 10.0 * scale])),
+                &sights(&row[..1], Some([2.0 * scale, 9.0 * scale])),
+                None,
+            );
+            let bounds = bounds.unwrap();
+            let Space::Ndc(frustum) = bounds.space else { panic!("{bounds:?}") };
+            assert!(bounds.is_valid() && frustum.near > 1.5 * scale && frustum.far < 21.0 * scale, "{frustum:?}");
+            for camera in &row {
+                for corner in corners(camera, [2.0 * scale, 15.0 * scale]) {
+                    let p = frustum.to_cube(frustum.to_camera(corner)).to_array();
+                    assert!(p.iter().all(|x| (-1e-9..=1.0 + 1e-9).contains(x)), "{p:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_space_is_what_the_cameras_see() {
+        let ring = circle(DVec3::ZERO, 4.0);
+        let chosen = |depths, kind| place(&sights(&ring, depths), &[], kind).map(|b| b.space);
+        assert_eq!(chosen(None, None), Ok(Space::Box));
+        assert_eq!(chosen(Some([3.0, 5.0]), None), Ok(Space::Box));
+        assert_eq!(chosen(Some([3.0, 40.0]), None), Ok(Space::Contraction));
+        assert_eq!(chosen(Some([3.0, 40.0]), Some(SpaceKind::Box)), Ok(Space::Box));
+        assert_eq!(chosen(None, Some(SpaceKind::Contraction)), Ok(Space::Contraction));
+        assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
+        let one = [looking_at(DVec3::Y, DVec3::ZERO)];
+        assert_eq!(place(&sights(&one, None), &[], Some(SpaceKind::Ndc)), Err(SpaceError::NoDepths));
+        assert_eq!(place(&sights(&one, None), &[], None).map(|b| b.space), Ok(Space::Box));
     }
 }

@@ -110,7 +110,7 @@ mod tests {
         let side = camera([[0., 0., 1., 10.], [0., 1., 0., 0.], [-1., 0., 0., 0.]]);
         let mask: Vec<f32> =
             (0..32 * 32).map(|i| f32::from(u8::from((8..24).contains(&(i % 32)) && (8..24).contains(&(i / 32))))).collect();
-        let bounds = Bounds { min: [-2.; 3], max: [2.; 3], near: 1., far: 20. };
+        let bounds = Bounds { min: [-2.; 3], max: [2.; 3], near: 1., far: 20., ..Default::default() };
         let tight = tightened(&bounds, &[front, side], &[mask.clone(), mask.clone()], 1).unwrap();
         for axis in 0..3 {
             // The square spans ±1.27 at the centre; conservative means never less, and not everything.

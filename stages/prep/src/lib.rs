@@ -21,11 +21,11 @@ use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use dataset::{Dataset, Format, Frame, Split};
 use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
-use scene::{Background, Bounds, Camera, VIEWS_FILE, View, Views};
+use scene::{Background, Bounds, Camera, Space, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use bounds::bounds_of;
+pub use bounds::{Sight, SpaceError, SpaceKind, place};
 pub use degrade::{LowResolution, degrade};
 pub use hull::{GRID, carve};
 pub use sizes::{SizeError, Sizes, enlarged, sizes};
@@ -56,6 +56,9 @@ pub struct Params {
     /// Distance along rays behind which there is nothing; without it: from the cameras.
     #[schemars(range(min = 0.0))]
     pub far: Option<f64>,
+    /// What a field keeps in its cube. Without it: `ndc` where all cameras look one way and it is known how near they see, `contraction`
+    /// where something is known to lie far outside what they look at, else `box`.
+    pub space: Option<SpaceKind>,
     /// `alpha` carves a visual hull from the LR images' alpha: faster training, but information the paper's method doesn't see.
     pub hull: HullSource,
     /// Which views are trained on and which are for testing. Without it: what the data set says, else `holdout`.
@@ -78,6 +81,7 @@ impl Default for Params {
             background: Background::White,
             near: None,
             far: None,
+            space: None,
             hull: HullSource::None,
             split: None,
             test_views: None,
@@ -272,8 +276,21 @@ impl Making {
 }
 
 /// Where in the data set a complaint belongs.
-fn place(frame: &Frame) -> String {
+fn frame_name(frame: &Frame) -> String {
     format!("frame {}", frame.name)
+}
+
+/// The space that was chosen, in words.
+fn space_note(bounds: &Bounds) -> String {
+    match bounds.space {
+        Space::Box => {
+            format!("space: a box of {:.3} units, seen from {:.3} to {:.3}", bounds.longest_side(), bounds.near, bounds.far)
+        }
+        Space::Ndc(f) => format!("space: all cameras look one way, so NDC, from depth {:.3} to {:.3}", f.near, f.far),
+        Space::Contraction => {
+            format!("space: a ball of {:.3} units, and all around it up to {:.0}, contracted", bounds.longest_side(), bounds.far)
+        }
+    }
 }
 
 /// Everything the steps of one run share.
@@ -287,14 +304,26 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    fn run(&self, set: &Dataset, notes: Vec<String>, train: &[&Frame], test: &[&Frame]) -> anyhow::Result<()> {
+    fn run(&self, set: &Dataset, mut notes: Vec<String>, train: &[&Frame], test: &[&Frame]) -> anyhow::Result<()> {
         let progress = self.context.progress("preparing", (train.len() + test.len()) as u64);
         let cameras = |frames: &[&Frame]| -> anyhow::Result<Vec<Camera>> {
             frames.iter().map(|f| Ok(f.camera(f.pinhole().bad_input("dataset")?))).collect()
         };
         let train_cameras = cameras(train)?;
-        let depths: Vec<_> = train.iter().map(|f| f.depths).collect();
-        let mut bounds = bounds_of(&train_cameras, &depths);
+        let test_cameras = cameras(test)?;
+        // What the user says of all views stands in for what isn't known of each.
+        let given =
+            self.params.near.zip(self.params.far).map(|(near, far)| [near, far]).filter(|[near, far]| 0.0 < *near && near < far);
+        let sights = |cameras: &'_ [Camera], frames: &[&Frame]| -> Vec<_> {
+            cameras.iter().cloned().zip(frames.iter().map(|f| f.depths.or(given))).collect()
+        };
+        let (training, others) = (sights(&train_cameras, train), sights(&test_cameras, test));
+        let mut bounds = place(&training, &others, self.params.space).map_err(|e| Failure::Usage(e.to_string()))?;
+        if self.params.hull == HullSource::Alpha && bounds.space != Space::Box {
+            return Err(Failure::Usage("parameter hull: alpha carves a box; choose space: box, too".to_owned()).into());
+        }
+        notes.push(space_note(&bounds));
+        self.context.say(space_note(&bounds));
         for (name, given, bound) in [("near", self.params.near, &mut bounds.near), ("far", self.params.far, &mut bounds.far)] {
             if let Some(value) = given {
                 if !value.is_finite() {
@@ -371,13 +400,13 @@ impl Job<'_> {
                 }
                 self.write_low("truth/low", &frame.name, &lr)?;
                 if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
-                    self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(place(frame))?;
+                    self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(frame_name(frame))?;
                 }
                 progress.add(1);
                 Ok(())
             })
             .collect::<anyhow::Result<Vec<()>>>()?;
-        let truth: Vec<View> = cameras(test)?
+        let truth: Vec<View> = test_cameras
             .iter()
             .zip(test)
             .map(|(c, frame)| View {
@@ -409,7 +438,7 @@ impl Job<'_> {
 
     /// The HR picture, where there is one, and the LR picture.
     fn pictures(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LowResolution)> {
-        let (image, pinhole) = frame.photograph().bad_input(place(frame))?;
+        let (image, pinhole) = frame.photograph().bad_input(frame_name(frame))?;
         if !self.making.has_truth {
             return Ok((None, LowResolution::Bytes(image)));
         }

@@ -135,7 +135,7 @@ fn rays(count: usize) -> Vec<Ray> {
 
 /// One core through a field of faint fog: every sample gets a colour.
 fn passes(rows: &mut Rows) {
-    let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0 };
+    let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
     let default = Architecture::default();
     let variants = [
         ("", Architecture { levels: 8, log2_entries: 17, hidden: 32, ..default }),
@@ -180,7 +180,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         let pictures = train_ss::read_pictures(&input, &views)?;
         let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
         let architecture = params.grid(views.views[0].camera.intrinsics.width);
-        let training = params.grid_training(params.rays(0));
+        let training = params.grid_training(params.rays(0), views.bounds.space);
         let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {

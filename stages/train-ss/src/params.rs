@@ -1,4 +1,5 @@
 use radiance::{Architecture, MlpArchitecture, TrainingOptions};
+use scene::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -65,6 +66,9 @@ pub struct Params {
     /// `grid`: share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
     #[schemars(range(min = 0.0, max = 0.999))]
     pub averaging: f64,
+    /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze where few views look.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub distortion: Option<f64>,
     /// `grid`: weight decay of the grid.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub grid_decay: f64,
@@ -137,6 +141,7 @@ impl Default for Params {
             final_rate: None,
             schedule: RateSchedule::Code,
             averaging: 0.97,
+            distortion: None,
             grid_decay: 0.0,
             network_decay: 1e-6,
             levels: grid.levels,
@@ -210,6 +215,7 @@ impl Params {
                 ("level_rate", self.level_rate != default.level_rate),
                 ("network_rate", self.network_rate != default.network_rate),
                 ("averaging", self.averaging != default.averaging),
+                ("distortion", self.distortion != default.distortion),
                 ("grid_decay", self.grid_decay != default.grid_decay),
                 ("network_decay", self.network_decay != default.network_decay),
                 ("levels", self.levels != default.levels),
@@ -292,8 +298,8 @@ impl Params {
         }
     }
 
-    /// How they ask for a grid to be trained, with so many rays.
-    pub fn grid_training(&self, rays: u64) -> TrainingOptions {
+    /// How they ask for a grid in a space to be trained, with so many rays.
+    pub fn grid_training(&self, rays: u64, space: Space) -> TrainingOptions {
         TrainingOptions {
             rays,
             batch: self.batch() as usize,
@@ -304,6 +310,7 @@ impl Params {
             final_rate: self.or(self.final_rate, 0.25, 0.01),
             warm_up: 100,
             averaging: self.averaging as f32,
+            distortion: self.distortion.unwrap_or(if space == Space::Box { 0.0 } else { 0.01 }) as f32,
             grid_decay: self.grid_decay as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,

@@ -396,7 +396,7 @@ mod tests {
             intrinsics: Intrinsics { width: 5, height: 4, fx: 6.0, fy: 7.0, cx: 2.4, cy: 2.1 },
             camera_to_world: [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]],
         };
-        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0 };
+        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0, ..Default::default() };
         let views = Views::new(Background::White, bounds, vec![View::camera_only(camera.clone())]);
         let picture = picture.unwrap_or_else(|| Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
         (Supersampling::new(&views, vec![picture], &options(supervision, scale)), camera)

@@ -1,6 +1,6 @@
 //! A few rays at a time through the whole field and back, in buffers that are reused: nothing is allocated once they have grown.
 
-use crate::composite::{MAX_RAW, optical_depth_gradients, optical_depths, weights};
+use crate::composite::{MAX_RAW, add_distortion_gradients, optical_depth_gradients, optical_depths, weights};
 use crate::field::{COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, encode};
 use crate::math::{exp, sigmoid};
@@ -22,9 +22,9 @@ pub(crate) struct RaySum {
     pub(crate) transmittance: f32,
     /// Σ w over the samples with colour.
     pub(crate) weight: f32,
-    /// Σ w·t over the same, in cube sides.
+    /// Σ w·distance over the same, in scene units.
     pub(crate) distance: f32,
-    /// Where the transmittance falls below one half, in cube sides.
+    /// Where along the ray the transmittance falls below one half: its t.
     pub(crate) median: Option<f32>,
 }
 
@@ -70,6 +70,7 @@ pub(crate) struct Chunk {
     starts: Vec<usize>,
     /// Optical depth of each ray so far.
     depth: Vec<f32>,
+    /// Where each sample lies along its ray, and in the unit cube.
     t: Vec<f32>,
     marched: Vec<[f32; 3]>,
     positions: Vec<f32>,
@@ -258,7 +259,7 @@ impl Chunk {
         let input = fit(&mut self.colour_in, COLOUR_INPUTS * m);
         gather(&self.rounds, &self.kept, &self.density, DENSITY_OUTPUTS, 1, &mut input[..(DENSITY_OUTPUTS - 1) * m], m);
         self.bases.clear();
-        self.bases.extend(rays.iter().map(|r| spherical_harmonics(r.direction)));
+        self.bases.extend(rays.iter().map(|r| spherical_harmonics(r.view)));
         for (k, row) in input[(DENSITY_OUTPUTS - 1) * m..].chunks_exact_mut(m.max(1)).enumerate() {
             for (value, &r) in row.iter_mut().zip(&self.kept_ray) {
                 *value = self.bases[r as usize][k];
@@ -273,7 +274,7 @@ impl Chunk {
         let colour = fit(&mut self.colour, 3 * m);
         multiply(&field.network[third.range()], hidden2, colour, third.inputs, third.outputs, m, After::Linear);
         sigmoids(colour);
-        for (sum, range) in self.sums.iter_mut().zip(self.ray_starts.windows(2)) {
+        for ((sum, ray), range) in self.sums.iter_mut().zip(rays).zip(self.ray_starts.windows(2)) {
             for &k in &self.along[range[0]..range[1]] {
                 let (k, i) = (k as usize, self.kept[k as usize] as usize);
                 let w = self.weight[i];
@@ -281,19 +282,21 @@ impl Chunk {
                     sum.colour[c] = w.mul_add(colour[c * m + k], sum.colour[c]);
                 }
                 sum.weight += w;
-                sum.distance = w.mul_add(self.t[i], sum.distance);
+                sum.distance = w.mul_add(ray.distance(self.t[i]), sum.distance);
             }
         }
     }
 
-    /// Goes back from each ray's colour gradient: adds to the networks' partial sums (`lanes`) and appends to `into`.
-    /// `transposed` are the weights output by output.
+    /// Goes back from each ray's colour gradient, and from the distortion loss times `distortion`: adds to the networks' partial sums
+    /// (`lanes`) and appends to `into`. `transposed` are the weights output by output.
+    #[allow(clippy::too_many_arguments, reason = "what a pass reads and where it adds; a struct of them would have one use")]
     pub(crate) fn backward(
         &mut self,
         field: &Field,
         transposed: &[f32],
         colour_gradients: &[[f32; 3]],
         backgrounds: &[[f32; 3]],
+        distortion: f32,
         lanes: &mut [f32],
         into: &mut FeatureGradients,
     ) {
@@ -312,16 +315,17 @@ impl Chunk {
             a[c * m + count..(c + 1) * m].fill(0.0);
         }
         let longest = self.ray_starts.windows(2).map(|r| r[1] - r[0]).max().unwrap_or(0);
-        let along = fit(g3, 4 * longest);
+        let along = fit(g3, 5 * longest);
         let (shade, rest) = along.split_at_mut(longest);
         let (transmittance, rest) = rest.split_at_mut(longest);
-        let (weight, by_depth) = rest.split_at_mut(longest);
+        let (weight, rest) = rest.split_at_mut(longest);
+        let (t, by_depth) = rest.split_at_mut(longest);
         for (r, range) in self.ray_starts.windows(2).enumerate() {
             let (g, background) = (colour_gradients[r], backgrounds[r]);
             let places = &self.along[range[0]..range[1]];
             for (j, &k) in places.iter().enumerate() {
                 let (k, i) = (k as usize, self.kept[k as usize] as usize);
-                (transmittance[j], weight[j]) = (self.transmittance[i], self.weight[i]);
+                (transmittance[j], weight[j], t[j]) = (self.transmittance[i], self.weight[i], self.t[i]);
                 shade[j] = 0.0;
                 for c in 0..3 {
                     let colour = self.colour[c * m + k];
@@ -332,6 +336,9 @@ impl Chunk {
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
             let len = places.len();
+            if distortion > 0.0 {
+                add_distortion_gradients(&t[..len], &weight[..len], field.step(), distortion, &mut shade[..len]);
+            }
             optical_depth_gradients(&shade[..len], &transmittance[..len], &weight[..len], behind, &mut by_depth[..len]);
             for (&k, &gradient) in places.iter().zip(&by_depth[..len]) {
                 tau_gradient[k as usize] = gradient;

@@ -193,17 +193,20 @@ impl Field {
             .map_init(Chunk::default, |chunk, rays| {
                 let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
                 chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
-                let side = self.bounds.longest_side() as f32;
                 let pixel = |(i, ray): (usize, &Ray)| {
                     let sum = &chunk.sums[i];
-                    let far = if clipped[i].leave > clipped[i].enter { clipped[i].leave * side } else { self.bounds.far as f32 };
+                    let far = if clipped[i].leave > clipped[i].enter {
+                        clipped[i].distance(clipped[i].leave)
+                    } else {
+                        self.bounds.far as f32
+                    };
                     let opacity = 1.0 - sum.transmittance;
                     Pixel {
                         colour: std::array::from_fn(|c| sum.transmittance.mul_add(ray.background[c], sum.colour[c])),
                         premultiplied: sum.colour,
                         opacity,
-                        depth: if sum.weight > 1e-4 { (sum.distance / sum.weight) * side } else { far },
-                        median_depth: sum.median.map_or(far, |t| t * side),
+                        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
+                        median_depth: sum.median.map_or(far, |t| clipped[i].distance(t)),
                     }
                 };
                 rays.iter().enumerate().map(pixel).collect::<Vec<_>>()

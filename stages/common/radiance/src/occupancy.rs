@@ -1,6 +1,6 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
-use crate::ray::UnitRay;
+use crate::ray::{Course, FASTEST, UnitRay};
 use crate::simd::kernel;
 
 /// Cells along each axis.
@@ -71,8 +71,8 @@ impl Occupancy {
 pub(crate) const DONE: u32 = u32::MAX;
 
 kernel! {
-    /// Marches on: at most `most` more samples of each of the `active` rays, wherever a cell is occupied, at distances
-    /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends distances and positions; `starts` gets
+    /// Marches on: at most `most` more samples of each of the `active` rays, wherever a cell is occupied, at t =
+    /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends t and positions; `starts` gets
     /// the first sample of each active ray, and the end.
     pub(crate) fn march<L>(
         occupancy: &Occupancy, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
@@ -92,7 +92,7 @@ kernel! {
                     k = DONE;
                     break;
                 }
-                let p: [f32; 3] = std::array::from_fn(|i| ray.direction[i].mul_add(at, ray.origin[i]));
+                let p = ray.position(at);
                 let cell = p.map(|x| (x * GRID as f32).max(0.0).min(last) as i32 as usize);
                 let brick = cell.map(|c| c / SIDE);
                 let (block_word, brick_bit) = place(brick, BLOCKS);
@@ -113,12 +113,21 @@ kernel! {
                 };
                 // Where the ray leaves this empty cell or block; at least one step on.
                 let mut exit = f32::INFINITY;
-                for i in 0..3 {
-                    let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
-                    let until = (face - ray.origin[i]) * inverse[i];
-                    if ray.direction[i] != 0.0 && until < exit {
-                        exit = until;
+                if let Course::Straight { .. } = ray.course {
+                    for i in 0..3 {
+                        let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
+                        let until = (face - ray.origin[i]) * inverse[i];
+                        if ray.direction[i] != 0.0 && until < exit {
+                            exit = until;
+                        }
                     }
+                } else {
+                    // No sooner than the nearest face can be reached.
+                    for i in 0..3 {
+                        let (below, above) = (low[i] as f32 / GRID as f32, (low[i] + size) as f32 / GRID as f32);
+                        exit = exit.min((p[i] - below).min(above - p[i]));
+                    }
+                    exit = (1.0 / FASTEST).mul_add(exit, at);
                 }
                 let onwards = (exit - ray.enter).mul_add(per_step, -offset).ceil();
                 // `as` saturates: an exit that is NaN or infinite moves on by one step.
@@ -151,7 +160,7 @@ mod tests {
                 .filter(|&i| direction[i] != 0.0)
                 .map(|i| (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i])
                 .fold(f32::INFINITY, f32::min);
-            let ray = UnitRay { origin, direction, enter: 0.0, leave };
+            let ray = UnitRay { origin, direction, leave, ..UnitRay::default() };
             let mut found = Vec::new();
             // In parts, as the renderer does.
             let (mut next, mut positions) = ([0], Vec::new());

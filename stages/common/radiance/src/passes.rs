@@ -38,7 +38,7 @@ impl Passes {
             if backward {
                 let backgrounds = [[1.0; 3]; CHUNK_RAYS];
                 let gradients = [[1.0; 3]; CHUNK_RAYS];
-                self.chunk.backward(field, &self.transposed, &gradients, &backgrounds, &mut self.lanes, &mut self.into);
+                self.chunk.backward(field, &self.transposed, &gradients, &backgrounds, 0.0, &mut self.lanes, &mut self.into);
             }
         }
         samples

@@ -1,4 +1,7 @@
-use scene::Bounds;
+use glam::DVec3;
+use scene::{Bounds, Frustum, Space};
+
+use crate::math::exp;
 
 /// A ray in scene units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -11,44 +14,154 @@ pub struct Ray {
     pub background: [f32; 3],
 }
 
-/// A ray in the unit cube: p(t) = origin + t·direction, with t the distance in cube sides.
-#[derive(Clone, Copy, Debug)]
+/// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in cube sides.
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct UnitRay {
     pub(crate) origin: [f32; 3],
     pub(crate) direction: [f32; 3],
-    /// Where it enters and leaves the box; nothing when `enter >= leave`.
+    /// Where it enters and leaves; nothing when `enter >= leave`.
     pub(crate) enter: f32,
     pub(crate) leave: f32,
+    pub(crate) course: Course,
+    /// The direction in the world, unit length: what colours depend on, whatever the field's space.
+    pub(crate) view: [f32; 3],
 }
 
-/// Clips a ray to the box and the range of distances, in units of the box's longest side. Computed in f64, so that scenes of
-/// 1e-6 and 1e6 units lose nothing.
-pub(crate) fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
-    let side = bounds.longest_side();
-    let (mut enter, mut leave) = (bounds.near / side, bounds.far / side);
-    let mut origin = [0.0f32; 3];
-    let mut usable = false;
-    for i in 0..3 {
-        let o = (f64::from(ray.origin[i]) - bounds.min[i]) / side;
-        let d = f64::from(ray.direction[i]);
-        let extent = (bounds.max[i] - bounds.min[i]) / side;
-        origin[i] = o as f32;
-        usable |= d != 0.0;
-        if d == 0.0 {
-            // Parallel to these faces: inside for ever, or never.
-            if !(0.0..=extent).contains(&o) {
-                leave = f64::NEG_INFINITY;
+/// How a ray runs through the unit cube, and its distance in scene units at t.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Course {
+    /// Position origin + t·direction, distance start + t·scale / (1 - t·bend): a perspective map keeps lines straight and moves
+    /// along them as a Möbius map does; a box has `bend` 0.
+    Straight { start: f32, scale: f32, bend: f32 },
+    /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's radius; from there it is
+    /// `reach`·sinh(4t) to the point, whose steps thereby grow as fast as the contraction shrinks them. The distance is
+    /// start + scale·sinh(4t).
+    Contracted { start: f32, scale: f32, reach: f32 },
+}
+
+impl Default for Course {
+    fn default() -> Self {
+        Self::Straight { start: 0.0, scale: 1.0, bend: 0.0 }
+    }
+}
+
+/// Most that a contracted ray moves through the cube for each unit of t.
+pub(crate) const FASTEST: f32 = 2.0;
+
+/// sinh(4t). Near 0 it has the absolute error of a difference of two numbers near 1, which is that of a position.
+#[inline(always)]
+fn sinh4(t: f32) -> f32 {
+    let e = exp(4.0 * t);
+    0.5 * (e - 1.0 / e)
+}
+
+impl UnitRay {
+    /// The place in the unit cube at t.
+    #[inline(always)]
+    pub(crate) fn position(&self, t: f32) -> [f32; 3] {
+        match self.course {
+            Course::Straight { .. } => std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i])),
+            Course::Contracted { reach, .. } => {
+                let along = reach * sinh4(t);
+                let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
+                let length = u.iter().map(|x| x * x).sum::<f32>().sqrt();
+                let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
+                u.map(|x| (0.25 * factor).mul_add(x, 0.5))
             }
-        } else {
-            let (a, b) = (-o / d, (extent - o) / d);
-            enter = enter.max(a.min(b));
-            leave = leave.min(a.max(b));
         }
     }
-    // A NaN anywhere fails this comparison.
-    let usable = usable && enter < leave && ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite());
-    let (enter, leave) = if usable { (enter as f32, leave as f32) } else { (0.0, 0.0) };
-    UnitRay { origin, direction: ray.direction, enter, leave }
+
+    /// The distance in scene units at t.
+    #[inline(always)]
+    pub(crate) fn distance(&self, t: f32) -> f32 {
+        match self.course {
+            Course::Straight { start, scale, bend } => t * scale / bend.mul_add(-t, 1.0) + start,
+            Course::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
+        }
+    }
+
+    /// A ray that meets nothing.
+    fn miss(ray: &Ray) -> Self {
+        Self { enter: 0.0, leave: 0.0, view: ray.direction, ..Self::default() }
+    }
+}
+
+/// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64, so that scenes of 1e-6 and 1e6
+/// units lose nothing.
+pub(crate) fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
+    // A NaN or a zero direction anywhere ends here.
+    if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite()) {
+        return UnitRay::miss(ray);
+    }
+    let (origin, direction) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let clipped = match &bounds.space {
+        Space::Box => through_box(bounds, origin, direction),
+        Space::Ndc(frustum) => through_frustum(frustum, [bounds.near, bounds.far], origin, direction),
+        Space::Contraction => through_contraction(bounds, origin, direction),
+    };
+    clipped.map_or(UnitRay::miss(ray), |clipped| UnitRay { view: ray.direction, ..clipped })
+}
+
+fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+    let side = bounds.longest_side();
+    let origin = (origin - DVec3::from(bounds.min)) / side;
+    let extent = (DVec3::from(bounds.max) - DVec3::from(bounds.min)) / side;
+    // On the inner side of a face: offset + slope·t >= 0.
+    let faces = (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
+    let (enter, leave) = clip_to(faces, [bounds.near / side, bounds.far / side])?;
+    let course = Course::Straight { start: 0.0, scale: side as f32, bend: 0.0 };
+    let (origin, direction) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
+    Some(UnitRay { origin, direction, enter: enter as f32, leave: leave as f32, course, view: [0.0; 3] })
+}
+
+fn through_frustum(frustum: &Frustum, range: [f64; 2], origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+    let (o, d) = (frustum.to_camera(origin), frustum.turn(direction));
+    let depths = [(o.z - frustum.near, d.z), (frustum.far - o.z, -d.z)];
+    let sides = (0..2).flat_map(|i| {
+        let (low, high) = (frustum.min[i], frustum.max[i]);
+        [(o[i] - low * o.z, d[i] - low * d.z), (high * o.z - o[i], high * d.z - d[i])]
+    });
+    let (enter, leave) = clip_to(depths.into_iter().chain(sides), range)?;
+    let (from, to) = (o + enter * d, o + leave * d);
+    let (start, end) = (frustum.to_cube(from), frustum.to_cube(to));
+    let length = (end - start).length();
+    if length <= 0.0 {
+        return None;
+    }
+    // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from the far end.
+    let c = length * to.z / (leave - enter);
+    let course = Course::Straight { start: enter as f32, scale: (from.z / c) as f32, bend: (d.z / c) as f32 };
+    let direction = (end - start) / length;
+    let (origin, direction) = (start.as_vec3().to_array(), direction.as_vec3().to_array());
+    Some(UnitRay { origin, direction, enter: 0.0, leave: length as f32, course, view: [0.0; 3] })
+}
+
+fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+    let radius = 0.5 * bounds.longest_side();
+    let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+    let from = (origin - centre) / radius;
+    let to_nearest = -from.dot(direction);
+    let nearest = from + to_nearest * direction;
+    let reach = nearest.length().max(1.0);
+    let t = |distance: f64| 0.25 * ((distance / radius - to_nearest) / reach).asinh();
+    let course = Course::Contracted { start: (to_nearest * radius) as f32, scale: (reach * radius) as f32, reach: reach as f32 };
+    let (origin, direction) = (nearest.as_vec3().to_array(), direction.as_vec3().to_array());
+    Some(UnitRay { origin, direction, enter: t(bounds.near) as f32, leave: t(bounds.far) as f32, course, view: [0.0; 3] })
+}
+
+/// The part of a range of x in which all of some functions offset + slope·x aren't negative; `None` where there is none.
+fn clip_to(functions: impl Iterator<Item = (f64, f64)>, [low, high]: [f64; 2]) -> Option<(f64, f64)> {
+    let (mut low, mut high) = (low, high);
+    for (offset, slope) in functions {
+        if slope > 0.0 {
+            low = low.max(-offset / slope);
+        } else if slope < 0.0 {
+            high = high.min(-offset / slope);
+        } else if offset < 0.0 {
+            return None;
+        }
+    }
+    (low < high).then_some((low, high))
 }
 
 #[cfg(test)]
@@ -63,9 +176,10 @@ mod tests {
     fn rays_meet_the_box_or_not() {
         for scale in [1e-6, 1.0, 1e6f64] {
             let s = scale as f32;
-            let bounds = Bounds { min: [-scale; 3], max: [scale; 3], near: 0.0, far: 100.0 * scale };
+            let bounds = Bounds { min: [-scale; 3], max: [scale; 3], near: 0.0, far: 100.0 * scale, ..Default::default() };
             let hit = clip(&bounds, &ray([0., 0., 4. * s], [0., 0., -1.]));
             assert!((hit.enter - 1.5).abs() < 1e-5 && (hit.leave - 2.5).abs() < 1e-5, "{hit:?}");
+            assert!((hit.distance(hit.enter) - 3.0 * s).abs() < 1e-5 * s);
             // Starting inside, missing, parallel to a face inside and outside, behind, zero length, NaN.
             assert_eq!(clip(&bounds, &ray([0.; 3], [1., 0., 0.])).enter, 0.0);
             for (o, d) in [
@@ -77,6 +191,84 @@ mod tests {
             ] {
                 let miss = clip(&bounds, &ray(o.map(|x| x * s), d));
                 assert!(miss.enter >= miss.leave, "{o:?} {d:?}: {miss:?}");
+            }
+        }
+    }
+
+    fn unit(v: [f64; 3]) -> DVec3 {
+        DVec3::from(v).normalize()
+    }
+
+    /// In every space the place at t is the mapped world point at the distance that t stands for, in the cube all the way, and t
+    /// grows with the distance.
+    #[test]
+    fn places_and_distances_agree_in_every_space() {
+        let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
+        for scale in [1e-4, 1.0, 1e4f64] {
+            let centre = scale * DVec3::new(0.1, 0.2, 0.3);
+            let row = |i: usize| [turned.x_axis[i], turned.y_axis[i], turned.z_axis[i], centre[i]];
+            let pose = [row(0), row(1), row(2)];
+            let frustum =
+                Frustum { camera_to_world: pose, min: [-0.9, -0.6], max: [0.8, 0.7], near: 0.8 * scale, far: 50.0 * scale };
+            let (near, far) = (0.1 * scale, 90.0 * scale);
+            let bounds = |space| Bounds { min: [-scale; 3], max: [scale; 3], near, far, space };
+            let contract = |p: DVec3| {
+                let u = p / scale;
+                let u = if u.length() > 1.0 { (2.0 - 1.0 / u.length()) * u.normalize() } else { u };
+                0.25 * u + 0.5
+            };
+            let mut met = [0; 2];
+            for k in 0..200 {
+                let mut draws = crate::random::Draws::new(5, 0, k);
+                let mut draw = || f64::from(draws.uniform()) - 0.5;
+                let from = centre + scale * DVec3::new(draw(), draw(), draw());
+                let direction = (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
+                let ray = ray(from.as_vec3().to_array(), direction.as_vec3().to_array());
+                for (i, space) in [Space::Ndc(frustum), Space::Contraction].into_iter().enumerate() {
+                    let seen = clip(&bounds(space), &ray);
+                    if seen.enter >= seen.leave {
+                        continue;
+                    }
+                    met[i] += 1;
+                    let mut before = f64::from(seen.distance(seen.enter)) - 1e-5 * scale;
+                    for j in 0..=20 {
+                        let t = seen.enter + (seen.leave - seen.enter) * j as f32 / 20.0;
+                        let (p, distance) = (seen.position(t), f64::from(seen.distance(t)));
+                        let world = from + distance * direction;
+                        let expected = match space {
+                            Space::Ndc(_) => frustum.to_cube(frustum.to_camera(world)),
+                            _ => contract(world),
+                        };
+                        let error = (DVec3::from(p.map(f64::from)) - expected).length();
+                        assert!(error < 2e-5, "{space:?} {j}: {p:?} {expected} at {distance}");
+                        assert!(p.iter().all(|x| (-1e-5..1.00001).contains(x)), "{p:?}");
+                        assert!(distance >= before, "{distance} after {before}");
+                        before = distance;
+                    }
+                }
+            }
+            assert!(met[0] > 100 && met[1] == 200, "{met:?}");
+        }
+    }
+
+    /// Steps of a contracted ray are never longer than twice those of t, however it passes: what leaping relies on.
+    #[test]
+    fn contracted_rays_move_at_most_twice_as_fast_as_t() {
+        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e4, space: Space::Contraction };
+        for k in 0..300 {
+            let mut draws = crate::random::Draws::new(6, 0, k);
+            let mut draw = || 2.0 * draws.uniform() - 1.0;
+            let far = [0.5, 3.0, 40.0][k as usize % 3];
+            let origin = [far * draw(), far * draw(), far * draw()];
+            let direction = unit([draw(), draw(), draw()].map(f64::from)).as_vec3().to_array();
+            let seen = clip(&bounds, &ray(origin, direction));
+            let step = 1e-3;
+            let mut t = seen.enter;
+            while t + step < seen.leave {
+                let (a, b) = (seen.position(t), seen.position(t + step));
+                let moved = (0..3).map(|i| (a[i] - b[i]).powi(2)).sum::<f32>().sqrt();
+                assert!(moved < FASTEST * step + 1e-6, "{moved} at {t} of {seen:?}");
+                t += step;
             }
         }
     }

@@ -91,7 +91,8 @@ impl Judge<'_> {
 
 fn example() -> (Field, Vec<Ray>) {
     let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, log2_entries: 9, hidden: 16, steps: 24 };
-    let mut field = Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0 }, 3);
+    let mut field =
+        Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() }, 3);
     let mut draws = Draws::new(8, 8, 8);
     // Features of the size that training reaches, and fog thick enough that every sample counts.
     field.grid.iter_mut().for_each(|g| *g = draws.uniform() - 0.5);
@@ -152,7 +153,7 @@ fn fused_passes_equal_the_plain_ones() {
     let mut lanes = vec![0.0; field.network.len() * LANES];
     let mut features = FeatureGradients::default();
     let backgrounds: Vec<[f32; 3]> = rays.iter().map(|r| r.background).collect();
-    chunk.backward(&field, &transposed, &g, &backgrounds, &mut lanes, &mut features);
+    chunk.backward(&field, &transposed, &g, &backgrounds, 0.0, &mut lanes, &mut features);
     let mut network = vec![0.0; field.network.len()];
     drain_lanes(&mut lanes, &mut network);
     let mut grid = vec![0.0f32; field.grid.len()];
@@ -238,7 +239,7 @@ fn every_family_renders_and_trains_to_equal_bits() {
         let mut lanes = vec![0.0; field.network.len() * LANES];
         let mut features = FeatureGradients::default();
         let backgrounds = vec![[1.0; 3]; rays.len()];
-        chunk.backward(&field, &field.network, &vec![[0.3, -0.2, 0.1]; rays.len()], &backgrounds, &mut lanes, &mut features);
+        chunk.backward(&field, &field.network, &vec![[0.3, -0.2, 0.1]; rays.len()], &backgrounds, 0.2, &mut lanes, &mut features);
         bits.extend(lanes.iter().map(|x| x.to_bits()));
         for (level, gradients) in field.levels.iter().zip(&features.levels) {
             let mut grid = vec![0.0f32; level.entries * FEATURES];
@@ -260,8 +261,11 @@ fn extremes_stay_finite() {
     for raw in [-1e30f32, -50.0, 0.0, 50.0, 1e30] {
         for scale in [1e-6f64, 1.0, 1e6] {
             let architecture = Architecture { levels: 2, coarsest: 2, finest: 4, log2_entries: 8, hidden: 16, steps: 64 };
-            let mut field =
-                Field::new(architecture, Bounds { min: [-scale; 3], max: [scale; 3], near: 0.1 * scale, far: 20.0 * scale }, 3);
+            let mut field = Field::new(
+                architecture,
+                Bounds { min: [-scale; 3], max: [scale; 3], near: 0.1 * scale, far: 20.0 * scale, ..Default::default() },
+                3,
+            );
             field.grid.fill(1.0);
             field.network.fill(raw / 1e3);
             let s = scale as f32;

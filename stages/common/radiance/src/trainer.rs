@@ -51,6 +51,8 @@ pub struct TrainingOptions {
     pub warm_up: u64,
     /// Share of the weights' running average that is kept at each of its steps; 0 for no average.
     pub averaging: f32,
+    /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision gives.
+    pub distortion: f32,
     /// Weight decay of the grid's entries.
     pub grid_decay: f32,
     /// Weight decay of the networks.
@@ -249,7 +251,7 @@ impl Trainer {
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, field, transposed, judge, options.seed, (first_group, first_ray), range, groups);
+            shard.run(&mut worker, field, transposed, judge, options, (first_group, first_ray), range, groups);
             lock(workers).push(worker);
         });
 
@@ -491,7 +493,7 @@ impl Shard {
         field: &Field,
         transposed: &[f32],
         supervision: &impl Supervision,
-        seed: u64,
+        &TrainingOptions { seed, distortion, .. }: &TrainingOptions,
         (first_group, first_ray): (u64, u64),
         range: std::ops::Range<usize>,
         groups: usize,
@@ -540,6 +542,7 @@ impl Shard {
                 transposed,
                 &worker.gradients,
                 &worker.backgrounds,
+                distortion * scale / group as f32,
                 &mut worker.lanes,
                 &mut self.features,
             );

@@ -23,7 +23,9 @@
 //! ```
 
 mod camera;
+mod space;
 mod views;
 
 pub use camera::{Camera, CameraError, Intrinsics, Ray};
+pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, VIEWS_FILE, View, Views, ViewsError};

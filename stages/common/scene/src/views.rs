@@ -5,6 +5,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::camera::{Camera, CameraError};
+use crate::space::Space;
 
 /// Name of the file in every folder of views.
 pub const VIEWS_FILE: &str = "views.json";
@@ -96,8 +97,8 @@ impl Background {
     }
 }
 
-/// An axis-aligned box around the scene, and the range of distances along rays at which it lies.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// An axis-aligned box around the scene, the range of distances along rays at which it lies, and how a field sees it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Bounds {
     /// Smallest corner.
@@ -108,13 +109,18 @@ pub struct Bounds {
     pub near: f64,
     /// Distance behind which there is nothing.
     pub far: f64,
+    /// What a field keeps in its unit cube.
+    #[serde(default)]
+    pub space: Space,
 }
 
 impl Bounds {
-    /// Whether the box has an inside and the range a length, all numbers finite.
+    /// Whether box, range and space have an inside, all numbers finite.
     pub fn is_valid(&self) -> bool {
         let finite = self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
-        finite && (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far
+        let inside = (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far;
+        let space = if let Space::Ndc(frustum) = &self.space { frustum.is_valid() } else { true };
+        finite && inside && space
     }
 
     /// Length of the longest side.
@@ -145,7 +151,7 @@ pub enum ViewsError {
     Path(String),
     /// A box without inside.
     #[error("{VIEWS_FILE}: bounds {0:?} have no inside")]
-    Bounds(Bounds),
+    Bounds(Box<Bounds>),
 }
 
 impl Views {
@@ -168,7 +174,7 @@ impl Views {
             return Err(ViewsError::Empty);
         }
         if !self.bounds.is_valid() {
-            return Err(ViewsError::Bounds(self.bounds));
+            return Err(ViewsError::Bounds(Box::new(self.bounds)));
         }
         let mut names = BTreeSet::new();
         for view in &self.views {
@@ -197,7 +203,7 @@ mod tests {
             intrinsics: Intrinsics::from_angle_x(8, 6, 0.7),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
-        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 2., far: 6. };
+        let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 2., far: 6., space: Space::Box };
         Views::new(Background::White, bounds, vec![View::camera_only(camera)])
     }
 

@@ -103,6 +103,9 @@ impl TorchGrid {
     pub fn read(path: &Path, architecture: Architecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
         let format = |reason: String| TorchFieldError::Format { path: path.to_path_buf(), reason };
         architecture.check().map_err(format)?;
+        if bounds.space != scene::Space::Box {
+            return Err(format("through libtorch the grid lives in a box; this one has another space".to_owned()));
+        }
         let weights = nets::Weights::read(path)?;
         let levels = levels(&architecture);
         let entries: i64 = levels.iter().map(|l| l.entries).sum();
@@ -357,7 +360,7 @@ mod tests {
     /// walls, and the same field on a GPU where there is one.
     #[test]
     fn agrees_with_the_hand_written_field() {
-        let bounds = Bounds { min: [-1.0, -0.8, -1.0], max: [1.0, 1.0, 0.7], near: 1.0, far: 9.0 };
+        let bounds = Bounds { min: [-1.0, -0.8, -1.0], max: [1.0, 1.0, 0.7], near: 1.0, far: 9.0, ..Default::default() };
         let mut devices = vec![Device::Cpu];
         devices.extend(nets::device("cuda").ok());
         for (spread, log2_entries, hidden) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)] {
@@ -404,7 +407,7 @@ mod tests {
     /// What misses the box, runs along its faces, begins inside, has no length or isn't finite.
     #[test]
     fn extreme_rays_are_finite_alike() {
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6 };
+        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
         let architecture = Architecture { finest: 64, log2_entries: 12, hidden: 16, steps: 64, ..Architecture::default() };
         let (field, path) = example(architecture, bounds, 1.0);
         let judge = TorchGrid::read(&path, architecture, bounds, Device::Cpu).unwrap();
