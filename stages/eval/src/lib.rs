@@ -4,6 +4,7 @@
 //! * [`ssim`]: Gaussian window, reflected at the border or valid pixels only.
 //! * `lpips`: SqueezeNet, where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
+//! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
 //! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
 //!   photographs are all there is, no HR truth exists, and this alone can be known.
 //!
@@ -13,6 +14,7 @@ mod depth;
 #[cfg(feature = "torch")]
 mod lpips;
 mod ssim;
+mod warp;
 
 use std::path::Path;
 
@@ -30,6 +32,7 @@ pub use depth::{DepthError, depth_error};
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
 pub use ssim::{Border, ssim};
+pub use warp::WarpScore;
 
 /// Parameters of `eval`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -74,6 +77,8 @@ pub struct MetricConventions {
     pub lpips: String,
     /// How depth was scored.
     pub depth: String,
+    /// How a view's neighbour was brought over.
+    pub warp: String,
     /// How the view's LR picture was compared with.
     pub low_resolution: String,
     /// What the error maps show.
@@ -96,6 +101,9 @@ pub struct Scores {
     /// Depth errors, where there is true depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthError>,
+    /// The neighbour's true picture brought over by depth, where there is HR truth and rendered depth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warp: Option<WarpScore>,
     /// The shrunk render against the view's LR picture, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub low_resolution: Option<LowScores>,
@@ -121,6 +129,9 @@ pub struct ViewScores {
     pub scores: Scores,
     /// Its error map.
     pub error_map: String,
+    /// Its neighbour's picture, brought over by depth.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub warp: Option<String>,
 }
 
 /// The stage.
@@ -223,18 +234,41 @@ impl Job<'_> {
         let error_map = format!("errors/{name}.png");
         write_png(&self.context.output_path(&error_map)?, &draw_error(shown, against, self.params.error_range as f32))?;
         let border = self.params.ssim_border;
+        let warped = expected.as_ref().map(|e| self.warp(view, e)).transpose()?.flatten();
         let scores = Scores {
             psnr: expected.as_ref().map(|e| psnr(&found, e)),
             ssim: expected.as_ref().map(|e| ssim(&found, e, border)),
             lpips: expected.as_ref().map(|e| self.perceptual.distance(&found, e)).transpose()?.flatten(),
             depth: score_depth((views_in, view), (truth_in, true_view))?,
+            warp: warped.as_ref().map(|(score, _)| *score),
             low_resolution: shrunk
                 .iter()
                 .zip(&low)
                 .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low), ssim: ssim(shrunk, low, border) })
                 .next(),
         };
-        Ok(ViewScores { name: name.clone(), scores, error_map })
+        Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
+    }
+
+    /// The true picture of a view's nearest neighbour, seen from the view by the rendered depths: its score and its file.
+    fn warp(&self, view: &View, expected: &Picture) -> anyhow::Result<Option<(WarpScore, String)>> {
+        let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
+        let Some(other) = warp::neighbour(&view.camera, &views.views) else { return Ok(None) };
+        let other_truth = truth.views.iter().find(|v| v.camera.name == other.camera.name);
+        let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else { return Ok(None) };
+        let (Some(own), Some(theirs)) = (warp::read_surface(views_in, view)?, warp::read_surface(views_in, other)?) else {
+            return Ok(None);
+        };
+        let picture = read_view(truth_in, other_view, file, truth.background)?;
+        if (picture.width, picture.height) != (theirs.width, theirs.height) {
+            return Ok(None);
+        }
+        let Some((score, warped)) = warp::warp((&view.camera, &own, expected), (&other.camera, &theirs, &picture)) else {
+            return Ok(None);
+        };
+        let file = format!("warps/{}.png", view.camera.name);
+        write_png(&self.context.output_path(&file)?, &warped)?;
+        Ok(Some((score, file)))
     }
 }
 
@@ -291,6 +325,9 @@ fn mean_of(views: &[ViewScores]) -> Scores {
             median_absolute: depth(&|d| d.median_absolute).unwrap_or_default(),
             missed: depth(&|d| d.missed).unwrap_or_default(),
         }),
+        warp: mean(&|s| s.warp.map(|w| w.psnr))
+            .zip(mean(&|s| s.warp.map(|w| w.seen)))
+            .map(|(psnr, seen)| WarpScore { psnr, seen }),
         low_resolution: mean(&|s| s.low_resolution.map(|l| l.psnr))
             .zip(mean(&|s| s.low_resolution.map(|l| l.ssim)))
             .map(|(psnr, ssim)| LowScores { psnr, ssim }),
@@ -309,6 +346,9 @@ fn conventions(params: &Params, background: Background, perceptual: &Perceptual,
         ssim: format!("Gaussian 11×11, σ 1.5, {border}, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels"),
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
+        warp: "the true picture of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
+               both see the same surface (depths within 2 %, opacity at least one half)"
+            .to_owned(),
         low_resolution: format!(
             "the render shrunk by {}, against the view's LR picture",
             made.map_or_else(|| "a box, for want of a better guess".to_owned(), |d| format!("{:?}", d.kernel).to_lowercase())

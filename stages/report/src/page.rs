@@ -55,11 +55,12 @@ pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
 /// A table of means, one row a point, the best figure of each column in bold.
 fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
-    let columns: [(&str, &str, usize, bool); 7] = [
+    let columns: [(&str, &str, usize, bool); 8] = [
         ("PSNR ↑ dB", "psnr", 2, true),
         ("SSIM ↑", "ssim", 4, true),
         ("LPIPS ↓", "lpips", 4, false),
         ("PSNR at LR ↑ dB", "low_resolution/psnr", 2, true),
+        ("PSNR of neighbours by depth ↑ dB", "warp/psnr", 2, true),
         ("depth error ↓ mean", "depth/mean_absolute", 4, false),
         ("median", "depth/median_absolute", 4, false),
         ("missed", "depth/missed", 4, false),
@@ -130,6 +131,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let found = picture(&rendered, &view.image, views.background)?;
         let expected = picture(&truth, &true_view.image, truths.background)?;
         let error = scores["error_map"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
+        let warped = scores["warp"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
         let depth = depth(&rendered, &view)?;
         let caption = |what: &str, found: &Option<(String, usize)>| {
             found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
@@ -148,6 +150,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
                 (figure("px", error.map(|b| data_uri(&b)), if expected.is_some() { "error" } else { "error at LR" }.to_owned()))
+                (figure("px", warped.map(|b| data_uri(&b)), format!("neighbour by depth, {} dB (red: not seen)", number("/warp/psnr", 2))))
                 (figure("px", depth.map(|d| uri_of(&d)), "depth (warm is near)".to_owned()))
             }
         });

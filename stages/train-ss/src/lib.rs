@@ -18,7 +18,7 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, read_premultiplied};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
-use scene::Views;
+use scene::{Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -62,6 +62,18 @@ pub struct CurvePoint {
     pub psnr: f64,
 }
 
+/// LR pixels across the field's cube, as the first view sees it.
+fn pixels_across(views: &Views) -> f64 {
+    let k = &views.views[0].camera.intrinsics;
+    match views.bounds.space {
+        // The cube is about what a view sees.
+        Space::Box => f64::from(k.width),
+        Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
+        // Half of it is, and the shell around it.
+        Space::Contraction => 2.0 * f64::from(k.width),
+    }
+}
+
 /// The stage.
 pub struct TrainSs;
 
@@ -83,7 +95,7 @@ impl Stage for TrainSs {
         let input = context.input("scene")?;
         let views = Views::read(input)?;
         let model = match params.field {
-            FieldKind::Grid => FieldModel::Grid(params.grid(views.views[0].camera.intrinsics.width)),
+            FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views))),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
         let all = params.rays(epoch(&views, params));

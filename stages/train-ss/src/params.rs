@@ -81,7 +81,7 @@ pub struct Params {
     /// `grid`: cells along an axis of the coarsest level.
     #[schemars(range(min = 2, max = 512))]
     pub coarsest: u32,
-    /// `grid`: cells along an axis of the finest level. Without it: 2.56 for every LR pixel across, at least `coarsest`.
+    /// `grid`: cells along an axis of the finest level. Without it: 2.56 for every LR pixel across the field, at least `coarsest`.
     #[schemars(range(min = 2, max = 4096))]
     pub finest: Option<u32>,
     /// `grid`: base-2 logarithm of the most entries in a level. Without it: 17 for 256 cells along the finest level's axis, and two more
@@ -271,9 +271,9 @@ impl Params {
         self.or(self.rays, 30_000_000, EPOCHS * epoch)
     }
 
-    /// What grid they ask for, with LR images of a width.
-    pub fn grid(&self, lr_width: u32) -> Architecture {
-        let by_width = (2.56 * f64::from(lr_width)).round().clamp(64.0, 2048.0) as u32;
+    /// What grid they ask for, with so many LR pixels across its cube.
+    pub fn grid(&self, pixels: f64) -> Architecture {
+        let by_width = (2.56 * pixels).round().clamp(64.0, 2048.0) as u32;
         let finest = self.finest.unwrap_or(by_width.max(self.coarsest));
         let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
         Architecture {

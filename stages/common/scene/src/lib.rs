@@ -25,7 +25,9 @@
 mod camera;
 mod space;
 mod views;
+mod warp;
 
 pub use camera::{Camera, CameraError, Intrinsics, Ray};
 pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, VIEWS_FILE, View, Views, ViewsError};
+pub use warp::Surface;

@@ -1,0 +1,129 @@
+use crate::camera::Camera;
+
+/// What a view sees: at each pixel's centre, row by row, the depth of the surface and its opacity.
+#[derive(Clone, Copy, Debug)]
+pub struct Surface<'a> {
+    /// Where from; its intrinsics have the size of the lists.
+    pub camera: &'a Camera,
+    /// Camera-space z-depth in scene units.
+    pub depth: &'a [f32],
+    /// Opacity; below one half there is no surface.
+    pub opacity: &'a [f32],
+}
+
+/// Two depths of one surface differ by at most this share; more is another surface.
+const SAME: f64 = 0.02;
+
+impl Surface<'_> {
+    /// Where another view sees what this one sees at each pixel: the position in its picture, in pixels from the top left corner. `None`
+    /// where this view sees no surface, the other doesn't look, or something stands between.
+    ///
+    /// # Panics
+    /// Where a list hasn't one number a pixel.
+    pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
+        let k = &self.camera.intrinsics;
+        let at = |i: usize| {
+            let (column, row) = (i % k.width as usize, i / k.width as usize);
+            if self.opacity[i] < 0.5 {
+                return None;
+            }
+            let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
+            let point = ray.at(f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray));
+            let (x, y, depth) = other.camera.project(point)?;
+            other.has_near(x, y, depth).then_some([x as f32, y as f32])
+        };
+        (0..k.width as usize * k.height as usize).map(at).collect()
+    }
+
+    /// Whether there is a surface of that depth at one of the four pixels around a position. All four lie in the picture or at its border.
+    fn has_near(&self, x: f64, y: f64, depth: f64) -> bool {
+        let (width, height) = (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
+        // NaN lies nowhere.
+        if !(0.0..=width as f64).contains(&x) || !(0.0..=height as f64).contains(&y) {
+            return false;
+        }
+        let around = |v: f64, size: usize| {
+            let low = (v - 0.5).floor().max(0.0) as usize;
+            [low.min(size - 1), (low + 1).min(size - 1)]
+        };
+        around(y, height).into_iter().any(|row| {
+            around(x, width).into_iter().any(|column| {
+                let i = row * width + column;
+                self.opacity[i] >= 0.5 && (f64::from(self.depth[i]) - depth).abs() <= SAME * depth
+            })
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::{DMat3, DVec3};
+
+    use super::*;
+    use crate::Intrinsics;
+
+    fn camera(centre: DVec3, turn: f64) -> Camera {
+        let r = DMat3::from_axis_angle(DVec3::Y, turn);
+        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
+        Camera { name: "c".into(), intrinsics: Intrinsics::from_angle_x(64, 48, 0.9), camera_to_world: [row(0), row(1), row(2)] }
+    }
+
+    /// A wall at z = 0 and, before it, a plate at z = 1 over x in -0.3..=0.3: depth along each pixel's ray.
+    fn depths(camera: &Camera, has_plate: bool) -> Vec<f32> {
+        (0..64 * 48)
+            .map(|i| {
+                let ray = camera.ray(f64::from(i % 64) + 0.5, f64::from(i / 64) + 0.5);
+                let to = |z: f64| (z - ray.origin.z) / ray.direction.z;
+                let on_plate = has_plate && ray.at(to(1.0)).x.abs() <= 0.3;
+                (to(f64::from(u8::from(on_plate))) * camera.depth_per_distance(&ray)) as f32
+            })
+            .collect()
+    }
+
+    #[test]
+    fn places_are_those_of_the_same_surface_point() {
+        let (a, b) = (camera(DVec3::new(-0.3, 0.0, 4.0), -0.05), camera(DVec3::new(0.5, 0.2, 4.5), 0.1));
+        let opacity = vec![1.0; 64 * 48];
+        for has_plate in [false, true] {
+            let (da, db) = (depths(&a, has_plate), depths(&b, has_plate));
+            let (from_a, from_b) =
+                (Surface { camera: &a, depth: &da, opacity: &opacity }, Surface { camera: &b, depth: &db, opacity: &opacity });
+            let mut seen = 0;
+            for (i, place) in from_a.seen_from(&from_b).into_iter().enumerate() {
+                let ray = a.ray((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5);
+                let point = ray.at(f64::from(da[i]) / a.depth_per_distance(&ray));
+                let (x, y, _) = b.project(point).unwrap();
+                let inside = (0.0..=64.0).contains(&x) && (0.0..=48.0).contains(&y);
+                // From b, the plate hides the wall where the line of sight passes it.
+                let way = point - b.centre();
+                let at_plate = b.centre() + way * ((1.0 - b.centre().z) / way.z);
+                let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
+                let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
+                match place {
+                    Some([px, py]) => {
+                        assert!((f64::from(px) - x).abs() < 1e-3 && (f64::from(py) - y).abs() < 1e-3);
+                        assert!(inside && (!hidden || at_edge), "pixel {i} is hidden");
+                        seen += 1;
+                    }
+                    None => assert!(!inside || hidden || at_edge, "pixel {i} isn't hidden"),
+                }
+            }
+            assert!(seen > 1000, "{seen}");
+        }
+        let nothing = vec![0.0; 64 * 48];
+        let (da, db) = (depths(&a, false), depths(&b, false));
+        let empty = Surface { camera: &a, depth: &da, opacity: &nothing };
+        assert!(empty.seen_from(&Surface { camera: &b, depth: &db, opacity: &opacity }).iter().all(Option::is_none));
+    }
+
+    #[test]
+    fn any_depth_is_no_panic() {
+        let (a, b) = (camera(DVec3::new(0.0, 0.0, 4.0), 0.0), camera(DVec3::new(0.5, 0.2, 4.5), 3.0));
+        let opacity = vec![1.0; 64 * 48];
+        for depth in [f32::NAN, f32::INFINITY, -1.0, 0.0, 1e38, 1e-38] {
+            let depth = vec![depth; 64 * 48];
+            let other = Surface { camera: &b, depth: &depth, opacity: &opacity };
+            Surface { camera: &a, depth: &depth, opacity: &opacity }.seen_from(&other);
+        }
+    }
+}

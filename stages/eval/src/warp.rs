@@ -1,0 +1,116 @@
+use artifact::{FailureExt as _, GivenInput};
+use pixels::{ExrImage, Picture, Rgba8, read_exr, to_u8};
+use scene::{Camera, Surface, View};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// A view's true picture against its neighbour's, brought over by the rendered depths: depth is right where colours agree.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct WarpScore {
+    /// Peak signal-to-noise ratio in dB over the pixels that the neighbour sees, too.
+    pub psnr: f64,
+    /// Their share.
+    pub seen: f64,
+}
+
+/// The view whose centre is nearest to a view's, itself left out.
+pub(crate) fn neighbour<'a>(of: &Camera, views: &'a [View]) -> Option<&'a View> {
+    let away = |v: &&View| (v.camera.centre() - of.centre()).length_squared();
+    views.iter().filter(|v| v.camera.name != of.name).min_by(|a, b| away(a).total_cmp(&away(b)))
+}
+
+/// A rendered view's depth and opacity.
+pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Option<ExrImage>> {
+    let Some(depth) = &view.depth else { return Ok(None) };
+    let image = read_exr(&input.path(depth)).bad_input(format!("view {}", view.camera.name))?;
+    let k = &view.camera.intrinsics;
+    let whole = (image.width, image.height) == (k.width as usize, k.height as usize);
+    Ok((whole && image.channel("Z").is_some() && image.channel("A").is_some()).then_some(image))
+}
+
+/// Brings the neighbour's picture over to a view and compares. The picture shows what was brought over; what the neighbour doesn't see is
+/// red. Pictures have the sizes of the views. `None` where it sees nothing.
+pub(crate) fn warp(view: (&Camera, &ExrImage, &Picture), other: (&Camera, &ExrImage, &Picture)) -> Option<(WarpScore, Rgba8)> {
+    const UNSEEN: [u8; 4] = [120, 20, 30, 255];
+    let from = surface(view.0, view.1)?;
+    let places = from.seen_from(&surface(other.0, other.1)?);
+    let (mut sum, mut seen) = (0.0, 0usize);
+    let mut data = Vec::with_capacity(4 * places.len());
+    for (place, truth) in places.iter().zip(view.2.data.chunks_exact(3)) {
+        let Some([x, y]) = place else {
+            data.extend(UNSEEN);
+            continue;
+        };
+        let colour = bilinear(other.2, *x, *y);
+        sum += colour.iter().zip(truth).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
+        seen += 1;
+        data.extend(colour.map(to_u8).into_iter().chain([255]));
+    }
+    let share = seen as f64 / places.len().max(1) as f64;
+    let psnr = (-10.0 * (sum / (3 * seen) as f64).log10()).min(100.0);
+    (seen > 0).then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
+}
+
+fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
+    Some(Surface { camera, depth: image.channel("Z")?, opacity: image.channel("A")? })
+}
+
+/// The picture at a position in pixels from the top left corner; its border goes on outside.
+fn bilinear(picture: &Picture, x: f32, y: f32) -> [f32; 3] {
+    let along = |v: f32, size: usize| {
+        let v = (v - 0.5).clamp(0.0, (size - 1) as f32);
+        let low = (v as usize).min(size.saturating_sub(2));
+        (low, (low + 1).min(size - 1), v - low as f32)
+    };
+    let ((x0, x1, fx), (y0, y1, fy)) = (along(x, picture.width), along(y, picture.height));
+    let at = |x: usize, y: usize, c: usize| picture.data[(y * picture.width + x) * 3 + c];
+    std::array::from_fn(|c| {
+        let row = |y: usize| at(x0, y, c) * (1.0 - fx) + at(x1, y, c) * fx;
+        row(y0) * (1.0 - fy) + row(y1) * fy
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use scene::Intrinsics;
+
+    fn camera(name: &str, x: f64) -> Camera {
+        Camera {
+            name: name.into(),
+            intrinsics: Intrinsics { width: 40, height: 4, fx: 40.0, fy: 40.0, cx: 20.0, cy: 2.0 },
+            camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 0.]],
+        }
+    }
+
+    fn image(depth: f32) -> ExrImage {
+        let channels = vec![("A".into(), vec![1.0; 160]), ("Z".into(), vec![depth; 160])];
+        ExrImage { width: 40, height: 4, channels }
+    }
+
+    /// A step of a tenth to the side before a wall at distance 2 moves its picture by two pixels.
+    #[test]
+    fn right_depth_agrees_and_wrong_depth_does_not() {
+        let wall = |shift: usize| {
+            let level = |i: usize| ((i % 40 + shift) as f32 * 0.7).sin() * 0.4 + 0.5;
+            Picture::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
+        };
+        let (a, b) = (camera("a", 0.0), camera("b", 0.1));
+        let score = |depth: f32| warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap();
+        let (right, picture) = score(2.0);
+        assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
+        // What lies left of the neighbour's picture isn't seen.
+        assert_eq!(picture.data[..3], [120, 20, 30]);
+        let (wrong, _) = score(3.0);
+        assert!(wrong.psnr < 25.0, "{wrong:?}");
+    }
+
+    #[test]
+    fn the_neighbour_is_the_nearest_other_view() {
+        let views: Vec<View> = [("a", 0.0), ("b", 1.0), ("c", 1.2)].map(|(n, x)| View::camera_only(camera(n, x))).into();
+        assert_eq!(neighbour(&views[0].camera, &views).unwrap().camera.name, "b");
+        assert_eq!(neighbour(&views[1].camera, &views).unwrap().camera.name, "c");
+        assert!(neighbour(&views[0].camera, &views[..1]).is_none());
+    }
+}
