@@ -201,12 +201,12 @@ fn worlds_without_end_have_a_space_of_their_own() {
         let mean = serde_json::from_slice::<Value>(&std::fs::read(metrics).unwrap()).unwrap()["mean"].clone();
         (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
     };
-    for (views, space, least, depth_error) in [("forward", "ndc", 22.0, 0.7), ("around", "contraction", 18.0, 0.7)] {
-        let views = format!("views={views}");
+    for (layout, space, least, depth_error) in [("forward", "ndc", 22.0, 0.7), ("around", "contraction", 18.0, 0.7)] {
+        let layout = format!("layout={layout}");
         let settings = |space: &str| {
             vec![
                 "-p".to_owned(),
-                views.clone(),
+                layout.clone(),
                 "-p".into(),
                 space.to_owned(),
                 "-p".into(),

@@ -25,6 +25,8 @@ fn schemas_are_current() {
     parameters::<render_depth::RenderDepth>(&mut all);
     parameters::<eval::Eval>(&mut all);
     parameters::<report::Report>(&mut all);
+    parameters::<camera_path::CameraPath>(&mut all);
+    parameters::<video::Video>(&mut all);
     for (name, schema) in [
         ("pipeline", of::<runner::Pipeline>()),
         ("describe", of::<artifact::Description>()),

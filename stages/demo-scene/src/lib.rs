@@ -45,7 +45,7 @@ pub struct Params {
     #[schemars(range(min = 1, max = 16))]
     pub samples: u32,
     /// Where cameras stand.
-    pub views: Layout,
+    pub layout: Layout,
     /// Puts the things into a world without end: ground, towers far away, a sky.
     pub backdrop: bool,
     /// Another seed puts other textures on the things and them in other places.
@@ -54,7 +54,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: 200, train: 80, test: 10, samples: 4, views: Layout::Around, backdrop: false, seed: 0 }
+        Self { size: 200, train: 80, test: 10, samples: 4, layout: Layout::Around, backdrop: false, seed: 0 }
     }
 }
 
@@ -86,7 +86,7 @@ impl Stage for DemoScene {
         let total = u64::from(params.train + params.test);
         let progress = context.progress("rendering", total);
         for (split, count) in [("train", params.train), ("test", params.test)] {
-            let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.views, split, i, count)).collect();
+            let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.layout, split, i, count)).collect();
             context.output_path(&format!("{split}/."))?;
             (0..count)
                 .into_par_iter()

@@ -2,9 +2,10 @@ use std::path::Path;
 
 use artifact::{RunInput, RunNode, RunRecord};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use scene::Views;
 use serde_json::Value;
 
-use crate::pictures::{colour, data_uri, depth, read_views, uri_of};
+use crate::pictures::{colour, data_uri, depth, uri_of};
 use crate::results::metrics;
 
 const STYLE: &str = "
@@ -111,14 +112,14 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
     let (Some(rendered), Some(truth)) = (folder("views"), folder("truth")) else {
         return Ok(html! { p { "These metrics have no inputs `views` and `truth` to show." } });
     };
-    let (views, truths) = (read_views(&rendered)?, read_views(&truth)?);
+    let (views, truths) = (Views::of_folder(&rendered)?, Views::of_folder(&truth)?);
     let all = point.metrics["views"].as_array().cloned().unwrap_or_default();
     let shown = count.min(all.len());
     let mut rows = Vec::new();
     for k in 0..shown {
         let scores = &all[k * all.len() / shown];
         let name = scores["name"].as_str().unwrap_or_default();
-        let find = |list: &scene::Views| list.views.iter().find(|v| v.camera.name == name).cloned();
+        let find = |list: &Views| list.views.iter().find(|v| v.camera.name == name).cloned();
         let (Some(view), Some(true_view)) = (find(&views), find(&truths)) else { continue };
         let figure = |class: &str, uri: Option<String>, caption: String| {
             html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }

@@ -126,7 +126,6 @@ impl Plan {
         let programs: BTreeMap<String, Arc<StageProgram>> =
             describe_all(pipeline, store)?.into_iter().map(|(name, program)| (name, Arc::new(program))).collect();
         let order = check(pipeline, &programs)?;
-        let axes = axes(pipeline, &programs, request)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
         for target in targets {
             if !pipeline.stages.contains_key(target) {
@@ -134,6 +133,7 @@ impl Plan {
                 return Err(PlanError::Usage(format!("no stage {target:?}; known: {known}")));
             }
         }
+        let axes = axes(pipeline, &programs, request, &needed(pipeline, targets))?;
         Expansion { pipeline, programs: &programs, axes: &axes, nodes: Vec::new(), of_stage: BTreeMap::new() }
             .expand(&order, targets)
     }
@@ -258,6 +258,18 @@ fn needs(pipeline: &Pipeline, stage: &str) -> impl Iterator<Item = String> {
     sources.into_iter().map(|s| split(&s).0.to_owned())
 }
 
+/// The stages that targets come to, themselves included.
+fn needed(pipeline: &Pipeline, targets: &[String]) -> BTreeSet<String> {
+    let mut needed: BTreeSet<String> = BTreeSet::new();
+    let mut open: Vec<String> = targets.to_vec();
+    while let Some(stage) = open.pop() {
+        if needed.insert(stage.clone()) {
+            open.extend(needs(pipeline, &stage));
+        }
+    }
+    needed
+}
+
 /// Kahn's order, by name where there is a choice; what is left over is a cycle.
 fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
     let mut left: BTreeSet<&String> = pipeline.stages.keys().collect();
@@ -283,8 +295,13 @@ fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
     Ok(order)
 }
 
-/// What the command line sets, each with its stage.
-fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, request: &Request) -> Result<Vec<Axis>, PlanError> {
+/// What the command line sets, each with its stage. Where several stages have a name, that one is meant that the targets need.
+fn axes(
+    pipeline: &Pipeline,
+    programs: &BTreeMap<String, Arc<StageProgram>>,
+    request: &Request,
+    needed: &BTreeSet<String>,
+) -> Result<Vec<Axis>, PlanError> {
     let mut axes: Vec<Axis> = Vec::new();
     let parameters = request.parameters.iter().map(|text| ("-p", text, true));
     let inputs = request.inputs.iter().map(|text| ("-i", text, false));
@@ -302,6 +319,10 @@ fn axes(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>, req
         let (stages, own): (Vec<&String>, &str) = match name.split_once('.') {
             Some((stage, own)) => (pipeline.stages.keys().filter(|s| *s == stage && has(s, own)).collect(), own),
             None => (pipeline.stages.keys().filter(|s| has(s, name)).collect(), name),
+        };
+        let stages = match stages.iter().filter(|s| needed.contains(**s)).copied().collect::<Vec<_>>() {
+            meant if meant.is_empty() => stages,
+            meant => meant,
         };
         let stage = match stages[..] {
             [stage] => stage.clone(),

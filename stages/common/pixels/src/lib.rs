@@ -28,7 +28,7 @@ mod srgb;
 
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
-pub use heat::{Palette, heat};
+pub use heat::{Palette, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, to_u8};
 pub use operator::{AxisTaps, Resampling};
 pub use picture_file::read_premultiplied;

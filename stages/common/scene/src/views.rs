@@ -168,6 +168,16 @@ impl Views {
         Ok(views)
     }
 
+    /// Reads and checks the `views.json` of a folder that a run's record names.
+    pub fn of_folder(folder: &std::path::Path) -> anyhow::Result<Self> {
+        use artifact::FailureExt as _;
+        let path = folder.join(VIEWS_FILE);
+        let bytes = std::fs::read(&path).bad_input(path.display())?;
+        let views: Self = serde_json::from_slice(&bytes).bad_input(path.display())?;
+        views.check().bad_input(path.display())?;
+        Ok(views)
+    }
+
     /// Refuses what can't be: no views, impossible cameras, names or paths that leave the folder, an empty box.
     pub fn check(&self) -> Result<(), ViewsError> {
         if self.views.is_empty() {

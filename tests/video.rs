@@ -1,0 +1,65 @@
+//! `nerf-sr run video`: a flight through the scene, rendered and shown as a film.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use common::Project;
+
+const FLIGHT: &str = "
+  camera-path:
+    inputs: {cameras: prep/train}
+    parameters: {frames: 6}
+  path-views:
+    run: render-depth
+    inputs: {field: train-ss, cameras: camera-path}
+  video:
+    inputs: {run: path-views}
+";
+
+fn project() -> Project {
+    let project = Project::tiny();
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + FLIGHT));
+    project
+}
+
+#[test]
+fn a_flight_is_rendered_and_filmed() {
+    let project = project();
+    // `sub_rays` is a parameter of two blocks; the film needs one of them.
+    let first = project.run(&["run", "video", "-p", "sub_rays=1"]);
+    assert_eq!(first.code, 0, "{}", first.stderr);
+    for i in 0..6 {
+        let frame = pixels::read_png(&project.path(&format!("out/video/frames/{i:05}.png"))).unwrap();
+        // Colour and depth, each of HR's size.
+        assert_eq!((frame.width, frame.height), (96, 48));
+        let levels = |half: usize| (0..48 * 48).map(move |k| (k / 48) * 96 + half * 48 + k % 48);
+        for half in [0, 1] {
+            let first = &frame.data[4 * levels(half).next().unwrap()..][..3];
+            assert!(levels(half).any(|p| &frame.data[4 * p..][..3] != first), "half {half} of frame {i} is one colour");
+        }
+    }
+    // Evaluation isn't part of a film.
+    assert!(!first.stdout.contains("eval"), "{}", first.stdout);
+    let film = project.path("out/video/video.mp4");
+    if film.exists() {
+        assert!(std::fs::read(&film).unwrap().windows(4).any(|w| w == b"ftyp"), "no MP4 file");
+    } else {
+        let log = std::fs::read_to_string(project.path(".nerf-sr/sinks/video/log")).unwrap_or_default();
+        assert!((first.stderr + &log).contains("no video.mp4"), "neither a film nor a reason");
+    }
+}
+
+#[test]
+fn a_list_of_poses_is_a_path_and_a_wrong_one_is_refused() {
+    let project = project();
+    project.replace(
+        "{frames: 6}",
+        "{poses: [[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]], [[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 4]]]}",
+    );
+    project.ok(&["run", "camera-path"]);
+    let summary = project.object(&project.output_of("camera-path", &["camera-path"])[0]).join("summary.txt");
+    assert!(std::fs::read_to_string(summary).unwrap().contains("2 frames of 48×48, list"));
+    project.replace("[1, 0, 0, 1]", "[3, 0, 0, 1]");
+    project.run(&["run", "camera-path"]).fails(2, &["poses", "frame_00001", "no rigid motion"]);
+}
