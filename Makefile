@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff seeds bench clean goldens
+.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -44,6 +44,19 @@ lint: setup ## rustfmt, clippy with and without libtorch; cargo-deny and typos w
 	cargo clippy --release -p train-ss -p render-depth -p eval --no-default-features --all-targets -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
+
+# libFuzzer's coverage on a stable compiler; for the target alone, since build scripts have no libFuzzer to link with.
+FUZZ_FLAGS := -Cpasses=sancov-module $(addprefix -Cllvm-args=-sanitizer-coverage-,level=4 inline-8bit-counters pc-table trace-compares)
+FUZZ_HOST = $(shell rustc -vV | sed -n 's/^host: //p')
+FUZZ_TARGETS ?= colmap llff transforms picture field
+FUZZ_SECONDS ?= 60
+fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
+	@python3 tests/fuzz/seeds.py out/fuzz/seeds
+	@cd tests/fuzz && CARGO_TARGET_DIR=$(CURDIR)/target/fuzz RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
+	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target; \
+	  target/fuzz/$(FUZZ_HOST)/release/$$target -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=2048 -max_len=4096 \
+	    -artifact_prefix=out/fuzz/$$target- out/fuzz/corpus/$$target out/fuzz/seeds/$$target 2>&1 | tee out/fuzz/$$target.log | tail -3; \
+	  test $${PIPESTATUS[0]} = 0 || exit 1; done
 
 lego: build ## Real lego 100→200, plain NeRF beside supersampling
 	@$(NERF_SR) run -j 1 --out out/lego -i dataset=$(DATA)/nerf_synthetic/lego -i weights=$(DATA)/weights \

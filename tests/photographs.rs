@@ -97,6 +97,16 @@ fn as_llff(project: &Project) -> PathBuf {
     folder
 }
 
+/// The largest difference between the numbers of two views' cameras.
+fn difference(a: &Value, b: &Value) -> f64 {
+    let numbers = |v: &Value| -> Vec<f64> {
+        let pose = v["camera"]["camera_to_world"].as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().clone());
+        let inside = v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
+        pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
+    };
+    numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
 fn views(folder: &Path) -> Vec<Value> {
     let text = std::fs::read_to_string(folder.join("views.json")).unwrap();
     serde_json::from_str::<Value>(&text).unwrap()["views"].as_array().unwrap().clone()
@@ -112,7 +122,7 @@ fn every_form_gives_the_same_cameras_and_pictures() {
         let made = stage("prep", r#"{"degrade": "none", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
         assert_eq!(made.code, 0, "{}", made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
-        for words in ["17 views to train on, 3 others to test", "as if made by box; HR is 48×48", "20 photographs"] {
+        for words in ["17 views to train on, 3 others to test", "as if made by box, opaque; HR is 48×48", "20 photographs"] {
             assert!(summary.contains(words), "{words} isn't in {summary}");
         }
         scenes.push(scene);
@@ -123,19 +133,42 @@ fn every_form_gives_the_same_cameras_and_pictures() {
         for scene in &scenes[1..] {
             for (a, b) in first.iter().zip(views(&scene.join(subtree))) {
                 assert_eq!(a["camera"]["name"], b["camera"]["name"]);
-                let numbers = |v: &Value| -> Vec<f64> {
-                    let pose =
-                        v["camera"]["camera_to_world"].as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().clone());
-                    let inside = v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
-                    pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
-                };
-                let worst = numbers(a).iter().zip(numbers(&b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                assert!(worst < 1e-6, "{subtree} {worst}");
+                assert!(difference(a, &b) < 1e-6, "{subtree}: {a} {b}");
             }
         }
     }
     let picture = |scene: &Path| std::fs::read(scene.join("train/images/r_3.png")).unwrap();
     assert!(scenes.iter().all(|s| picture(s) == picture(&scenes[0])));
+}
+
+/// What COLMAP's own library writes is read, too.
+#[test]
+fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
+    let project = Project::tiny();
+    let folder = as_transforms(&project);
+    let has = std::process::Command::new("python3").args(["-c", "import pycolmap"]).output();
+    if !has.is_ok_and(|o| o.status.success()) {
+        eprintln!("skipped: no pycolmap (python3 -m pip install pycolmap)");
+        return;
+    }
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/write-colmap.py");
+    let colmap = project.path("pycolmap");
+    photographs(&project, "pycolmap");
+    let model = colmap.join("sparse/0");
+    let written = std::process::Command::new("python3").arg(script).arg(&folder).arg(&model).output().unwrap();
+    assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
+    let scenes = [folder, colmap].map(|folder| {
+        let scene = folder.with_extension("scene");
+        let made = stage("prep", "{}", &[("dataset", &folder)], &scene, &[]);
+        assert_eq!(made.code, 0, "{}", made.stderr);
+        scene
+    });
+    let [ours, theirs] = scenes.map(|scene| views(&scene.join("train")));
+    assert_eq!(ours.len(), 17);
+    for (a, b) in ours.iter().zip(&theirs) {
+        assert_eq!(a["camera"]["name"], b["camera"]["name"]);
+        assert!(difference(a, b) < 1e-6, "{a} {b}");
+    }
 }
 
 /// COLMAP's folder and no option: views at twice the size of photographs that nobody has larger, scored by what can be known.
@@ -194,31 +227,19 @@ fn worlds_without_end_have_a_space_of_their_own() {
     let project = Project::tiny();
     project.replace("train: 12", "train: 30");
     project.replace("rays: 60000", "rays: 400000");
-    let mean = |settings: &[&str]| -> (f64, f64) {
-        let settings = [&["-p", "backdrop=true"], settings].concat();
-        project.ok(&[&["run"], &settings[..]].concat());
-        let metrics = project.object(&project.output_of("eval", &settings)[0]).join("metrics.json");
+    let mean = |settings: [&str; 2]| -> (f64, f64) {
+        let all = settings.into_iter().chain(["backdrop=true", "background=opaque", "near=2", "far=80"]);
+        let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
+        project.ok(&[&["run"], &all[..]].concat());
+        let metrics = project.object(&project.output_of("eval", &all)[0]).join("metrics.json");
         let mean = serde_json::from_slice::<Value>(&std::fs::read(metrics).unwrap()).unwrap()["mean"].clone();
         (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
     };
-    for (layout, space, least, depth_error) in [("forward", "ndc", 22.0, 0.7), ("around", "contraction", 18.0, 0.7)] {
-        let layout = format!("layout={layout}");
-        let settings = |space: &str| {
-            vec![
-                "-p".to_owned(),
-                layout.clone(),
-                "-p".into(),
-                space.to_owned(),
-                "-p".into(),
-                "near=2".into(),
-                "-p".into(),
-                "far=80".into(),
-            ]
-        };
-        let own = settings(&format!("space={space}"));
-        let (psnr, depth) = mean(&own.iter().map(String::as_str).collect::<Vec<_>>());
-        let boxed = settings("space=box");
-        let (psnr_of_box, _) = mean(&boxed.iter().map(String::as_str).collect::<Vec<_>>());
+    for (layout, space, least, depth_error) in
+        [("layout=forward", "space=ndc", 22.0, 0.7), ("layout=around", "space=contraction", 18.0, 0.7)]
+    {
+        let (psnr, depth) = mean([layout, space]);
+        let (psnr_of_box, _) = mean([layout, "space=box"]);
         println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");
         assert!(psnr > least && depth < depth_error, "{space}: {psnr} dB, depth off by {depth}");
         assert!(psnr > psnr_of_box, "{space}: {psnr} dB, box {psnr_of_box}");

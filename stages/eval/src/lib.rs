@@ -335,7 +335,11 @@ fn mean_of(views: &[ViewScores]) -> Scores {
 }
 
 fn conventions(params: &Params, background: Background, perceptual: &Perceptual, made: Option<Degradation>) -> MetricConventions {
-    let on = if background == Background::Black { "black" } else { "white" };
+    let on = match background {
+        Background::Black => "black",
+        Background::White | Background::Alpha => "white",
+        Background::Opaque => "none: the pictures are opaque",
+    };
     let border = match params.ssim_border {
         Border::Reflect => "borders reflected",
         Border::Valid => "pixels whose window is whole",

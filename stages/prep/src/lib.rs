@@ -48,8 +48,9 @@ pub struct Params {
     pub degrade: Option<Degrade>,
     /// How LR images are made from HR ones; where nothing is made, what is taken to have made them. Without it: `lanczos`, there `box`.
     pub kernel: Option<Kernel>,
-    /// What lies behind the scene; `alpha` keeps it open.
-    pub background: Background,
+    /// What lies behind the scene; `alpha` keeps it open, `opaque` says that there is nothing behind. Without it: `opaque` for photographs
+    /// without transparency, `white` for Blender's scenes and for pictures that are transparent somewhere.
+    pub background: Option<Background>,
     /// Distance along rays before which there is nothing; without it: from the cameras.
     #[schemars(range(min = 0.0))]
     pub near: Option<f64>,
@@ -78,7 +79,7 @@ impl Default for Params {
             scale: None,
             degrade: None,
             kernel: None,
-            background: Background::White,
+            background: None,
             near: None,
             far: None,
             space: None,
@@ -213,7 +214,11 @@ impl Stage for Prep {
         } else {
             enlarged(native, params.hr, params.scale)
         };
-        let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
+        let background = match params.background {
+            Some(background) => background,
+            None => background_of(&set, &set.frames[split.train[0]])?,
+        };
+        let job = Job { context, params, making, background, sizes: sizes.usage("parameters")?, native };
         let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
         notes.iter().for_each(|note| context.say(note));
         if making.kernel == Kernel::Avg {
@@ -226,6 +231,16 @@ impl Stage for Prep {
         let chosen = |numbers: &[usize]| numbers.iter().map(|&i| &set.frames[i]).collect::<Vec<_>>();
         job.run(&set, notes, &chosen(&split.train), &chosen(&split.test))
     }
+}
+
+/// What lies behind a data set's scene, by one of its pictures.
+fn background_of(set: &Dataset, frame: &Frame) -> anyhow::Result<Background> {
+    if set.format == Format::Blender {
+        return Ok(Background::White);
+    }
+    let (picture, _) = frame.photograph().bad_input(frame_name(frame))?;
+    let is_opaque = picture.data.chunks_exact(4).all(|p| p[3] == 255);
+    Ok(if is_opaque { Background::Opaque } else { Background::White })
 }
 
 /// Which frames are for what.
@@ -298,6 +313,7 @@ struct Job<'a> {
     context: &'a Context,
     params: &'a Params,
     making: Making,
+    background: Background,
     /// Those of the first training view, and its own size.
     sizes: Sizes,
     native: (u32, u32),
@@ -353,7 +369,7 @@ impl Job<'_> {
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
         let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
-        let mut views = Views::new(self.params.background, bounds, Vec::new());
+        let mut views = Views::new(self.background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
             .map(|c| View { image: Some(low_name(&c.name)), ..View::camera_only(self.resized(c, |s| s.lr)) })
@@ -387,7 +403,7 @@ impl Job<'_> {
             .map(|c| View { image: Some(format!("images/{}.png", c.name)), ..View::camera_only(high(c)) })
             .collect();
         if references > 0 {
-            let views = Views::new(self.params.background, bounds, reference_views);
+            let views = Views::new(self.background, bounds, reference_views);
             self.context.write_json(&format!("references/{VIEWS_FILE}"), &views)?;
         }
 
@@ -417,8 +433,8 @@ impl Job<'_> {
             })
             .collect();
         let cameras = truth.iter().map(|v| View::camera_only(v.camera.clone())).collect();
-        self.context.write_json(&format!("truth/{VIEWS_FILE}"), &Views::new(self.params.background, bounds, truth))?;
-        self.context.write_json(&format!("cameras/{VIEWS_FILE}"), &Views::new(self.params.background, bounds, cameras))?;
+        self.context.write_json(&format!("truth/{VIEWS_FILE}"), &Views::new(self.background, bounds, truth))?;
+        self.context.write_json(&format!("cameras/{VIEWS_FILE}"), &Views::new(self.background, bounds, cameras))?;
         self.summarise(set, notes, train, test, bounds)
     }
 
@@ -450,16 +466,22 @@ impl Job<'_> {
     fn choice(&self, split: &Split) -> String {
         let Sizes { lr, hr } = self.sizes;
         let kernel = format!("{:?}", self.making.kernel).to_lowercase();
+        let behind = match self.background {
+            Background::White => "on white",
+            Background::Black => "on black",
+            Background::Alpha => "on an open background",
+            Background::Opaque => "opaque",
+        };
         let both = split.train.iter().filter(|i| split.test.contains(i)).count();
         let parts = match both {
             0 => format!("{} views to train on, {} others to test", split.train.len(), split.test.len()),
             _ => format!("{} views to train on, {} to test, {both} of them for both", split.train.len(), split.test.len()),
         };
         if self.making.has_truth {
-            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
+            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}, {behind}", lr.0, lr.1, hr.0, hr.1)
         } else {
             format!(
-                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR is {}×{}",
+                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}, {behind}; HR is {}×{}",
                 lr.0, lr.1, hr.0, hr.1
             )
         }
@@ -535,7 +557,7 @@ impl Job<'_> {
                 scale,
                 has_truth: self.making.has_truth,
                 kernel: self.making.kernel,
-                background: self.params.background,
+                background: self.background,
                 bounds,
                 train: train.len(),
                 test: test.len(),

@@ -180,7 +180,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         let pictures = train_ss::read_pictures(&input, &views)?;
         let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
         let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width));
-        let training = params.grid_training(params.rays(0), views.bounds.space);
+        let training = params.grid_training(params.rays(0));
         let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {

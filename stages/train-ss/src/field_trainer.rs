@@ -53,8 +53,7 @@ pub(crate) fn start(
                 let message = format!("--device {device}: the grid is trained on the CPU; leave --device away");
                 return Err(Failure::Usage(message).into());
             }
-            let mut trainer =
-                Trainer::new(Field::new(architecture, bounds, params.seed), params.grid_training(rays, bounds.space));
+            let mut trainer = Trainer::new(Field::new(architecture, bounds, params.seed), params.grid_training(rays));
             if let Some(hull) = hull {
                 trainer.limit_to_hull(&hull);
             }

@@ -1,5 +1,4 @@
 use radiance::{Architecture, MlpArchitecture, TrainingOptions};
-use scene::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -66,9 +65,9 @@ pub struct Params {
     /// `grid`: share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
     #[schemars(range(min = 0.0, max = 0.999))]
     pub averaging: f64,
-    /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze where few views look.
+    /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze, fewer samples, and less detail.
     #[schemars(range(min = 0.0, max = 10.0))]
-    pub distortion: Option<f64>,
+    pub distortion: f64,
     /// `grid`: weight decay of the grid.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub grid_decay: f64,
@@ -141,7 +140,7 @@ impl Default for Params {
             final_rate: None,
             schedule: RateSchedule::Code,
             averaging: 0.97,
-            distortion: None,
+            distortion: 0.0,
             grid_decay: 0.0,
             network_decay: 1e-6,
             levels: grid.levels,
@@ -298,8 +297,8 @@ impl Params {
         }
     }
 
-    /// How they ask for a grid in a space to be trained, with so many rays.
-    pub fn grid_training(&self, rays: u64, space: Space) -> TrainingOptions {
+    /// How they ask for a grid to be trained, with so many rays.
+    pub fn grid_training(&self, rays: u64) -> TrainingOptions {
         TrainingOptions {
             rays,
             batch: self.batch() as usize,
@@ -310,7 +309,7 @@ impl Params {
             final_rate: self.or(self.final_rate, 0.25, 0.01),
             warm_up: 100,
             averaging: self.averaging as f32,
-            distortion: self.distortion.unwrap_or(if space == Space::Box { 0.0 } else { 0.01 }) as f32,
+            distortion: self.distortion as f32,
             grid_decay: self.grid_decay as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,

@@ -242,9 +242,9 @@ impl Supersampling {
         (view, (at - self.views[view].before) as usize)
     }
 
-    /// What lies behind a group's rays: with an open background another colour each time, so that opacity is learnt.
+    /// What lies behind a group's rays: with an open background, or none, another colour each time, so that opacity is learnt.
     fn behind(&self, group: u64) -> [f32; 3] {
-        if self.background == Background::Alpha {
+        if matches!(self.background, Background::Alpha | Background::Opaque) {
             let mut draws = Draws::new(self.seed, BACKGROUND, group);
             [0, 1, 2].map(|_| draws.uniform())
         } else {

@@ -88,12 +88,20 @@ pub enum Background {
     Black,
     /// Kept open: alpha is data, colours are premultiplied.
     Alpha,
+    /// Nothing: every ray ends on something, as in photographs. Training puts another colour there each time, so that nothing can
+    /// pretend to be it.
+    Opaque,
 }
 
 impl Background {
-    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white.
+    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white, what is left open of an opaque scene on
+    /// the mean of all colours.
     pub fn shown(self) -> f32 {
-        if self == Self::Black { 0.0 } else { 1.0 }
+        match self {
+            Self::Black => 0.0,
+            Self::White | Self::Alpha => 1.0,
+            Self::Opaque => 0.5,
+        }
     }
 }
 

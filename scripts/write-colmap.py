@@ -1,0 +1,29 @@
+#!/usr/bin/env python3
+"""Writes transforms.json's cameras as a COLMAP model, by COLMAP's own library: write-colmap.py FOLDER sparse/0.
+
+A test's other side: what pycolmap writes, `prep` must read. Needs `pip install pycolmap`.
+"""
+
+import json
+import pathlib
+import sys
+
+import numpy
+import pycolmap
+
+folder, model = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2])
+transforms = json.loads((folder / "transforms.json").read_text())
+width, height, focal = transforms["w"], transforms["h"], transforms["fl_x"]
+reconstruction = pycolmap.Reconstruction()
+parameters = [focal, focal, width / 2, height / 2]
+camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=width, height=height, params=parameters)
+reconstruction.add_camera_with_trivial_rig(camera)
+for number, frame in enumerate(transforms["frames"], 1):
+    # World to camera, with axes right, down, forward.
+    pose = numpy.array(frame["transform_matrix"]) @ numpy.diag([1, -1, -1, 1])
+    inverse = pycolmap.Rigid3d(numpy.linalg.inv(pose)[:3])
+    image = pycolmap.Image(name=pathlib.Path(frame["file_path"]).name, camera_id=1, image_id=number)
+    reconstruction.add_image_with_trivial_frame(image, inverse)
+model.mkdir(parents=True, exist_ok=True)
+reconstruction.write_binary(model)
+print(f"pycolmap {pycolmap.__version__}: {reconstruction.num_reg_images()} images in {model}")

@@ -1,0 +1,66 @@
+#!/usr/bin/env python3
+"""Writes a few whole files for each fuzz target to start from: seeds.py FOLDER."""
+
+import base64
+import pathlib
+import struct
+import sys
+import zlib
+
+out = pathlib.Path(sys.argv[1])
+
+
+def seed(target: str, name: str, data: bytes) -> None:
+    (out / target).mkdir(parents=True, exist_ok=True)
+    (out / target / name).write_bytes(data)
+
+
+cameras = struct.pack("<QIIQQ4d", 1, 1, 1, 4, 3, 5, 5, 2, 1.5)
+image = lambda i, name: struct.pack("<I7dI", i, 1, 0, 0, 0, 0.1, 0.2, i, 1) + name + b"\0" + struct.pack("<Q2dQ", 1, 1, 1, 1)
+images = struct.pack("<Q", 2) + image(1, b"a.png") + image(2, b"b.png")
+points = struct.pack("<QQ3d3BdQII", 1, 1, 0, 0, 5, 9, 9, 9, 0.5, 1, 1, 0)
+for which, data in enumerate([cameras, images, points]):
+    seed("colmap", f"binary-{which}", bytes([which]) + data)
+seed("colmap", "text-cameras", b"\x041 SIMPLE_RADIAL 4 3 5 2 1.5 0.1\n")
+seed("colmap", "text-images", b"\x051 1 0 0 0 0 0 1 1 a.png\n1 1 1\n2 1 0 0 0 0 0 2 1 b.png\n\n")
+seed("colmap", "text-points", b"\x061 0 0 5 9 9 9 0.5 1 0\n")
+
+header = "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 17), }".ljust(117) + "\n"
+row = [0, 1, 0, 0, 3, -1, 0, 0, 0, 4, 0, 0, 1, 4, 5, 1, 9]
+seed("llff", "two", b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.encode() + struct.pack("<34d", *row, *row))
+
+pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"
+frame = f'{{"file_path": "images/a.png", "transform_matrix": {pose}, "fl_x": 5, "k1": 0.1, "mask_path": "images/b.png"}}'
+seed("transforms", "one", f'{{"camera_angle_x": 0.7, "w": 4, "h": 3, "frames": [{frame}]}}'.encode())
+
+chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+for bits, size in ((8, 4), (16, 8)):
+    pixels = zlib.compress((b"\0" + bytes(range(4 * size))) * 3)
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 4, 3, bits, 6, 0, 0, 0)) + chunk(b"IDAT", pixels)
+    seed("picture", f"png-{bits}", b"\0" + png + chunk(b"IEND", b""))
+# 4×3, with an EXIF orientation.
+jpeg = """
+/9j/4AAQSkZJRgABAQAAAQABAAD/4QAiRXhpZgAATU0AKgAAAAgAAQESAAMAAAABAAYAAAAAAAD/2wBDABALDA4MChAODQ4SERATGCgaGBYWGDEjJR0oOjM9
+PDkzODdASFxOQERXRTc4UG1RV19iZ2hnPk1xeXBkeFxlZ2P/2wBDARESEhgVGC8aGi9jQjhCY2NjY2NjY2NjY2NjY2NjY2NjY2NjY2NjY2NjY2NjY2NjY2Nj
+Y2NjY2NjY2NjY2NjY2P/wAARCAADAAQDASIAAhEBAxEB/8QAHwAAAQUBAQEBAQEAAAAAAAAAAAECAwQFBgcICQoL/8QAtRAAAgEDAwIEAwUFBAQAAAF9AQID
+AAQRBRIhMUEGE1FhByJxFDKBkaEII0KxwRVS0fAkM2JyggkKFhcYGRolJicoKSo0NTY3ODk6Q0RFRkdISUpTVFVWV1hZWmNkZWZnaGlqc3R1dnd4eXqDhIWG
+h4iJipKTlJWWl5iZmqKjpKWmp6ipqrKztLW2t7i5usLDxMXGx8jJytLT1NXW19jZ2uHi4+Tl5ufo6erx8vP09fb3+Pn6/8QAHwEAAwEBAQEBAQEBAQAAAAAA
+AAECAwQFBgcICQoL/8QAtREAAgECBAQDBAcFBAQAAQJ3AAECAxEEBSExBhJBUQdhcRMiMoEIFEKRobHBCSMzUvAVYnLRChYkNOEl8RcYGRomJygpKjU2Nzg5
+OkNERUZHSElKU1RVVldYWVpjZGVmZ2hpanN0dXZ3eHl6goOEhYaHiImKkpOUlZaXmJmaoqOkpaanqKmqsrO0tba3uLm6wsPExcbHyMnK0tPU1dbX2Nna4uPk
+5ebn6Onq8vP09fb3+Pn6/9oADAMBAAIRAxEAPwCGiiivKPcP/9k=
+"""
+seed("picture", "jpeg", b"\x01" + base64.b64decode(jpeg))
+attribute = lambda name, kind, data: name + b"\0" + kind + b"\0" + struct.pack("<I", len(data)) + data
+channels = b"".join(c + b"\0" + struct.pack("<IB3xII", 1, 0, 1, 1) for c in (b"A", b"B", b"G", b"R")) + b"\0"
+exr = struct.pack("<II", 20000630, 2) + attribute(b"channels", b"chlist", channels) + attribute(b"compression", b"compression", b"\0")
+for name in (b"dataWindow", b"displayWindow"):
+    exr += attribute(name, b"box2i", struct.pack("<4i", 0, 0, 3, 2))
+exr += attribute(b"lineOrder", b"lineOrder", b"\0") + attribute(b"pixelAspectRatio", b"float", struct.pack("<f", 1))
+exr += attribute(b"screenWindowCenter", b"v2f", struct.pack("<ff", 0, 0)) + attribute(b"screenWindowWidth", b"float", struct.pack("<f", 1)) + b"\0"
+first = len(exr) + 3 * 8
+exr += struct.pack("<3Q", *(first + 40 * y for y in range(3)))
+exr += b"".join(struct.pack("<iI", y, 32) + struct.pack("<e", 0.5) * 16 for y in range(3))
+seed("picture", "exr", b"\x02" + exr)
+
+names = '{"grid":{"dtype":"F32","shape":[4],"data_offsets":[0,16]}}'
+seed("field", "one", struct.pack("<Q", len(names)) + names.encode() + bytes(16))

@@ -1,0 +1,14 @@
+//! `poses_bounds.npy`.
+#![no_main]
+
+use std::sync::LazyLock;
+
+use fuzz::Folder;
+use libfuzzer_sys::fuzz_target;
+
+static FOLDER: LazyLock<Folder> = LazyLock::new(Folder::new);
+
+fuzz_target!(|data: &[u8]| {
+    FOLDER.write("poses_bounds.npy", data);
+    FOLDER.read();
+});
