@@ -432,6 +432,27 @@ mod tests {
         }
     }
 
+    /// Behind an opaque scene lies another colour in every group, and what is asked for is the same: a field that is opaque alone
+    /// can give it.
+    #[test]
+    fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
+        let behind = |background| -> Vec<[f32; 3]> {
+            let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
+            supersampling.background = background;
+            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
+            let groups = (0..40).map(|group| {
+                supersampling.cast(group, &mut rays);
+                assert!(rays.iter().all(|r| r.background == rays[0].background));
+                rays[0].background
+            });
+            groups.collect()
+        };
+        assert!(behind(Background::White).iter().all(|b| *b == [1.0; 3]));
+        let colours = behind(Background::Opaque);
+        assert!((0..40).all(|i| (0..i).all(|j| colours[i] != colours[j])));
+        assert!(colours.iter().flatten().any(|c| *c < 0.2) && colours.iter().flatten().any(|c| *c > 0.8));
+    }
+
     #[test]
     fn gradient_is_that_of_the_loss() {
         for kind in [Supervision::Average, Supervision::Refiltered] {
