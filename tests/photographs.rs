@@ -122,7 +122,7 @@ fn every_form_gives_the_same_cameras_and_pictures() {
         let made = stage("prep", r#"{"degrade": "none", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
         assert_eq!(made.code, 0, "{}", made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
-        for words in ["17 views to train on, 3 others to test", "as if made by box, opaque; HR is 48×48", "20 photographs"] {
+        for words in ["17 views to train on, 3 others to test", "as if made by box; HR is 48×48", "20 photographs"] {
             assert!(summary.contains(words), "{words} isn't in {summary}");
         }
         scenes.push(scene);
@@ -228,7 +228,7 @@ fn worlds_without_end_have_a_space_of_their_own() {
     project.replace("train: 12", "train: 30");
     project.replace("rays: 60000", "rays: 400000");
     let mean = |settings: [&str; 2]| -> (f64, f64) {
-        let all = settings.into_iter().chain(["backdrop=true", "background=opaque", "near=2", "far=80"]);
+        let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
         let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
         project.ok(&[&["run"], &all[..]].concat());
         let metrics = project.object(&project.output_of("eval", &all)[0]).join("metrics.json");

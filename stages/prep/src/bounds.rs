@@ -42,9 +42,7 @@ pub fn place(training: &[Sight], others: &[Sight], kind: Option<SpaceKind>) -> R
     let ndc = || -> Result<Bounds, SpaceError> {
         let all = [training, others].concat();
         let space = Space::Ndc(frustum(&all)?);
-        let around = around_frusta(&all).ok_or(SpaceError::NoDepths)?;
-        // The frustum's planes end rays; the range must not end them before.
-        Ok(Bounds { far: 3.0 * around.far, space, ..around })
+        Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
     };
     match kind {
         Some(SpaceKind::Box) => Ok(boxed),

@@ -48,8 +48,8 @@ pub struct Params {
     pub degrade: Option<Degrade>,
     /// How LR images are made from HR ones; where nothing is made, what is taken to have made them. Without it: `lanczos`, there `box`.
     pub kernel: Option<Kernel>,
-    /// What lies behind the scene; `alpha` keeps it open, `opaque` says that there is nothing behind. Without it: `opaque` for photographs
-    /// without transparency, `white` for Blender's scenes and for pictures that are transparent somewhere.
+    /// What lies behind the scene; `alpha` keeps it open, `opaque` says that there is nothing behind. Without it: `opaque` where the
+    /// space holds all that is seen (`ndc`, `contraction`) and pictures aren't transparent, else `white`.
     pub background: Option<Background>,
     /// Distance along rays before which there is nothing; without it: from the cameras.
     #[schemars(range(min = 0.0))]
@@ -214,11 +214,7 @@ impl Stage for Prep {
         } else {
             enlarged(native, params.hr, params.scale)
         };
-        let background = match params.background {
-            Some(background) => background,
-            None => background_of(&set, &set.frames[split.train[0]])?,
-        };
-        let job = Job { context, params, making, background, sizes: sizes.usage("parameters")?, native };
+        let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
         let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
         notes.iter().for_each(|note| context.say(note));
         if making.kernel == Kernel::Avg {
@@ -233,9 +229,9 @@ impl Stage for Prep {
     }
 }
 
-/// What lies behind a data set's scene, by one of its pictures.
-fn background_of(set: &Dataset, frame: &Frame) -> anyhow::Result<Background> {
-    if set.format == Format::Blender {
+/// What lies behind a scene: nothing, where the space holds all that is seen and one of the pictures is opaque.
+fn background_of(space: &Space, frame: &Frame) -> anyhow::Result<Background> {
+    if *space == Space::Box {
         return Ok(Background::White);
     }
     let (picture, _) = frame.photograph().bad_input(frame_name(frame))?;
@@ -295,9 +291,15 @@ fn frame_name(frame: &Frame) -> String {
     format!("frame {}", frame.name)
 }
 
-/// The space that was chosen, in words.
-fn space_note(bounds: &Bounds) -> String {
-    match bounds.space {
+/// Space and background, in words.
+fn space_note(bounds: &Bounds, background: Background) -> String {
+    let behind = match background {
+        Background::White => "on white",
+        Background::Black => "on black",
+        Background::Alpha => "the background kept open",
+        Background::Opaque => "nothing behind",
+    };
+    let space = match bounds.space {
         Space::Box => {
             format!("space: a box of {:.3} units, seen from {:.3} to {:.3}", bounds.longest_side(), bounds.near, bounds.far)
         }
@@ -305,7 +307,8 @@ fn space_note(bounds: &Bounds) -> String {
         Space::Contraction => {
             format!("space: a ball of {:.3} units, and all around it up to {:.0}, contracted", bounds.longest_side(), bounds.far)
         }
-    }
+    };
+    format!("{space}; {behind}")
 }
 
 /// Everything the steps of one run share.
@@ -313,7 +316,6 @@ struct Job<'a> {
     context: &'a Context,
     params: &'a Params,
     making: Making,
-    background: Background,
     /// Those of the first training view, and its own size.
     sizes: Sizes,
     native: (u32, u32),
@@ -338,8 +340,12 @@ impl Job<'_> {
         if self.params.hull == HullSource::Alpha && bounds.space != Space::Box {
             return Err(Failure::Usage("parameter hull: alpha carves a box; choose space: box, too".to_owned()).into());
         }
-        notes.push(space_note(&bounds));
-        self.context.say(space_note(&bounds));
+        let background = match self.params.background {
+            Some(background) => background,
+            None => background_of(&bounds.space, train[0])?,
+        };
+        notes.push(space_note(&bounds, background));
+        self.context.say(space_note(&bounds, background));
         for (name, given, bound) in [("near", self.params.near, &mut bounds.near), ("far", self.params.far, &mut bounds.far)] {
             if let Some(value) = given {
                 if !value.is_finite() {
@@ -348,7 +354,10 @@ impl Job<'_> {
                 *bound = value;
             }
         }
-        if bounds.near >= bounds.far {
+        if let (Some(far), Space::Ndc(frustum)) = (self.params.far, &mut bounds.space) {
+            frustum.far = frustum.far.min(far);
+        }
+        if bounds.near >= bounds.far || !bounds.is_valid() {
             let message = format!("parameter near: {} is not before far = {}", bounds.near, bounds.far);
             return Err(Failure::Usage(message).into());
         }
@@ -369,7 +378,7 @@ impl Job<'_> {
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
         let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
-        let mut views = Views::new(self.background, bounds, Vec::new());
+        let mut views = Views::new(background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
             .map(|c| View { image: Some(low_name(&c.name)), ..View::camera_only(self.resized(c, |s| s.lr)) })
@@ -403,7 +412,7 @@ impl Job<'_> {
             .map(|c| View { image: Some(format!("images/{}.png", c.name)), ..View::camera_only(high(c)) })
             .collect();
         if references > 0 {
-            let views = Views::new(self.background, bounds, reference_views);
+            let views = Views::new(background, bounds, reference_views);
             self.context.write_json(&format!("references/{VIEWS_FILE}"), &views)?;
         }
 
@@ -433,9 +442,9 @@ impl Job<'_> {
             })
             .collect();
         let cameras = truth.iter().map(|v| View::camera_only(v.camera.clone())).collect();
-        self.context.write_json(&format!("truth/{VIEWS_FILE}"), &Views::new(self.background, bounds, truth))?;
-        self.context.write_json(&format!("cameras/{VIEWS_FILE}"), &Views::new(self.background, bounds, cameras))?;
-        self.summarise(set, notes, train, test, bounds)
+        self.context.write_json(&format!("truth/{VIEWS_FILE}"), &Views::new(background, bounds, truth))?;
+        self.context.write_json(&format!("cameras/{VIEWS_FILE}"), &Views::new(background, bounds, cameras))?;
+        self.summarise(set, notes, train, test, bounds, background)
     }
 
     /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
@@ -466,22 +475,16 @@ impl Job<'_> {
     fn choice(&self, split: &Split) -> String {
         let Sizes { lr, hr } = self.sizes;
         let kernel = format!("{:?}", self.making.kernel).to_lowercase();
-        let behind = match self.background {
-            Background::White => "on white",
-            Background::Black => "on black",
-            Background::Alpha => "on an open background",
-            Background::Opaque => "opaque",
-        };
         let both = split.train.iter().filter(|i| split.test.contains(i)).count();
         let parts = match both {
             0 => format!("{} views to train on, {} others to test", split.train.len(), split.test.len()),
             _ => format!("{} views to train on, {} to test, {both} of them for both", split.train.len(), split.test.len()),
         };
         if self.making.has_truth {
-            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}, {behind}", lr.0, lr.1, hr.0, hr.1)
+            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
         } else {
             format!(
-                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}, {behind}; HR is {}×{}",
+                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR is {}×{}",
                 lr.0, lr.1, hr.0, hr.1
             )
         }
@@ -544,6 +547,7 @@ impl Job<'_> {
         train: &[&Frame],
         test: &[&Frame],
         bounds: Bounds,
+        background: Background,
     ) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let scale = [f64::from(hr.0) / f64::from(lr.0), f64::from(hr.1) / f64::from(lr.1)];
@@ -557,7 +561,7 @@ impl Job<'_> {
                 scale,
                 has_truth: self.making.has_truth,
                 kernel: self.making.kernel,
-                background: self.background,
+                background,
                 bounds,
                 train: train.len(),
                 test: test.len(),

@@ -96,7 +96,7 @@ pub(crate) fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
     let (origin, direction) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
     let clipped = match &bounds.space {
         Space::Box => through_box(bounds, origin, direction),
-        Space::Ndc(frustum) => through_frustum(frustum, [bounds.near, bounds.far], origin, direction),
+        Space::Ndc(frustum) => through_frustum(frustum, bounds.near, origin, direction),
         Space::Contraction => through_contraction(bounds, origin, direction),
     };
     clipped.map_or(UnitRay::miss(ray), |clipped| UnitRay { view: ray.direction, ..clipped })
@@ -114,18 +114,20 @@ fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<UnitR
     Some(UnitRay { origin, direction, enter: enter as f32, leave: leave as f32, course, view: [0.0; 3] })
 }
 
-fn through_frustum(frustum: &Frustum, range: [f64; 2], origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+/// Between the frustum's planes, from a distance on; its far plane lies behind all that is known, so the range's far end says no more.
+fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
     let (o, d) = (frustum.to_camera(origin), frustum.turn(direction));
     let depths = [(o.z - frustum.near, d.z), (frustum.far - o.z, -d.z)];
     let sides = (0..2).flat_map(|i| {
         let (low, high) = (frustum.min[i], frustum.max[i]);
         [(o[i] - low * o.z, d[i] - low * d.z), (high * o.z - o[i], high * d.z - d[i])]
     });
-    let (enter, leave) = clip_to(depths.into_iter().chain(sides), range)?;
+    let (enter, leave) = clip_to(depths.into_iter().chain(sides), [near, f64::INFINITY])?;
     let (from, to) = (o + enter * d, o + leave * d);
     let (start, end) = (frustum.to_cube(from), frustum.to_cube(to));
     let length = (end - start).length();
-    if length <= 0.0 {
+    // A ray that no plane ends has no length in numbers.
+    if !length.is_finite() || length <= 0.0 {
         return None;
     }
     // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from the far end.
