@@ -10,7 +10,7 @@ const FLIGHT: &str = "
     inputs: {cameras: prep/train}
     parameters: {frames: 6}
   path-views:
-    run: render-depth
+    like: render-depth
     inputs: {field: train-ss, cameras: camera-path}
   video:
     inputs: {run: path-views}
@@ -26,7 +26,7 @@ fn project() -> Project {
 #[test]
 fn a_flight_is_rendered_and_filmed() {
     let project = project();
-    // `sub_rays` is a parameter of two blocks; the film needs one of them.
+    // `sub_rays` is a parameter of two blocks; the film's are like the other's.
     let first = project.run(&["run", "video", "-p", "sub_rays=1"]);
     assert_eq!(first.code, 0, "{}", first.stderr);
     for i in 0..6 {

@@ -27,10 +27,19 @@ pub struct Pipeline {
 pub struct StageBlock {
     /// What to run: a path from the file's folder, or the name of a binary beside `nerf-sr`; without it: the block's name.
     pub run: Option<String>,
+    /// Another stage's block: what that runs, with its parameters and what the command line gives it, save what is given here.
+    pub like: Option<String>,
     /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that begins with `.` or `/`.
     pub inputs: BTreeMap<String, String>,
     /// Parameters that differ from the stage's defaults.
     pub parameters: Map<String, Value>,
+}
+
+impl StageBlock {
+    /// Whether the block itself has that parameter, or that input.
+    pub(crate) fn gives(&self, is_parameter: bool, name: &str) -> bool {
+        if is_parameter { self.parameters.contains_key(name) } else { self.inputs.contains_key(name) }
+    }
 }
 
 /// A pipeline.yaml that can't be used: file, line, what to do.
@@ -62,6 +71,28 @@ impl Pipeline {
         let mut pipeline: Self = serde_yaml::from_str(&text).map_err(located)?;
         (pipeline.text, pipeline.path) = (text, path.to_path_buf());
         Ok(pipeline)
+    }
+
+    /// The blocks that a stage's parameters come from, the weightiest last: the one it is like, then its own.
+    pub(crate) fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
+        self.stages[stage].like.as_deref().into_iter().chain([stage])
+    }
+
+    /// Checks what blocks say of being like others.
+    pub(crate) fn check_likeness(&self) -> Result<(), PipelineError> {
+        for (name, block) in &self.stages {
+            let Some(other) = &block.like else { continue };
+            let problem = match self.stages.get(other) {
+                None => format!("like: there is no stage {other:?}"),
+                Some(other_block) if other_block.like.is_some() => {
+                    format!("like: {other:?} is itself like another; name that one")
+                }
+                Some(_) if block.run.is_some() => "run: what it runs follows from `like`; give one of them".to_owned(),
+                Some(_) => continue,
+            };
+            return Err(self.error(name, Some("like"), problem));
+        }
+        Ok(())
     }
 
     /// The folder that relative paths start from.

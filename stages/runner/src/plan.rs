@@ -133,7 +133,8 @@ impl Plan {
                 return Err(PlanError::Usage(format!("no stage {target:?}; known: {known}")));
             }
         }
-        let axes = axes(pipeline, &programs, request, &needed(pipeline, targets))?;
+        let axes =
+            axes(pipeline, &programs, request, &needed(targets, |s| pipeline.stages[s].inputs.values().cloned().collect()))?;
         Expansion { pipeline, programs: &programs, axes: &axes, nodes: Vec::new(), of_stage: BTreeMap::new() }
             .expand(&order, targets)
     }
@@ -258,13 +259,14 @@ fn needs(pipeline: &Pipeline, stage: &str) -> impl Iterator<Item = String> {
     sources.into_iter().map(|s| split(&s).0.to_owned())
 }
 
-/// The stages that targets come to, themselves included.
-fn needed(pipeline: &Pipeline, targets: &[String]) -> BTreeSet<String> {
+/// The stages that targets come to, themselves included; `sources` are the inputs' texts of a stage.
+fn needed(targets: &[String], sources: impl Fn(&str) -> Vec<String>) -> BTreeSet<String> {
     let mut needed: BTreeSet<String> = BTreeSet::new();
     let mut open: Vec<String> = targets.to_vec();
     while let Some(stage) = open.pop() {
         if needed.insert(stage.clone()) {
-            open.extend(needs(pipeline, &stage));
+            let stages = sources(&stage).into_iter().filter(|s| as_path(s).is_none());
+            open.extend(stages.map(|s| split(&s).0.to_owned()));
         }
     }
     needed
@@ -295,7 +297,8 @@ fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
     Ok(order)
 }
 
-/// What the command line sets, each with its stage. Where several stages have a name, that one is meant that the targets need.
+/// What the command line sets, each with its stage. Where several stages have a name, that one is meant that the targets need; a block
+/// that is like another follows that one.
 fn axes(
     pipeline: &Pipeline,
     programs: &BTreeMap<String, Arc<StageProgram>>,
@@ -318,7 +321,13 @@ fn axes(
         };
         let (stages, own): (Vec<&String>, &str) = match name.split_once('.') {
             Some((stage, own)) => (pipeline.stages.keys().filter(|s| *s == stage && has(s, own)).collect(), own),
-            None => (pipeline.stages.keys().filter(|s| has(s, name)).collect(), name),
+            None => {
+                let follows = |s: &str| {
+                    let block = &pipeline.stages[s];
+                    block.like.as_ref().is_some_and(|other| needed.contains(other) || !block.gives(is_parameter, name))
+                };
+                (pipeline.stages.keys().filter(|s| has(s, name) && !follows(s)).collect(), name)
+            }
         };
         let stages = match stages.iter().filter(|s| needed.contains(**s)).copied().collect::<Vec<_>>() {
             meant if meant.is_empty() => stages,
@@ -364,17 +373,7 @@ struct Expansion<'a> {
 impl Expansion<'_> {
     fn expand(mut self, order: &[String], targets: &[String]) -> Result<Plan, PlanError> {
         // Only what the targets need; an input replaced from the command line needs nothing.
-        let mut wanted: BTreeSet<String> = targets.iter().cloned().collect();
-        for stage in order.iter().rev() {
-            if wanted.contains(stage) {
-                wanted.extend(
-                    self.block_inputs(stage)
-                        .into_iter()
-                        .filter(|(_, s)| as_path(s).is_none())
-                        .map(|(_, s)| split(&s).0.to_owned()),
-                );
-            }
-        }
+        let wanted = needed(targets, |stage| self.block_inputs(stage).into_iter().map(|(_, source)| source).collect());
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
             let program = Arc::clone(&self.programs[stage]);
@@ -397,10 +396,20 @@ impl Expansion<'_> {
         self.pipeline.stages[stage].inputs.iter().filter(|(i, _)| !replaced(i)).map(|(i, s)| (i.clone(), s.clone())).collect()
     }
 
+    /// Whether a value from the command line reaches a stage itself: given for it, or for the one it is like where it doesn't say otherwise.
+    fn sets(&self, axis: &Axis, stage: &str) -> bool {
+        let block = &self.pipeline.stages[stage];
+        let (is_parameter, name) = match &axis.what {
+            What::Parameter(name) => (true, name),
+            What::Input(name) => (false, name),
+        };
+        axis.stage == stage || (block.like.as_deref() == Some(&axis.stage) && !block.gives(is_parameter, name))
+    }
+
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         let inputs = self.block_inputs(stage);
         // The axes that reach the stage: its own and its parents'.
-        let mut reach: BTreeSet<usize> = (0..self.axes.len()).filter(|&a| self.axes[a].stage == stage).collect();
+        let mut reach: BTreeSet<usize> = (0..self.axes.len()).filter(|&a| self.sets(&self.axes[a], stage)).collect();
         for (_, source) in inputs.iter().filter(|(_, s)| as_path(s).is_none()) {
             reach.extend(self.of_stage[split(source).0].iter().flat_map(|(values, _)| values.keys().copied()));
         }
@@ -436,7 +445,7 @@ impl Expansion<'_> {
                 sources.push(NodeInput { name: name.clone(), from });
             }
             for (axis, value) in &point {
-                if let (true, What::Input(name)) = (self.axes[*axis].stage == stage, &self.axes[*axis].what) {
+                if let (true, What::Input(name)) = (self.sets(&self.axes[*axis], stage), &self.axes[*axis].what) {
                     sources.push(NodeInput {
                         name: name.clone(),
                         from: Origin::Folder(PathBuf::from(&self.axes[*axis].values[*value])),
@@ -462,15 +471,18 @@ impl Expansion<'_> {
         Ok(())
     }
 
-    /// A stage's parameters at a point: the command line's over the file's over the defaults.
+    /// A stage's parameters at a point: the command line's over the file's, those over what it is like, and that over the defaults.
     fn resolve(&self, stage: &str, point: &Point) -> Result<Value, PlanError> {
-        let mut given = self.pipeline.stages[stage].parameters.clone();
-        for (axis, value) in self.axes.iter().enumerate().filter(|(_, a)| a.stage == stage) {
-            if let What::Parameter(name) = &value.what {
-                let text = &value.values[point.get(&axis).copied().unwrap_or(0)];
-                // As in the file: 2 is a number, box a word.
-                let parsed = serde_yaml::from_str(text).map_err(|e| PlanError::Usage(format!("-p {name}={text}: {e}")))?;
-                given.insert(name.clone(), parsed);
+        let mut given = Map::new();
+        for layer in self.pipeline.layers(stage) {
+            given.extend(self.pipeline.stages[layer].parameters.clone());
+            for (axis, value) in self.axes.iter().enumerate().filter(|(_, a)| a.stage == layer && self.sets(a, stage)) {
+                if let What::Parameter(name) = &value.what {
+                    let text = &value.values[point.get(&axis).copied().unwrap_or(0)];
+                    // As in the file: 2 is a number, box a word.
+                    let parsed = serde_yaml::from_str(text).map_err(|e| PlanError::Usage(format!("-p {name}={text}: {e}")))?;
+                    given.insert(name.clone(), parsed);
+                }
             }
         }
         let schema = Schema::new(&self.programs[stage].description.parameters).map_err(PlanError::Usage)?;

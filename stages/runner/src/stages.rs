@@ -6,7 +6,7 @@ use std::time::UNIX_EPOCH;
 use artifact::{Description, Store, write_atomically};
 use serde::{Deserialize, Serialize};
 
-use crate::pipeline::{Pipeline, StageBlock};
+use crate::pipeline::Pipeline;
 
 /// A stage's executable and what it says of itself.
 #[derive(Clone, Debug)]
@@ -21,13 +21,14 @@ struct Cache(BTreeMap<String, (u64, u128, Description)>);
 
 /// Asks every stage of the pipeline to describe itself; each error names the block.
 pub(crate) fn describe_all(pipeline: &Pipeline, store: &Store) -> Result<BTreeMap<String, StageProgram>, crate::PipelineError> {
+    pipeline.check_likeness()?;
     let cache_file = store.root().join("cache/describe.json");
     // A cache that can't be read is an empty one.
     let mut cache: Cache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
     let mut changed = false;
     let mut programs = BTreeMap::new();
-    for (name, block) in &pipeline.stages {
-        let path = executable(pipeline, name, block);
+    for name in pipeline.stages.keys() {
+        let path = executable(pipeline, name);
         let fail = |problem: String| pipeline.error(name, Some("run"), problem);
         let meta = std::fs::metadata(&path).map_err(|e| {
             fail(format!("{}: {e}; build it (make build) or set `run:` to the stage's executable", path.display()))
@@ -53,8 +54,9 @@ pub(crate) fn describe_all(pipeline: &Pipeline, store: &Store) -> Result<BTreeMa
     Ok(programs)
 }
 
-fn executable(pipeline: &Pipeline, name: &str, block: &StageBlock) -> PathBuf {
-    let run = block.run.as_deref().unwrap_or(name);
+fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
+    let origin = pipeline.stages[stage].like.as_deref().unwrap_or(stage);
+    let run = pipeline.stages[origin].run.as_deref().unwrap_or(origin);
     if run.contains('/') {
         let path = pipeline.folder().join(run);
         return path.canonicalize().unwrap_or(path);
