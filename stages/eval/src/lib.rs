@@ -21,7 +21,8 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{
-    DEGRADATION_FILE, Degradation, Filter, Palette, Picture, Resampling, Rgba8, heat, read_exr, read_premultiplied, write_png,
+    DEGRADATION_FILE, Degradation, Filter, Palette, Picture, Resampling, Rgba8, heat, psnr_of, read_exr, read_premultiplied,
+    write_png,
 };
 use rayon::prelude::*;
 use scene::{Background, View, Views};
@@ -276,7 +277,7 @@ impl Job<'_> {
 /// [`read_view`]; equal pictures, which have no PSNR, count as 100 dB.
 pub fn psnr(found: &Picture, expected: &Picture) -> f64 {
     let sum: f64 = found.data.iter().zip(&expected.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
-    (-10.0 * (sum / found.data.len() as f64).log10()).min(100.0)
+    psnr_of(sum / found.data.len() as f64)
 }
 
 /// A picture of a view over its background, clamped to [0, 1].

@@ -1,5 +1,5 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{ExrImage, Picture, Rgba8, read_exr, to_u8};
+use pixels::{ExrImage, Picture, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -48,7 +48,7 @@ pub(crate) fn warp(view: (&Camera, &ExrImage, &Picture), other: (&Camera, &ExrIm
         data.extend(colour.map(to_u8).into_iter().chain([255]));
     }
     let share = seen as f64 / places.len().max(1) as f64;
-    let psnr = (-10.0 * (sum / (3 * seen) as f64).log10()).min(100.0);
+    let psnr = psnr_of(sum / (3 * seen) as f64);
     (seen > 0).then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
 }
 

@@ -2,6 +2,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use pixels::psnr_of;
 use radiance::StepReport;
 use serde::{Deserialize, Serialize};
 
@@ -28,9 +29,7 @@ impl Curve {
         let hundredths = rays * 100 / total;
         let before = self.points.last().map_or(0, |p| p.rays * 100 / total);
         if hundredths > before && self.steps > 0 {
-            // A loss of exactly 0 has no PSNR; 100 dB stands for it.
-            let psnr = (-10.0 * (self.loss / self.steps as f64).log10()).min(100.0);
-            self.points.push(CurvePoint { rays, psnr });
+            self.points.push(CurvePoint { rays, psnr: psnr_of(self.loss / self.steps as f64) });
             (self.loss, self.steps) = (0.0, 0);
         }
     }

@@ -85,3 +85,8 @@ pub fn to_u8(value: f32) -> u8 {
     // `as` saturates and sends NaN to 0.
     (value * 255.0 + 0.5) as u8
 }
+
+/// Peak signal-to-noise ratio in dB, peak 1, of a mean squared error. No error at all has none; 100 dB stands for it.
+pub fn psnr_of(mean_squared_error: f64) -> f64 {
+    (-10.0 * mean_squared_error.log10()).min(100.0)
+}

@@ -5,6 +5,7 @@
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
+//! * [`psnr_of`]: a mean squared error in dB.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
 //!
 //! Colours are display-encoded sRGB in [0, 1] throughout.
@@ -29,7 +30,7 @@ mod srgb;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
 pub use heat::{Palette, depth_range, draw_depth, heat};
-pub use image_buffer::{Picture, Rgba8, to_u8};
+pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
 pub use operator::{AxisTaps, Resampling};
 pub use picture_file::read_premultiplied;
 pub use pillow_resample::{Filter, resize_pillow};
