@@ -2,6 +2,7 @@
 //!
 //! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes don't depend on threads.
 //! * [`device`]: the device that a stage was asked to use, or why it can't be.
+//! * [`Adam`]: the optimiser, on gradients that are given.
 //! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have.
 //!
 //! ```no_run,standalone_crate
@@ -11,12 +12,16 @@
 //! # Ok::<(), nets::WeightsError>(())
 //! ```
 
+mod adam;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use tch::{Cuda, Device, Kind, TchError, Tensor};
+
+pub use adam::{Adam, all_finite};
 
 /// Makes libtorch repeat its bytes: sums are split by thread, so it gets one.
 pub fn deterministic() {

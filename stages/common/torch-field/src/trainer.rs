@@ -1,5 +1,6 @@
 use std::path::Path;
 
+use nets::Adam;
 use radiance::{Ray, StepReport, Supervision};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -30,11 +31,8 @@ pub struct MlpTraining {
 pub struct MlpTrainer {
     field: Mlp,
     options: MlpTraining,
-    first: Vec<Tensor>,
-    second: Vec<Tensor>,
+    adam: Adam,
     step: u64,
-    /// Steps that changed the field.
-    updates: u64,
     groups: u64,
     rays: u64,
     rate_scale: f64,
@@ -65,21 +63,8 @@ struct Piece {
 impl MlpTrainer {
     /// Starts from a field.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
-        let zeros = || field.parameters().map(|p| p.f_zeros_like()?.f_detach()).collect::<Result<Vec<_>, TchError>>();
-        let (first, second) = (zeros()?, zeros()?);
-        Ok(Self {
-            field,
-            options,
-            first,
-            second,
-            step: 0,
-            updates: 0,
-            groups: 0,
-            rays: 0,
-            rate_scale: 1.0,
-            last_fault: None,
-            dark_steps: 0,
-        })
+        let adam = Adam::new(field.parameters())?;
+        Ok(Self { field, options, adam, step: 0, groups: 0, rays: 0, rate_scale: 1.0, last_fault: None, dark_steps: 0 })
     }
 
     /// The field as it is now.
@@ -124,7 +109,7 @@ impl MlpTrainer {
                 no_grad(|| gradients.iter_mut().zip(&piece.gradients).try_for_each(|(sum, g)| sum.f_add_(g).map(drop)))?;
             }
         }
-        let skipped = !loss.is_finite() || !all_finite(&gradients)?;
+        let skipped = !loss.is_finite() || !nets::all_finite(&gradients)?;
         if skipped {
             if self.last_fault.is_some_and(|before| self.step - before < 100) {
                 return Err(TorchFieldError::NotFinite { step: self.step });
@@ -175,36 +160,20 @@ impl MlpTrainer {
         Plan { first_group: self.groups, first_ray: self.rays, groups, seed, noise }
     }
 
-    /// Adam as PyTorch has it: β 0.9 and 0.999, ε 1e-8.
+    /// Moves the parameters.
     pub(crate) fn take(&mut self, gradients: &[Tensor], done: f64) -> Result<(), TchError> {
-        self.updates += 1;
-        no_grad(|| self.adam(gradients, done))
-    }
-
-    fn adam(&mut self, gradients: &[Tensor], done: f64) -> Result<(), TchError> {
-        let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
         let rate = self.rate_scale * self.options.schedule.rate(self.options.rate, self.options.final_rate, done);
-        let (one, two) = (1.0 - 0.9f64.powi(t), (1.0 - 0.999f64.powi(t)).sqrt());
-        let moments = self.first.iter_mut().zip(&mut self.second);
-        for ((mut parameter, g), (first, second)) in self.field.parameters().zip(gradients).zip(moments) {
-            let _ = first.f_mul_scalar_(0.9)?.f_add_(&g.f_mul_scalar(0.1)?)?;
-            let _ = second.f_mul_scalar_(0.999)?.f_addcmul_(g, &g.f_mul_scalar(0.001)?)?;
-            let size = second.f_sqrt()?.f_div_scalar(two)?.f_add_scalar(1e-8)?;
-            let _ = parameter.f_add_(&first.f_div(&size)?.f_mul_scalar(-rate / one)?)?;
-        }
-        Ok(())
+        self.adam.step(self.field.parameters(), gradients, rate)
     }
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
         let fault = self.last_fault.map_or(-1, |s| s as i64);
-        let counts = [self.step, self.updates, self.groups, self.rays, self.rate_scale.to_bits(), self.dark_steps];
+        let counts = [self.step, self.adam.updates(), self.groups, self.rays, self.rate_scale.to_bits(), self.dark_steps];
         let counters: Vec<i64> = counts.iter().map(|&c| c as i64).chain([fault]).collect();
         let mut tensors = self.field.named();
         let names: Vec<String> = tensors.iter().map(|(name, _)| name.clone()).collect();
-        for (kind, moments) in [("first", &self.first), ("second", &self.second)] {
-            tensors.extend(names.iter().zip(moments).map(|(name, t)| (format!("{kind}.{name}"), t.shallow_clone())));
-        }
+        tensors.extend(self.adam.named(&names));
         tensors.push((COUNTERS.to_owned(), Tensor::f_from_slice(&counters)?));
         nets::write(path, &tensors)?;
         Ok(())
@@ -222,17 +191,14 @@ impl MlpTrainer {
         let counters = weights.integers(COUNTERS, 7)?;
         let named = self.field.named();
         let device = self.field.device;
-        let read = |prefix: &str| -> Result<Vec<Tensor>, TorchFieldError> {
-            let tensor = |(name, like): &(String, Tensor)| -> Result<Tensor, TorchFieldError> {
-                Ok(weights.tensor(&format!("{prefix}{name}"), &like.size())?.f_to_device(device)?)
-            };
-            named.iter().map(tensor).collect()
-        };
-        let (parameters, first, second) = (read("")?, read("first.")?, read("second.")?);
+        let shapes: Vec<(String, Vec<i64>)> = named.iter().map(|(name, like)| (name.clone(), like.size())).collect();
+        let read = |(name, shape): &(String, Vec<i64>)| weights.tensor(name, shape);
+        let parameters = shapes.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+        let adam = Adam::read(&weights, &shapes, counters[1] as u64, device)?;
         no_grad(|| self.field.parameters().zip(&parameters).try_for_each(|(mut to, from)| to.f_copy_(from).map(drop)))?;
-        (self.first, self.second) = (first, second);
+        self.adam = adam;
         let count = |i: usize| counters[i] as u64;
-        (self.step, self.updates, self.groups, self.rays) = (count(0), count(1), count(2), count(3));
+        (self.step, self.groups, self.rays) = (count(0), count(2), count(3));
         (self.rate_scale, self.dark_steps) = (f64::from_bits(count(4)), count(5));
         self.last_fault = u64::try_from(counters[6]).ok();
         Ok(())
@@ -317,14 +283,4 @@ impl Plan {
         let opacity = [opacity(&seen.coarse.weights)?, opacity(&seen.fine.weights)?];
         Ok(Piece { gradients, colours, loss, opacity })
     }
-}
-
-fn all_finite(tensors: &[Tensor]) -> Result<bool, TchError> {
-    for tensor in tensors {
-        // The sum of finite numbers may overflow, but then the step is no good either.
-        if !tensor.f_sum(Kind::Double)?.f_double_value(&[])?.is_finite() {
-            return Ok(false);
-        }
-    }
-    Ok(true)
 }
