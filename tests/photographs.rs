@@ -122,7 +122,7 @@ fn every_form_gives_the_same_cameras_and_pictures() {
         let made = stage("prep", r#"{"degrade": "none", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
         assert_eq!(made.code, 0, "{}", made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
-        for words in ["17 views to train on, 3 others to test", "as if made by box; HR is 48×48", "20 photographs"] {
+        for words in ["17 views to train on, 3 others for testing", "as if made by box; HR is 48×48", "20 photographs"] {
             assert!(summary.contains(words), "{words} isn't in {summary}");
         }
         scenes.push(scene);

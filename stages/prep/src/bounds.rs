@@ -19,7 +19,9 @@ pub enum SpaceKind {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SpaceError {
     /// Nothing says how near the scene comes.
-    #[error("parameter space: ndc needs to know how near and far each view sees, and the data set doesn't say; choose box")]
+    #[error(
+        "parameter space: ndc needs to know how near and far each view sees, and the data set doesn't say; give near and far, or choose box"
+    )]
     NoDepths,
     /// Cameras that look every way.
     #[error("parameter space: ndc needs cameras that look one way; choose box or contraction")]

@@ -1,4 +1,4 @@
-use pixels::{Filter, Kernel, Picture, Rgba8, average_pool, resize_pillow};
+use pixels::{Filter, Kernel, Picture, Resampling, Rgba8, average_pool, resize_pillow};
 
 use crate::sizes::Sizes;
 
@@ -26,6 +26,17 @@ pub enum LowResolution {
 }
 
 impl LowResolution {
+    /// The same shrunk once more, by the same kernel.
+    pub(crate) fn shrunk(&self, (width, height): (usize, usize), kernel: Kernel) -> Self {
+        match self {
+            Self::Bytes(image) => Self::Bytes(resize_pillow(image, width, height, kernel.filter())),
+            Self::Floats(picture) => {
+                let shrink = Resampling::new(kernel.filter(), (picture.width, picture.height), (width, height));
+                Self::Floats(shrink.apply(picture))
+            }
+        }
+    }
+
     /// Alpha, row by row.
     pub(crate) fn alpha(&self) -> Vec<f32> {
         match self {

@@ -6,8 +6,9 @@
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
 //!
-//! The scene has four subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `cameras/`
-//! (the test cameras at HR size, no pictures), `truth/` (HR test images, depth), `references/` (HR training images).
+//! The scene has five subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `rehearsal/` (the
+//! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `cameras/` (the test cameras at HR size, no
+//! pictures), `truth/` (HR test images, depth), `references/` (HR training images).
 
 mod bounds;
 mod degrade;
@@ -192,6 +193,7 @@ impl Stage for Prep {
     fn output() -> Output {
         Output::kind("scene")
             .with_subtree("train", "scene/train")
+            .with_subtree("rehearsal", "scene/train")
             .with_subtree("cameras", "scene/cameras")
             .with_subtree("truth", "scene/truth")
             .with_subtree("references", "scene/references")
@@ -332,7 +334,7 @@ impl Job<'_> {
         // What the user says of all views stands in for what isn't known of each.
         let given =
             self.params.near.zip(self.params.far).map(|(near, far)| [near, far]).filter(|[near, far]| 0.0 < *near && near < far);
-        let sights = |cameras: &'_ [Camera], frames: &[&Frame]| -> Vec<_> {
+        let sights = |cameras: &[Camera], frames: &[&Frame]| -> Vec<_> {
             cameras.iter().cloned().zip(frames.iter().map(|f| f.depths.or(given))).collect()
         };
         let (training, others) = (sights(&train_cameras, train), sights(&test_cameras, test));
@@ -344,8 +346,6 @@ impl Job<'_> {
             Some(background) => background,
             None => background_of(&bounds.space, train[0])?,
         };
-        notes.push(space_note(&bounds, background));
-        self.context.say(space_note(&bounds, background));
         for (name, given, bound) in [("near", self.params.near, &mut bounds.near), ("far", self.params.far, &mut bounds.far)] {
             if let Some(value) = given {
                 if !value.is_finite() {
@@ -361,6 +361,8 @@ impl Job<'_> {
             let message = format!("parameter near: {} is not before far = {}", bounds.near, bounds.far);
             return Err(Failure::Usage(message).into());
         }
+        notes.push(space_note(&bounds, background));
+        self.context.say(space_note(&bounds, background));
 
         let references = if self.making.has_truth { (self.params.references as usize).min(train.len()) } else { 0 };
         let train_pictures = train
@@ -399,8 +401,9 @@ impl Job<'_> {
             std::fs::write(&path, bytes).with_context(|| format!("cannot write {}", path.display()))?;
             views.hull = Some("hull.safetensors".to_owned());
         }
-        drop(train_pictures);
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
+        self.write_rehearsal(&views, &train_pictures)?;
+        drop(train_pictures);
         let degradation = Degradation { kernel: self.making.kernel, hr: self.sizes.hr.into() };
         for subtree in ["train", "truth"] {
             self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &degradation)?;
@@ -447,6 +450,26 @@ impl Job<'_> {
         self.summarise(set, notes, train, test, bounds, background)
     }
 
+    /// The same task one size down, where its solution is known: LR pictures shrunk as HR ones were to make them.
+    fn write_rehearsal(&self, train: &Views, pictures: &[LowResolution]) -> anyhow::Result<()> {
+        let Sizes { lr, hr } = self.sizes;
+        let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
+        let kernel = self.making.kernel;
+        let make = |(view, picture): (&View, &LowResolution)| -> anyhow::Result<View> {
+            self.context.check_interrupt()?;
+            let k = &view.camera.intrinsics;
+            let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
+            let small = picture.shrunk((width as usize, height as usize), kernel);
+            self.write_low("rehearsal/images", &view.camera.name, &small)?;
+            Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
+        };
+        let views = train.views.par_iter().zip(pictures).map(make).collect::<anyhow::Result<Vec<_>>>()?;
+        self.context.write_json(&format!("rehearsal/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
+        // LR pictures that weren't rounded are shrunk by the box: the same, and for any size.
+        let kernel = if kernel == Kernel::Avg { Kernel::Box } else { kernel };
+        self.context.write_json(&format!("rehearsal/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
+    }
+
     /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
     fn sizes_of(&self, native: &scene::Intrinsics) -> Sizes {
         let of = |length: u32, first: u32, target: u32| {
@@ -477,8 +500,8 @@ impl Job<'_> {
         let kernel = format!("{:?}", self.making.kernel).to_lowercase();
         let both = split.train.iter().filter(|i| split.test.contains(i)).count();
         let parts = match both {
-            0 => format!("{} views to train on, {} others to test", split.train.len(), split.test.len()),
-            _ => format!("{} views to train on, {} to test, {both} of them for both", split.train.len(), split.test.len()),
+            0 => format!("{} views to train on, {} others for testing", split.train.len(), split.test.len()),
+            _ => format!("{} views to train on, {} for testing, {both} of them for both", split.train.len(), split.test.len()),
         };
         if self.making.has_truth {
             format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
