@@ -75,7 +75,7 @@ PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/quality.json)
+	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --out $(or $(OUT),out/quality.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/ablation.json)

@@ -25,7 +25,19 @@ def run(
 
     Without a scene the pipeline's own is taken: the demo scene.
     """
-    command = [nerf_sr, "run", "-j", "1", "--out", page]
+    (row,) = run_target("report", nerf_sr, page, scene, settings, weights)
+    return row
+
+
+def run_refined(
+    nerf_sr: str, page: pathlib.Path, scene: pathlib.Path | None, settings: list[str], weights: pathlib.Path | None = None
+) -> list[dict]:
+    """The same with the refined views: a row for what was rendered, a row for what was refined."""
+    return run_target("refined", nerf_sr, page, scene, settings, weights)
+
+
+def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights) -> list[dict]:
+    command = [nerf_sr, "run", target, "-j", "1", "--out", page]
     if scene:
         command += ["-i", f"dataset={scene}"]
     if weights and weights.is_dir():
@@ -35,15 +47,21 @@ def run(
     done = subprocess.run([str(word) for word in command])
     if done.returncode != 0:
         sys.exit(done.returncode)
-    (row,) = json.loads((page / "report" / "results.json").read_text())
-    train, render = row["stages"]["train-ss"], row["stages"]["render-depth"]
+    return [figures(row) for row in json.loads((page / target / "results.json").read_text())]
+
+
+def figures(row: dict) -> dict:
+    """A row's means, and the seconds of what it came through: training includes a refiner's, rendering includes refining."""
+    stages = row["stages"]
+    seconds = lambda *names: sum(stages[name]["seconds"] for name in names if name in stages)
+    train = stages["train-ss"]
     log = json.loads((pathlib.Path(train["folder"]) / "training.json").read_text())
     return {
         "psnr": row["mean"]["psnr"],
         "ssim": row["mean"]["ssim"],
         "lpips": row["mean"].get("lpips"),
-        "train_s": train["seconds"],
-        "render_s": render["seconds"],
+        "train_s": seconds("train-ss", "rehearsal-field", "rehearsal-views", "train-refine"),
+        "render_s": seconds("render-depth", "refine"),
         "rays_per_s": log["rays"] / train["seconds"],
         "samples_per_ray": log["samples_per_ray"],
     }

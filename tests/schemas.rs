@@ -27,6 +27,8 @@ fn schemas_are_current() {
     parameters::<report::Report>(&mut all);
     parameters::<camera_path::CameraPath>(&mut all);
     parameters::<video::Video>(&mut all);
+    parameters::<train_refine::TrainRefine>(&mut all);
+    parameters::<refine::Refine>(&mut all);
     for (name, schema) in [
         ("pipeline", of::<runner::Pipeline>()),
         ("describe", of::<artifact::Description>()),
@@ -37,6 +39,7 @@ fn schemas_are_current() {
         ("scene", of::<prep::SceneSummary>()),
         ("field", of::<radiance::FieldFile>()),
         ("training", of::<train_ss::TrainingLog>()),
+        ("refiner", of::<refinement::RefinerFile>()),
         ("metrics", of::<eval::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),
         ("degradation", of::<pixels::Degradation>()),

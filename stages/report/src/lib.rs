@@ -41,7 +41,10 @@ impl Stage for Report {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("run", Input::required(&["run"], "folder with run.json, the record of a run"))]
+        vec![
+            ("run", Input::required(&["run"], "folder with run.json, the record of a run")),
+            ("refined", Input::optional(&["run"], "in pipeline.yaml: further scores to show beside those of `run`")),
+        ]
     }
 
     fn output() -> Output {

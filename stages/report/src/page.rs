@@ -44,7 +44,7 @@ pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
                 h1 { "nerf-sr report" }
                 (scores(run, &points))
                 @for (point, gallery) in points.iter().zip(&galleries) {
-                    h2 { "Views" @if !point.node.point.is_empty() { " · " (point.node.point) } }
+                    h2 { "Views" @if points.len() > 1 { " · " (label(&points, point)) } }
                     (gallery)
                 }
                 (stages(run))
@@ -76,7 +76,7 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
             tbody {
                 @for point in points {
                     tr {
-                        td { @if point.node.point.is_empty() { "default" } @else { (point.node.point) } }
+                        td { (label(points, point)) }
                         @for (_, path, digits, up) in columns {
                             @match mean(point, path) {
                                 Some(value) => td class=(if points.len() > 1 && value == best(path, up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
@@ -85,8 +85,9 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
                             }
                         }
                         td class="n" { (point.metrics["views"].as_array().map_or(0, Vec::len)) }
-                        td class="n" { (time_of(run, point, "field")) }
-                        td class="n" { (time_of(run, point, "views")) }
+                        @let [training, rendering] = times(run, point);
+                        td class="n" { (duration(training)) }
+                        td class="n" { (duration(rendering)) }
                     }
                 }
             }
@@ -99,10 +100,31 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     }
 }
 
-/// Time of the ancestors of a kind.
-fn time_of(run: &RunRecord, point: &Point<'_>, kind: &str) -> String {
-    let seconds: f64 =
-        run.ancestors(point.index).into_iter().map(|i| &run.nodes[i]).filter(|n| n.kind == kind).map(|n| n.seconds).sum();
+/// What tells a point from the others: its values in the sweep and, where several blocks score, whose scores they are.
+fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
+    let (stage, values) = (point.node.stage.as_str(), point.node.point.as_str());
+    match (points.iter().any(|p| p.node.stage != stage), values) {
+        (false, "") => "default".to_owned(),
+        (false, values) => values.to_owned(),
+        (true, "") => stage.to_owned(),
+        (true, values) => format!("{stage}, {values}"),
+    }
+}
+
+/// Seconds of training and of rendering. What was rendered on the way to a refiner belongs to its training.
+fn times(run: &RunRecord, point: &Point<'_>) -> [f64; 2] {
+    let mut rendered = Vec::new();
+    let mut next = point.node.inputs.get("views").and_then(|input| input.node);
+    while let Some(index) = next {
+        rendered.push(index);
+        next = run.nodes[index].inputs.get("views").and_then(|input| input.node);
+    }
+    let seconds = |i: &usize| run.nodes[*i].seconds;
+    let trains = |i: &usize| ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str()) && !rendered.contains(i);
+    [run.ancestors(point.index).iter().filter(|i| trains(i)).map(seconds).sum(), rendered.iter().map(seconds).sum()]
+}
+
+fn duration(seconds: f64) -> String {
     if seconds < 90.0 { format!("{seconds:.1} s") } else { format!("{:.1} min", seconds / 60.0) }
 }
 

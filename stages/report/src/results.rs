@@ -11,6 +11,8 @@ use serde_json::{Map, Value};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ResultRow {
+    /// The block that scored.
+    pub stage: String,
     /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
     /// Means over the views: `psnr`, `ssim`, `lpips` where weights were given, `depth` where there is truth.
@@ -52,6 +54,7 @@ pub(crate) fn results(run: &RunRecord) -> anyhow::Result<Vec<ResultRow>> {
             (node.stage.clone(), result)
         });
         Ok(ResultRow {
+            stage: node.stage.clone(),
             point: node.point.clone(),
             mean: metrics["mean"].clone(),
             views: metrics["views"].as_array().map_or(0, Vec::len),

@@ -1,0 +1,58 @@
+//! Refinement of rendered views: a small network that gives them the detail they systematically lack.
+//!
+//! A field that was trained from LR pictures renders edges softer than they are, and the same way everywhere in a scene. The network sees a
+//! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR pictures that
+//! were shrunk once more renders views of LR size, whose truth the LR pictures are.
+//!
+//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
+//! * [`Example`]: a rendered view and its true picture; [`RefinerTrainer`], [`RefinerTraining`]: learning from them.
+//! * [`RefinerFile`]: what a folder with a refiner says of it.
+//!
+//! Colours are display-encoded sRGB, composited on the background that is shown. A view is a [`Picture`] of four channels: colour, and
+//! opacity ([`view_over`]).
+//!
+//! Convolutions go through libtorch, each tile and each shard of a step in one thread; gradients are added in order, so bytes don't
+//! depend on the number of threads.
+//!
+//! ```
+//! use pixels::Picture;
+//! use refinement::{Architecture, Refiner};
+//! nets::deterministic();
+//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1 }, 7)?;
+//! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
+//! // A network that hasn't learnt anything adds nothing.
+//! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
+//! # Ok::<(), refinement::RefinementError>(())
+//! ```
+//!
+//! [`Picture`]: pixels::Picture
+
+mod folded;
+mod refiner;
+mod trainer;
+
+pub use refiner::{Architecture, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE, view_over};
+pub use trainer::{Example, RefinerTrainer, RefinerTraining, Scores};
+
+/// A refiner that can't be read, written, used or trained.
+#[derive(Debug, thiserror::Error)]
+pub enum RefinementError {
+    /// libtorch refused.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+    /// A file of weights can't be used.
+    #[error(transparent)]
+    Weights(#[from] nets::WeightsError),
+    /// A view isn't one.
+    #[error("a view of {channels} channels where colour and opacity are expected")]
+    Channels {
+        /// How many it has.
+        channels: usize,
+    },
+    /// Numbers went wrong.
+    #[error("step {step}: the gradient is not finite; lower the rate")]
+    NotFinite {
+        /// The step.
+        step: u64,
+    },
+}

@@ -1,0 +1,203 @@
+use std::path::Path;
+
+use pixels::Picture;
+use radiance::Draws;
+use rayon::prelude::*;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use tch::{TchError, Tensor, no_grad};
+
+use crate::RefinementError;
+use crate::folded::{FOLD, Square, samples};
+
+/// Size of a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Architecture {
+    /// Features of the hidden layers.
+    pub channels: u32,
+    /// Residual blocks of two layers each.
+    pub blocks: u32,
+}
+
+/// Name of the file that describes a refiner.
+pub const REFINER_FILE: &str = "refiner.json";
+/// Name of the file with its weights: safetensors, kernels as outputs × rows × columns × inputs.
+pub const WEIGHTS_FILE: &str = "refiner.safetensors";
+
+/// `refiner.json`: what a folder with a refiner says of it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct RefinerFile {
+    /// The network.
+    pub architecture: Architecture,
+    /// Share of what it predicts that is added: what was best for the views that training left out, from 0 to 1.
+    pub strength: f64,
+    /// Mean PSNR of those views as they were rendered, in dB.
+    pub rendered_psnr: f64,
+    /// Mean PSNR of those views refined, in dB.
+    pub refined_psnr: f64,
+}
+
+/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (He et al. 2016), one out. It pads
+/// nothing: borders are gone on with before it, and what it predicts depends on nothing but what it sees.
+#[derive(Debug)]
+pub struct Refiner {
+    architecture: Architecture,
+    /// Kernel and bias of each layer.
+    parameters: Vec<Tensor>,
+}
+
+/// Channels of a rendered view: colour and opacity.
+pub(crate) const INPUTS: usize = 4;
+/// Channels of a picture.
+pub(crate) const OUTPUTS: usize = 3;
+/// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
+const TILE: usize = 128;
+/// Purpose of draws.
+const WEIGHTS: u64 = 300;
+
+impl Refiner {
+    /// A network that hasn't learnt anything: it adds nothing.
+    pub fn new(architecture: Architecture, seed: u64) -> Result<Self, RefinementError> {
+        let mut draws = Draws::new(seed, WEIGHTS, 0);
+        let layers = layers(architecture);
+        let mut parameters = Vec::with_capacity(2 * layers.len());
+        for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
+            // As PyTorch draws them: blocks that begin by adding little. The last layer, and with it the prediction, starts at 0.
+            let reach = if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
+            let kernel: Vec<f32> =
+                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(draws.uniform()) - 1.0)) as f32).collect();
+            parameters.push(Tensor::f_from_slice(&kernel)?.f_reshape(kernel_shape(*inputs, *outputs))?.set_requires_grad(true));
+            parameters.push(Tensor::f_from_slice(&vec![0.0f32; *outputs])?.set_requires_grad(true));
+        }
+        Ok(Self { architecture, parameters })
+    }
+
+    /// Reads weights that [`Refiner::write`] wrote.
+    pub fn read(path: &Path, architecture: Architecture) -> Result<Self, RefinementError> {
+        let weights = nets::Weights::read(path)?;
+        let tensors = shapes(architecture).into_iter().map(|(name, shape)| weights.tensor(&name, &shape));
+        Ok(Self { architecture, parameters: tensors.collect::<Result<_, _>>()? })
+    }
+
+    /// Writes the weights.
+    pub fn write(&self, path: &Path) -> Result<(), RefinementError> {
+        Ok(nets::write(path, &self.named())?)
+    }
+
+    /// The parameters by name.
+    pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
+        shapes(self.architecture).into_iter().map(|(name, _)| name).zip(self.parameters()).collect()
+    }
+
+    /// The parameters.
+    pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
+        self.parameters.iter().map(Tensor::shallow_clone)
+    }
+
+    /// Their names and shapes.
+    pub(crate) fn shapes(&self) -> Vec<(String, Vec<i64>)> {
+        shapes(self.architecture)
+    }
+
+    /// Another handle on the same parameters, for another thread.
+    pub(crate) fn share(&self) -> Self {
+        Self { architecture: self.architecture, parameters: self.parameters().collect() }
+    }
+
+    /// Folds that it sees on each side of one.
+    pub(crate) fn reach(&self) -> usize {
+        2 * self.architecture.blocks as usize + 2
+    }
+
+    /// What to add to the colours of squares, from the squares grown by [`Refiner::reach`].
+    pub(crate) fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
+        let layer = |x: &Tensor, i: usize| {
+            let kernel = self.parameters[2 * i].f_permute([0, 3, 1, 2])?;
+            x.f_conv2d(&kernel, Some(&self.parameters[2 * i + 1]), 1, 0, 1, 1)
+        };
+        let mut x = layer(input, 0)?;
+        for block in 0..self.architecture.blocks as usize {
+            let inner = layer(&x, 1 + 2 * block)?.f_relu()?;
+            let [_, _, height, width] = x.size()[..] else { unreachable!("a convolution's output has four dimensions") };
+            let middle = x.f_narrow(2, 2, height - 4)?.f_narrow(3, 2, width - 4)?;
+            x = middle.f_add(&layer(&inner, 2 + 2 * block)?)?;
+        }
+        layer(&x.f_relu()?, 1 + 2 * self.architecture.blocks as usize)
+    }
+
+    /// The view with `strength` times what the network adds: a picture of three channels in 0..1.
+    pub fn refine_by(&self, view: &Picture, strength: f32) -> Result<Picture, RefinementError> {
+        if view.channels != INPUTS {
+            return Err(RefinementError::Channels { channels: view.channels });
+        }
+        let (width, height) = (view.width, view.height);
+        let tiles: Vec<(usize, usize, Self)> = (0..height)
+            .step_by(TILE)
+            .flat_map(|y| (0..width).step_by(TILE).map(move |x| (x, y)))
+            .map(|(x, y)| (x, y, self.share()))
+            .collect();
+        let refined: Vec<(Square, Vec<f32>)> = tiles
+            .into_par_iter()
+            .map(|(x, y, refiner)| -> Result<_, TchError> {
+                let side = |from: usize, size: usize| (size - from).min(TILE).next_multiple_of(FOLD);
+                let square = Square { x: x as isize, y: y as isize, size: (side(x, width), side(y, height)) };
+                let (around, mut input) = (square.grown(refiner.reach()), Vec::new());
+                around.fold(|x, y| input.extend_from_slice(around.of(view, x, y)));
+                let added = no_grad(|| refiner.forward(&around.tensor(&input, INPUTS)?))?;
+                Ok((square, samples(&added)?))
+            })
+            .collect::<Result<_, _>>()?;
+        let mut data = vec![0.0; width * height * OUTPUTS];
+        for (square, added) in &refined {
+            square.unfold(added, OUTPUTS, |x, y, added| {
+                let (column, row) = (square.x as usize + x, square.y as usize + y);
+                if column < width && row < height {
+                    let at = row * width + column;
+                    for c in 0..OUTPUTS {
+                        data[at * OUTPUTS + c] = (view.data[at * INPUTS + c] + strength * added[c]).clamp(0.0, 1.0);
+                    }
+                }
+            });
+        }
+        Ok(Picture::new(width, height, OUTPUTS, data))
+    }
+
+    /// The view with all that the network adds.
+    pub fn refine(&self, view: &Picture) -> Result<Picture, RefinementError> {
+        self.refine_by(view, 1.0)
+    }
+}
+
+/// A picture of premultiplied RGBA as a refiner takes it: colour over a grey level, and opacity.
+///
+/// # Panics
+/// On a picture without alpha.
+pub fn view_over(picture: &Picture, background: f32) -> Picture {
+    let over = picture.over(background);
+    let pixels = over.data.chunks_exact(OUTPUTS).zip(picture.data.chunks_exact(INPUTS));
+    Picture::new(picture.width, picture.height, INPUTS, pixels.flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]).collect())
+}
+
+/// Name, inputs and outputs of each layer.
+fn layers(architecture: Architecture) -> Vec<(String, usize, usize)> {
+    let width = architecture.channels as usize;
+    let blocks = (0..architecture.blocks)
+        .flat_map(|i| [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]);
+    let first = ("first".to_owned(), INPUTS * FOLD * FOLD, width);
+    let last = ("last".to_owned(), width, OUTPUTS * FOLD * FOLD);
+    std::iter::once(first).chain(blocks).chain([last]).collect()
+}
+
+fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
+    [outputs as i64, 3, 3, inputs as i64]
+}
+
+/// Names and shapes of the parameters.
+fn shapes(architecture: Architecture) -> Vec<(String, Vec<i64>)> {
+    let both = |(name, inputs, outputs): (String, usize, usize)| {
+        [(format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()), (format!("{name}.bias"), vec![outputs as i64])]
+    };
+    layers(architecture).into_iter().flat_map(both).collect()
+}

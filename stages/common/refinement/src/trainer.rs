@@ -1,0 +1,302 @@
+use std::ops::Range;
+use std::path::Path;
+
+use nets::{Adam, Weights};
+use pixels::{Picture, psnr_of};
+use radiance::Draws;
+use rayon::prelude::*;
+use tch::{Kind, TchError, Tensor, no_grad};
+
+use crate::RefinementError;
+use crate::folded::{FOLD, Square};
+use crate::refiner::{INPUTS, OUTPUTS, Refiner};
+
+/// A rendered view and what it should look like.
+#[derive(Clone, Debug)]
+pub struct Example {
+    /// Colour, on the background, and opacity.
+    pub view: Picture,
+    /// Colour, on the background; of the view's size.
+    pub truth: Picture,
+}
+
+/// How to train a [`Refiner`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RefinerTraining {
+    /// Steps in all.
+    pub steps: u64,
+    /// Squares in a step.
+    pub batch: usize,
+    /// Pixels along a square's side; an even number.
+    pub square: usize,
+    /// Highest learning rate; it rises over the first steps and falls to nothing, as a cosine.
+    pub rate: f64,
+    /// Seed of what is drawn.
+    pub seed: u64,
+}
+
+/// Trains a [`Refiner`] by Adam on the squared error of squares of examples, each turned, mirrored and with its colours changed: what is
+/// learnt are edges, not the scene's own colours, and so it holds at another size, too.
+pub struct RefinerTrainer {
+    refiner: Refiner,
+    options: RefinerTraining,
+    adam: Adam,
+    step: u64,
+}
+
+/// Shards of a step: fixed, so that sums have one order at any thread count.
+const SHARDS: usize = 8;
+/// Steps over which the rate rises.
+const WARM_UP: u64 = 50;
+/// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach nothing.
+const CONTRAST: f32 = 0.08;
+const REDRAWS: usize = 8;
+/// Purpose of draws.
+const SQUARES: u64 = 301;
+/// Name of a checkpoint's counters.
+const COUNTERS: &str = "counters";
+
+/// How well views are rendered and refined.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Scores {
+    /// Mean PSNR as rendered, in dB.
+    pub rendered_psnr: f64,
+    /// Mean PSNR refined, with the best strength, in dB.
+    pub refined_psnr: f64,
+    /// Share of the prediction that has the least squared error, from 0 to 1.
+    pub strength: f64,
+}
+
+impl RefinerTrainer {
+    /// Starts from a refiner.
+    pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
+        let adam = Adam::new(refiner.parameters())?;
+        Ok(Self { refiner, options, adam, step: 0 })
+    }
+
+    /// The refiner as it is now.
+    pub fn refiner(&self) -> &Refiner {
+        &self.refiner
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Takes a step on some of the examples, of which there is at least one; the mean squared error before it, `None` once all steps are
+    /// taken.
+    pub fn step(&mut self, examples: &[Example]) -> Result<Option<f64>, RefinementError> {
+        let RefinerTraining { steps, batch, rate, .. } = self.options;
+        if self.step >= steps {
+            return Ok(None);
+        }
+        let shards: Vec<(Refiner, Range<usize>)> =
+            (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
+        let (step, options) = (self.step, self.options);
+        let parts: Vec<(f64, Vec<Tensor>)> = shards
+            .into_par_iter()
+            .filter(|(_, range)| !range.is_empty())
+            .map(|(refiner, range)| shard(&refiner, &options, step, range, examples))
+            .collect::<Result<_, _>>()?;
+        let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>();
+        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
+        let mut gradients = parts.next().unwrap_or_default();
+        for part in parts {
+            no_grad(|| gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop)))?;
+        }
+        if !loss.is_finite() || !nets::all_finite(&gradients)? {
+            return Err(RefinementError::NotFinite { step });
+        }
+        let warm = ((step + 1) as f64 / WARM_UP as f64).min(1.0);
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
+        self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
+        self.step += 1;
+        Ok(Some(loss))
+    }
+
+    /// Scores examples that training left out, and finds the share of the prediction that serves them best.
+    pub fn score(&self, examples: &[Example]) -> Result<Scores, RefinementError> {
+        let (mut rendered, mut agreement, mut power) = (0.0, 0.0, 0.0);
+        for Example { view, truth } in examples {
+            let refined = self.refiner.refine(view)?;
+            let colours = view.data.chunks_exact(INPUTS).flat_map(|p| &p[..OUTPUTS]);
+            let mut error = 0.0;
+            for ((r, v), t) in refined.data.iter().zip(colours).zip(&truth.data) {
+                let (added, lacks) = (f64::from(r - v), f64::from(t - v));
+                agreement += added * lacks;
+                power += added * added;
+                error += lacks * lacks;
+            }
+            rendered += psnr_of(error / truth.data.len() as f64);
+        }
+        let strength = if power > 0.0 { (agreement / power).clamp(0.0, 1.0) } else { 0.0 };
+        let mut refined = 0.0;
+        for Example { view, truth } in examples {
+            let by = self.refiner.refine_by(view, strength as f32)?;
+            let error: f64 = by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
+            refined += psnr_of(error / truth.data.len() as f64);
+        }
+        let count = examples.len().max(1) as f64;
+        Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength })
+    }
+
+    /// Writes all that a resumed training needs. The caller makes it atomic.
+    pub fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
+        let mut tensors = self.refiner.named();
+        let names: Vec<String> = tensors.iter().map(|(name, _)| name.clone()).collect();
+        tensors.extend(self.adam.named(&names));
+        tensors.push((COUNTERS.to_owned(), Tensor::f_from_slice(&[self.step as i64])?));
+        Ok(nets::write(path, &tensors)?)
+    }
+
+    /// Goes on from a checkpoint of a trainer made with the same refiner and options.
+    pub fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
+        let weights = Weights::read(path)?;
+        let step = weights.integers(COUNTERS, 1)?[0] as u64;
+        let shapes = self.refiner.shapes();
+        let adam = Adam::read(&weights, &shapes, step, tch::Device::Cpu)?;
+        let parameters = shapes.iter().map(|(name, shape)| weights.tensor(name, shape)).collect::<Result<Vec<_>, _>>()?;
+        no_grad(|| self.refiner.parameters().zip(&parameters).try_for_each(|(mut to, from)| to.f_copy_(from).map(drop)))?;
+        (self.adam, self.step) = (adam, step);
+        Ok(())
+    }
+}
+
+/// Loss and gradients of some of a step's squares.
+fn shard(
+    refiner: &Refiner,
+    options: &RefinerTraining,
+    step: u64,
+    range: Range<usize>,
+    examples: &[Example],
+) -> Result<(f64, Vec<Tensor>), TchError> {
+    let (mut inputs, mut lacks) = (Vec::new(), Vec::new());
+    let size = (options.square, options.square);
+    let around = Square { x: 0, y: 0, size }.grown(refiner.reach());
+    let square = Square { x: 0, y: 0, size };
+    for i in range {
+        let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, examples);
+        drawn.append(refiner.reach(), &mut inputs, &mut lacks);
+    }
+    let added = refiner.forward(&around.tensor(&inputs, INPUTS)?)?;
+    let all = (options.batch * options.square * options.square * OUTPUTS) as f64;
+    let loss = added.f_sub(&square.tensor(&lacks, OUTPUTS)?)?.f_square()?.f_sum(None::<Kind>)?.f_div_scalar(all)?;
+    let parameters: Vec<Tensor> = refiner.parameters().collect();
+    let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
+    Ok((loss.f_double_value(&[])?, gradients))
+}
+
+/// A square of an example, as it is shown to the network.
+struct Drawn<'a> {
+    example: &'a Example,
+    square: Square,
+    /// Rows for columns; mirrored along each.
+    turn: [bool; 3],
+    /// Which channel comes first, second, third.
+    order: [usize; OUTPUTS],
+    /// Contrast; negative for the negative.
+    gain: f32,
+    offset: f32,
+}
+
+impl<'a> Drawn<'a> {
+    /// The square with that number.
+    fn new(options: &RefinerTraining, number: u64, examples: &'a [Example]) -> Self {
+        let mut draws = Draws::new(options.seed, SQUARES, number);
+        let mut place = || {
+            let example = &examples[draws.below(examples.len() as u64) as usize];
+            // On even pixels, as the folds of whole views lie.
+            let mut start =
+                |size: usize| (draws.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
+            let (x, y) = (start(example.view.width), start(example.view.height));
+            (example, Square { x, y, size: (options.square, options.square) })
+        };
+        let mut placed = place();
+        for _ in 0..REDRAWS {
+            if contrast(placed.0, placed.1) >= CONTRAST {
+                break;
+            }
+            placed = place();
+        }
+        let (example, square) = placed;
+        let turn = [(); 3].map(|()| draws.below(2) == 1);
+        let mut order = [0, 1, 2];
+        (1..OUTPUTS).for_each(|i| order.swap(i, draws.below(i as u64 + 1) as usize));
+        let (contrast, shift) = (0.5 + 0.7 * draws.uniform(), 0.4 * (draws.uniform() - 0.5));
+        let sign = if draws.below(2) == 1 { -1.0 } else { 1.0 };
+        // Around the middle of all colours.
+        let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
+        Self { example, square, turn, order, gain, offset }
+    }
+
+    /// Appends what the network gets, which reaches so many folds farther than the square, and what it should add.
+    fn append(&self, reach: usize, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
+        let Example { view, truth } = self.example;
+        let around = self.square.grown(reach);
+        around.fold(|x, y| {
+            let (x, y) = self.source(x, y, around.size.0);
+            let pixel = around.of(view, x, y);
+            inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
+            inputs.push(pixel[OUTPUTS]);
+        });
+        self.square.fold(|x, y| {
+            let (x, y) = self.source(x, y, self.square.size.0);
+            let (seen, wanted) = (self.square.of(view, x, y), self.square.of(truth, x, y));
+            lacks.extend(self.order.map(|c| self.gain * (wanted[c] - seen[c])));
+        });
+    }
+
+    /// Where a place of a turned square of that side comes from.
+    fn source(&self, x: usize, y: usize, side: usize) -> (usize, usize) {
+        let [swap, flip_x, flip_y] = self.turn;
+        let (x, y) = if swap { (y, x) } else { (x, y) };
+        (if flip_x { side - 1 - x } else { x }, if flip_y { side - 1 - y } else { y })
+    }
+}
+
+/// Range of the green in a square of the truth.
+fn contrast(example: &Example, square: Square) -> f32 {
+    let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
+    square.fold(|x, y| {
+        let green = square.of(&example.truth, x, y)[1];
+        (low, high) = (low.min(green), high.max(green));
+    });
+    high - low
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Architecture;
+
+    /// Stripes, and the same blurred by a pixel.
+    fn example(phase: usize) -> Example {
+        let level = |i: usize, blur: bool| {
+            let at = |x: usize| if (x + phase) / 4 % 2 == 0 { 0.2 } else { 0.8f32 };
+            let x = i % 32 + 1;
+            if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
+        };
+        let view = (0..32 * 32).flat_map(|i| [level(i, true), level(i, true), level(i, true), 1.0]).collect();
+        let truth = (0..32 * 32).flat_map(|i| [level(i, false); 3]).collect();
+        Example { view: Picture::new(32, 32, 4, view), truth: Picture::new(32, 32, 3, truth) }
+    }
+
+    fn trained(steps: u64, threads: usize) -> RefinerTrainer {
+        nets::deterministic();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let options = RefinerTraining { steps, batch: 8, square: 16, rate: 5e-3, seed: 3 };
+        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1 }, 3).unwrap();
+        let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
+        let examples: Vec<Example> = (0..4).map(example).collect();
+        while pool.install(|| trainer.step(&examples)).unwrap().is_some() {}
+        trainer
+    }
+
+    #[test]
+    fn a_blur_is_unlearnt() {
+        let scores = trained(150, 2).score(&[example(5)]).unwrap();
+        assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
+        assert!(scores.strength > 0.8, "{scores:?}");
+    }
+}

@@ -1,0 +1,164 @@
+//! `nerf-sr run refined`: a network that rehearsed one size down gives views the detail they lack.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+use common::{Finished, Project, manifest, signal, stage, stage_command};
+
+const REFINED: &str = "
+  rehearsal-field:
+    like: train-ss
+    inputs: {scene: prep/rehearsal}
+    parameters: {rays: 40000}
+  rehearsal-views:
+    like: render-depth
+    inputs: {field: rehearsal-field, cameras: prep/train}
+  train-refine:
+    inputs: {views: rehearsal-views, truth: prep/train}
+    parameters: {steps: 60, batch: 4, square: 16, channels: 8, blocks: 1}
+  refine:
+    inputs: {views: render-depth, refiner: train-refine}
+  eval-refined:
+    like: eval
+    inputs: {views: refine, truth: prep/truth}
+  refined:
+    run: report
+    inputs: {run: eval, refined: eval-refined}
+";
+
+fn project() -> Project {
+    let project = Project::tiny();
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + REFINED));
+    project
+}
+
+#[test]
+fn refined_views_stand_beside_rendered_ones() {
+    let project = project();
+    let run = project.ok(&["run", "refined"]);
+    assert!(run.contains("out/refined/index.html"), "{run}");
+    let page = std::fs::read_to_string(project.path("out/refined/index.html")).unwrap();
+    assert!(page.contains("Views · eval-refined") && page.contains("Views · eval<"), "the page lacks one of both");
+    let rows: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
+    let stages: Vec<&str> = rows.as_array().unwrap().iter().map(|r| r["stage"].as_str().unwrap()).collect();
+    assert_eq!(stages, ["eval", "eval-refined"]);
+
+    // Colours change, opacity and depth don't.
+    let folder = |stage: &str| project.object(&project.output_of(stage, &["refined"])[0]);
+    let (rendered, refined) = (folder("render-depth"), folder("refine"));
+    for file in std::fs::read_dir(rendered.join("images")).unwrap() {
+        let name = file.unwrap().file_name();
+        let read = |folder: &Path| pixels::read_exr(&folder.join("images").join(&name)).unwrap();
+        let (before, after) = (read(&rendered), read(&refined));
+        assert_eq!(before.channel("Z"), after.channel("Z"));
+        assert_eq!(before.channel("A"), after.channel("A"));
+        let changed = before.channel("G").unwrap().iter().zip(after.channel("G").unwrap()).filter(|(a, b)| a != b).count();
+        assert!(changed > 100, "{changed} pixels changed");
+    }
+    // Nothing of what the network predicts is nothing at all, but for half precision.
+    let none = project.path("none");
+    let inputs = [("views", rendered.as_path()), ("refiner", &folder("train-refine"))];
+    assert_eq!(stage("refine", r#"{"strength": 0}"#, &inputs, &none, &[]).code, 0);
+    let file = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap().file_name();
+    let green = |folder: &Path| pixels::read_exr(&folder.join("images").join(&file)).unwrap().channel("G").unwrap().to_vec();
+    assert!(green(&none).iter().zip(green(&rendered)).all(|(a, b)| (a - b).abs() < 2e-3));
+    // The network is for views.
+    let views = rendered.as_path();
+    stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[]).fails(3, &["refiner.json"]);
+}
+
+/// What a block is like reaches it from the file and from the command line, save what it says itself.
+#[test]
+fn a_block_like_another_follows_it() {
+    let project = project();
+    let parameters = |stage: &str, name: &str, more: &[&str]| -> Vec<String> {
+        project.ok(&[&["run", "refined"], more].concat());
+        let run: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(project.path(".nerf-sr/sinks/refined/run/run.json")).unwrap()).unwrap();
+        let nodes = run["nodes"].as_array().unwrap().iter().filter(|n| n["stage"] == stage);
+        nodes.map(|n| n["parameters"][name].to_string()).collect()
+    };
+    assert_eq!(parameters("rehearsal-field", "levels", &[]), ["4"]);
+    let both = ["-p", "supersample=1,2", "-p", "rays=50000"];
+    assert_eq!(parameters("rehearsal-field", "supersample", &both), ["1", "2"]);
+    assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
+    assert_eq!(parameters("rehearsal-field", "rays", &both), ["40000", "40000"]);
+    assert_eq!(parameters("rehearsal-field", "rays", &["-p", "rehearsal-field.rays=30000"]), ["30000"]);
+    for (from, to, words) in [
+        ("like: train-ss", "like: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
+        ("like: render-depth", "like: rehearsal-field", &["itself like another"]),
+        ("like: eval", "like: eval\n    run: eval", &["give one of them"]),
+    ] {
+        project.replace(from, to);
+        project.run(&["plan", "refined"]).fails(2, words);
+        project.replace(to, from);
+    }
+}
+
+/// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
+fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'static str) {
+    project.ok(&["run", "rehearsal-views"]);
+    let folder = |stage: &str| project.object(&project.output_of(stage, &["rehearsal-views"])[0]);
+    (
+        folder("rehearsal-views"),
+        folder("prep").join("train"),
+        r#"{"steps": 600, "batch": 8, "square": 24, "channels": 32, "blocks": 2}"#,
+    )
+}
+
+#[test]
+fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() {
+    let project = project();
+    let (views, truth, params) = training(&project);
+    let inputs = [("views", views.as_path()), ("truth", truth.as_path())];
+    let (whole, output, work) = (project.path("whole"), project.path("killed"), project.path("work"));
+    assert_eq!(stage("train-refine", params, &inputs, &whole, &["--threads", "1"]).code, 0);
+    let more = ["--work", work.to_str().unwrap()];
+    let checkpoint = work.join("checkpoint.safetensors");
+    let mut resumed = 0;
+    for milliseconds in [100, 300, 700] {
+        let before = checkpoint.metadata().and_then(|m| m.modified()).ok();
+        let mut child = stage_command("train-refine", params, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        for _ in 0..2400 {
+            if checkpoint.metadata().and_then(|m| m.modified()).ok() != before || child.try_wait().unwrap().is_some() {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(25));
+        }
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        if child.try_wait().unwrap().is_some() {
+            break;
+        }
+        signal(&child, "-KILL");
+        child.wait().unwrap();
+        assert!(!output.exists(), "a killed stage leaves no output");
+        resumed += usize::from(checkpoint.exists());
+    }
+    assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
+    if !output.exists() {
+        // A checkpoint cut short is said and left out, not trusted.
+        let bytes = std::fs::read(&checkpoint).unwrap();
+        std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
+        let last = Finished::of(stage_command("train-refine", params, &inputs, &output, &more).output().unwrap());
+        assert_eq!(last.code, 0, "{}", last.stderr);
+    }
+    assert_eq!(manifest(&output), manifest(&whole));
+}
+
+#[test]
+fn wrong_views_are_refused_in_a_line() {
+    let project = project();
+    let (views, truth, _) = training(&project);
+    let train = |params: &str, views: &Path, truth: &Path| {
+        stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
+    };
+    train(r#"{"square": 15}"#, &views, &truth).fails(2, &["parameter square: 15 is odd"]);
+    train("{}", &views, &truth.with_file_name("rehearsal")).fails(3, &["24×24 pixels where its truth has 12×12"]);
+    train("{}", &views, &truth.with_file_name("truth")).fails(3, &["none of them has a picture, by name and pose, in input truth"]);
+}
