@@ -8,7 +8,7 @@ use std::f64::consts::TAU;
 use artifact::{Context, Failure, Input, Output, Stage};
 use glam::{DMat3, DQuat, DVec3};
 use pixels::{DEGRADATION_FILE, Degradation};
-use scene::{Bounds, Camera, Space, VIEWS_FILE, View, Views};
+use scene::{Bounds, Camera, Space, VIEWS_FILE, View, Views, common_direction};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -53,9 +53,6 @@ pub enum Kind {
     /// The parameter `poses`.
     List,
 }
-
-/// Cameras that turn at most so far from their mean direction look one way: cos 45°.
-const FORWARD: f64 = 0.707;
 
 /// The stage.
 pub struct CameraPath;
@@ -105,10 +102,9 @@ impl Stage for CameraPath {
 }
 
 fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
-    let forward = mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z);
     if !params.poses.is_empty() {
         Kind::List
-    } else if cameras.iter().all(|c| c.forward().dot(forward) >= FORWARD) {
+    } else if common_direction(cameras.iter()).is_some() {
         Kind::Spiral
     } else {
         Kind::Orbit

@@ -1,5 +1,5 @@
 use glam::{DMat3, DVec3};
-use scene::{Bounds, Camera, Frustum, Space};
+use scene::{Bounds, Camera, Frustum, Space, common_direction};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -28,8 +28,6 @@ pub enum SpaceError {
     NotForward,
 }
 
-/// Cameras that turn at most so far from their mean direction are forward-facing: cos 45°.
-const FORWARD: f64 = 0.707;
 /// What lies so many box halves from the box's middle needs more than a box.
 const BEYOND: f64 = 2.5;
 
@@ -61,12 +59,9 @@ pub fn place(training: &[Sight], others: &[Sight], kind: Option<SpaceKind>) -> R
 /// What all cameras see, from the middle of them: the frustum of NDC.
 fn frustum(sights: &[Sight]) -> Result<Frustum, SpaceError> {
     let mean = |f: &dyn Fn(&Camera) -> DVec3| sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64;
-    let forward = mean(&Camera::forward).try_normalize().ok_or(SpaceError::NotForward)?;
+    let forward = common_direction(sights.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
     let up = mean(&|c| c.rotation().y_axis);
     let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
-    if sights.iter().any(|(c, _)| c.forward().dot(forward) < FORWARD) {
-        return Err(SpaceError::NotForward);
-    }
     let (up, centre) = (right.cross(forward), mean(&Camera::centre));
     let row = |i: usize| [right[i], up[i], -forward[i], centre[i]];
     let mut frustum = Frustum {

@@ -100,6 +100,15 @@ pub enum CameraError {
     },
 }
 
+/// Cameras that turn at most so far from their mean direction look one way: cos 45°.
+const ONE_WAY: f64 = 0.707;
+
+/// The direction in which all cameras look, where they do: forward-facing photographs.
+pub fn common_direction<'a>(cameras: impl Iterator<Item = &'a Camera> + Clone) -> Option<DVec3> {
+    let mean = cameras.clone().map(Camera::forward).sum::<DVec3>().try_normalize()?;
+    cameras.map(Camera::forward).all(|forward| forward.dot(mean) >= ONE_WAY).then_some(mean)
+}
+
 impl Camera {
     /// The rotation R.
     pub fn rotation(&self) -> DMat3 {

@@ -27,7 +27,7 @@ mod space;
 mod views;
 mod warp;
 
-pub use camera::{Camera, CameraError, Intrinsics, Ray};
+pub use camera::{Camera, CameraError, Intrinsics, Ray, common_direction};
 pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, VIEWS_FILE, View, Views, ViewsError};
-pub use warp::Surface;
+pub use warp::{Sight, Surface};

@@ -11,28 +11,53 @@ pub struct Surface<'a> {
     pub opacity: &'a [f32],
 }
 
+/// How one view sees a point of a surface that another sees, too.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Sight {
+    /// Where in its picture, in pixels from the top left corner.
+    pub place: [f32; 2],
+    /// Cosine of the angle between both lines of sight.
+    pub cosine: f32,
+    /// Pixels that a length of the surface covers there for every pixel here, its slant left aside.
+    pub detail: f32,
+}
+
 /// Two depths of one surface differ by at most this share; more is another surface.
 const SAME: f64 = 0.02;
 
 impl Surface<'_> {
-    /// Where another view sees what this one sees at each pixel: the position in its picture, in pixels from the top left corner. `None`
-    /// where this view sees no surface, the other doesn't look, or something stands between.
+    /// Where another view sees what this one sees at each pixel, row by row: [`Surface::sight`]'s places.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel.
     pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
-        let at = |i: usize| {
-            let (column, row) = (i % k.width as usize, i / k.width as usize);
-            if self.opacity[i] < 0.5 {
-                return None;
+        let (width, height) = (k.width as usize, k.height as usize);
+        (0..width * height).map(|i| self.sight(i % width, i / width, other).map(|s| s.place)).collect()
+    }
+
+    /// How another view sees what this one sees at a pixel. `None` where this view sees no surface, the other doesn't look, or something
+    /// stands between.
+    ///
+    /// # Panics
+    /// Where a list hasn't one number a pixel, or the pixel lies outside.
+    pub fn sight(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Sight> {
+        let i = row * self.camera.intrinsics.width as usize + column;
+        if self.opacity[i] < 0.5 {
+            return None;
+        }
+        let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
+        let distance = f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray);
+        let point = ray.at(distance);
+        let (x, y, depth) = other.camera.project(point)?;
+        other.has_near(x, y, depth).then(|| {
+            let way = point - other.camera.centre();
+            Sight {
+                place: [x as f32, y as f32],
+                cosine: (ray.direction.dot(way) / way.length()) as f32,
+                detail: (other.camera.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
             }
-            let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
-            let point = ray.at(f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray));
-            let (x, y, depth) = other.camera.project(point)?;
-            other.has_near(x, y, depth).then_some([x as f32, y as f32])
-        };
-        (0..k.width as usize * k.height as usize).map(at).collect()
+        })
     }
 
     /// Whether there is a surface of that depth at one of the four pixels around a position. All four lie in the picture or at its border.
