@@ -38,11 +38,11 @@ pub(crate) fn warp(view: (&Camera, &ExrImage, &Picture), other: (&Camera, &ExrIm
     let (mut sum, mut seen) = (0.0, 0usize);
     let mut data = Vec::with_capacity(4 * places.len());
     for (place, truth) in places.iter().zip(view.2.data.chunks_exact(3)) {
-        let Some([x, y]) = place else {
+        let Some(place) = place else {
             data.extend(UNSEEN);
             continue;
         };
-        let colour = bilinear(other.2, *x, *y);
+        let colour = other.2.colour_at(*place);
         sum += colour.iter().zip(truth).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>();
         seen += 1;
         data.extend(colour.map(to_u8).into_iter().chain([255]));
@@ -54,21 +54,6 @@ pub(crate) fn warp(view: (&Camera, &ExrImage, &Picture), other: (&Camera, &ExrIm
 
 fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
     Some(Surface { camera, depth: image.channel("Z")?, opacity: image.channel("A")? })
-}
-
-/// The picture at a position in pixels from the top left corner; its border goes on outside.
-fn bilinear(picture: &Picture, x: f32, y: f32) -> [f32; 3] {
-    let along = |v: f32, size: usize| {
-        let v = (v - 0.5).clamp(0.0, (size - 1) as f32);
-        let low = (v as usize).min(size.saturating_sub(2));
-        (low, (low + 1).min(size - 1), v - low as f32)
-    };
-    let ((x0, x1, fx), (y0, y1, fy)) = (along(x, picture.width), along(y, picture.height));
-    let at = |x: usize, y: usize, c: usize| picture.data[(y * picture.width + x) * 3 + c];
-    std::array::from_fn(|c| {
-        let row = |y: usize| at(x0, y, c) * (1.0 - fx) + at(x1, y, c) * fx;
-        row(y0) * (1.0 - fy) + row(y1) * fy
-    })
 }
 
 #[cfg(test)]

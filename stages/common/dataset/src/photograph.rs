@@ -4,7 +4,7 @@ use std::path::Path;
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
-use pixels::{PixelError, Rgba8, read_exr, srgb_from_linear, to_u8};
+use pixels::{PixelError, Rgba8, read_exr, sample_cubic, srgb_from_linear, to_u8};
 use scene::Intrinsics;
 
 use crate::{DatasetError, Frame, Lens};
@@ -143,37 +143,20 @@ impl Frame {
     }
 }
 
-/// The picture that a pinhole camera would have taken, by cubic interpolation (Catmull and Rom 1974).
+/// The picture that a pinhole camera would have taken, by cubic interpolation.
 fn undistorted(image: &Rgba8, lens: &Lens, pinhole: &Intrinsics) -> Rgba8 {
     let mut data = Vec::with_capacity(image.data.len());
     for y in 0..image.height {
         for x in 0..image.width {
             let at = lens.source(pinhole, x as f64 + 0.5, y as f64 + 0.5);
-            data.extend(cubic(image, at[0] - 0.5, at[1] - 0.5));
+            let pixel = |column: usize, row: usize| {
+                let at = 4 * (row * image.width + column);
+                [0, 1, 2, 3].map(|c| f64::from(image.data[at + c]))
+            };
+            data.extend(sample_cubic((image.width, image.height), at, pixel).map(|v| (v + 0.5) as u8));
         }
     }
     Rgba8::new(image.width, image.height, data)
-}
-
-/// Weights of the four samples around a place between the second and the third.
-fn catmull_rom(t: f64) -> [f64; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
-}
-
-fn cubic(image: &Rgba8, x: f64, y: f64) -> [u8; 4] {
-    let (left, top) = (x.floor(), y.floor());
-    let (across, down) = (catmull_rom(x - left), catmull_rom(y - top));
-    let place = |first: f64, k: usize, end: usize| ((first + k as f64 - 1.0).max(0.0) as usize).min(end - 1);
-    let mut sum = [0.0; 4];
-    for (j, wy) in down.iter().enumerate() {
-        let row = place(top, j, image.height) * image.width;
-        for (i, wx) in across.iter().enumerate() {
-            let pixel = &image.data[4 * (row + place(left, i, image.width))..][..4];
-            (0..4).for_each(|c| sum[c] += wx * wy * f64::from(pixel[c]));
-        }
-    }
-    sum.map(|v| (v + 0.5) as u8)
 }
 
 #[cfg(test)]

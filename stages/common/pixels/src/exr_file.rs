@@ -9,7 +9,7 @@ use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, Line
 use exr::meta::header::Header;
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
-use crate::{MAX_PIXELS, PixelError};
+use crate::{MAX_PIXELS, Picture, PixelError};
 
 /// Precision of an EXR channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +44,13 @@ impl ExrImage {
     /// The samples of a channel.
     pub fn channel(&self, name: &str) -> Option<&[f32]> {
         self.channels.iter().find(|(n, _)| n == name).map(|(_, samples)| samples.as_slice())
+    }
+
+    /// Channels R, G, B and A together, where it has them.
+    pub fn premultiplied(&self) -> Option<Picture> {
+        let [Some(r), Some(g), Some(b), Some(a)] = ["R", "G", "B", "A"].map(|name| self.channel(name)) else { return None };
+        let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
+        Some(Picture::new(self.width, self.height, 4, data))
     }
 }
 

@@ -5,6 +5,7 @@
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
+//! * [`sample_cubic`], [`Picture::colour_at`]: a picture between its pixels.
 //! * [`psnr_of`]: a mean squared error in dB.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
 //!
@@ -16,6 +17,7 @@
 //! assert_eq!(resize_pillow(&image, 2, 2, Filter::Lanczos).data[0], 200);
 //! ```
 
+mod cubic;
 mod degradation;
 mod exr_file;
 mod heat;
@@ -27,6 +29,7 @@ mod png_file;
 mod pool;
 mod srgb;
 
+pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
 pub use heat::{Palette, depth_range, draw_depth, heat};

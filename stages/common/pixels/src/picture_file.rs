@@ -8,11 +8,8 @@ pub fn read_premultiplied(path: &Path) -> Result<Picture, PixelError> {
     if path.extension().is_none_or(|e| e != "exr") {
         return Ok(Picture::premultiplied(&read_png(path)?));
     }
-    let image = read_exr(path)?;
-    let [Some(r), Some(g), Some(b), Some(a)] = ["R", "G", "B", "A"].map(|name| image.channel(name)) else {
+    read_exr(path)?.premultiplied().ok_or_else(|| {
         let reason = "channels R, G, B and A are expected".to_owned();
-        return Err(PixelError::Format { path: path.to_path_buf(), reason });
-    };
-    let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-    Ok(Picture::new(image.width, image.height, 4, data))
+        PixelError::Format { path: path.to_path_buf(), reason }
+    })
 }
