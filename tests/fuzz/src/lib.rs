@@ -54,28 +54,13 @@ impl Default for Folder {
     }
 }
 
-/// A COLMAP model's three files, binary, of two views.
-pub fn colmap_model() -> [(&'static str, Vec<u8>); 3] {
-    let mut cameras = 1u64.to_le_bytes().to_vec();
-    cameras.extend([1u32, 1].map(u32::to_le_bytes).concat());
-    cameras.extend([4u64, 3].map(u64::to_le_bytes).concat());
-    cameras.extend([5.0f64, 5.0, 2.0, 1.5].map(f64::to_le_bytes).concat());
-    let mut images = 2u64.to_le_bytes().to_vec();
-    for (id, name) in [(1u32, b"a.png\0"), (2, b"b.png\0")] {
-        images.extend(id.to_le_bytes());
-        images.extend([1.0f64, 0.0, 0.0, 0.0, 0.1, 0.2, f64::from(id)].map(f64::to_le_bytes).concat());
-        images.extend(1u32.to_le_bytes());
-        images.extend(name);
-        images.extend(1u64.to_le_bytes());
-        images.extend([1.0f64, 1.0].map(f64::to_le_bytes).concat());
-        images.extend(1u64.to_le_bytes());
+/// A COLMAP model's three files, binary, of two views: the seeds that `seeds.py` writes, less their first byte, which says which file they
+/// are.
+pub fn colmap_model() -> [(&'static str, &'static [u8]); 3] {
+    macro_rules! seed {
+        ($which:literal) => {
+            include_bytes!(concat!(env!("FUZZ_SEEDS"), "/colmap/binary-", $which)).split_at(1).1
+        };
     }
-    let mut points = 1u64.to_le_bytes().to_vec();
-    points.extend(1u64.to_le_bytes());
-    points.extend([0.0f64, 0.0, 5.0].map(f64::to_le_bytes).concat());
-    points.extend([9u8, 9, 9]);
-    points.extend(0.5f64.to_le_bytes());
-    points.extend(1u64.to_le_bytes());
-    points.extend([1u32, 0].map(u32::to_le_bytes).concat());
-    [("cameras.bin", cameras), ("images.bin", images), ("points3D.bin", points)]
+    [("cameras.bin", seed!("0")), ("images.bin", seed!("1")), ("points3D.bin", seed!("2"))]
 }
