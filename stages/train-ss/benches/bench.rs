@@ -179,7 +179,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let pictures = train_ss::read_pictures(&input, &views)?;
         let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
-        let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width));
+        let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width), &views.bounds.space);
         let training = params.grid_training(params.rays(0));
         let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);

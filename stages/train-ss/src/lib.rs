@@ -95,7 +95,7 @@ impl Stage for TrainSs {
         let input = context.input("scene")?;
         let views = Views::read(input)?;
         let model = match params.field {
-            FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views))),
+            FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
         let all = params.rays(epoch(&views, params));

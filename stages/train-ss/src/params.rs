@@ -1,4 +1,5 @@
 use radiance::{Architecture, MlpArchitecture, TrainingOptions};
+use scene::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -90,9 +91,10 @@ pub struct Params {
     /// Width of the networks' hidden layers. Without it: 64 for `grid`, 256 for `mlp`.
     #[schemars(range(min = 2, max = 1024))]
     pub hidden: Option<u32>,
-    /// `grid`: samples along the diagonal of the scene's cube.
+    /// `grid`: samples along the diagonal of the scene's cube. Without it: 512, and 256 in NDC, where every ray crosses the whole cube and
+    /// meets as many surfaces with half of them.
     #[schemars(range(min = 16, max = 8192))]
-    pub steps: u32,
+    pub steps: Option<u32>,
     /// `mlp`: octaves of the positions' encoding.
     #[schemars(range(min = 0, max = 16))]
     pub position_octaves: u32,
@@ -148,7 +150,7 @@ impl Default for Params {
             finest: None,
             log2_entries: None,
             hidden: None,
-            steps: grid.steps,
+            steps: None,
             position_octaves: mlp.position_octaves,
             direction_octaves: mlp.direction_octaves,
             layers: mlp.depth,
@@ -270,8 +272,8 @@ impl Params {
         self.or(self.rays, 30_000_000, EPOCHS * epoch)
     }
 
-    /// What grid they ask for, with so many LR pixels across its cube.
-    pub fn grid(&self, pixels: f64) -> Architecture {
+    /// What grid they ask for in a space, with so many LR pixels across its cube.
+    pub fn grid(&self, pixels: f64, space: &Space) -> Architecture {
         let by_width = (2.56 * pixels).round().clamp(64.0, 2048.0) as u32;
         let finest = self.finest.unwrap_or(by_width.max(self.coarsest));
         let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
@@ -281,7 +283,7 @@ impl Params {
             finest,
             log2_entries: self.log2_entries.unwrap_or(by_finest),
             hidden: self.or(self.hidden, Architecture::default().hidden, 256),
-            steps: self.steps,
+            steps: self.steps.unwrap_or(if matches!(space, Space::Ndc(_)) { 256 } else { 512 }),
         }
     }
 
