@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build setup test lint lego sweep quality refine-table ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -52,7 +52,7 @@ FUZZ_TARGETS ?= colmap llff transforms picture field
 FUZZ_SECONDS ?= 60
 fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
-	@cd tests/fuzz && CARGO_TARGET_DIR=$(CURDIR)/target/fuzz RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
+	@cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
 	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target; \
 	  target/fuzz/$(FUZZ_HOST)/release/$$target -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=2048 -max_len=4096 \
 	    -artifact_prefix=out/fuzz/$$target- out/fuzz/corpus/$$target out/fuzz/seeds/$$target 2>&1 | tee out/fuzz/$$target.log | tail -3; \
@@ -76,6 +76,11 @@ SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --out $(or $(OUT),out/quality.json)
+
+REFERENCES ?= 1
+refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
+	@python3 scripts/refine-table.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --references $(REFERENCES) \
+	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/ablation.json)

@@ -60,8 +60,10 @@ def figures(row: dict) -> dict:
         "psnr": row["mean"]["psnr"],
         "ssim": row["mean"]["ssim"],
         "lpips": row["mean"].get("lpips"),
-        "train_s": seconds("train-ss", "rehearsal-field", "rehearsal-views", "train-refine"),
-        "render_s": seconds("render-depth", "refine"),
+        "train_s": seconds("train-ss", "rehearsal-field", "rehearsal-views", "train-refine", "train-referenced"),
+        "render_s": seconds("render-depth", "refine", "refine-referenced"),
+        "refine_s": seconds("refine", "refine-referenced"),
+        "views": row["views"],
         "rays_per_s": log["rays"] / train["seconds"],
         "samples_per_ray": log["samples_per_ray"],
     }

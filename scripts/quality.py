@@ -11,19 +11,12 @@ import itertools
 import pathlib
 
 import cells
-
-# Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
-BUDGET = {"100x2": (32_000_000, 1), "100x4": (64_000_000, 4), "200x2": (80_000_000, 1), "200x4": (70_000_000, 1)}
-OTHER_BUDGET = (60_000_000, 1)
-# `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
-AVERAGE_RAYS = 13 / 12
-# The field that a refiner rehearses with gets as many rays for an LR pixel, and no fewer than these.
-REHEARSAL_RAYS = 4_000_000
+import protocols
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_synthetic/SCENE (or SCENE) and weights")
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
-parser.add_argument("--protocols", nargs="+", default=list(BUDGET), help="LR width x scale")
+parser.add_argument("--protocols", nargs="+", default=["100x2", "100x4", "200x2", "200x4"], help="LR width x scale")
 parser.add_argument("--supervision", nargs="+", default=["average", "kernel"])
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/quality.json"))
 parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
@@ -34,19 +27,11 @@ options = parser.parse_args()
 
 
 def cell(scene: str, protocol: str, supervision: str) -> list[dict]:
-    lr, scale = protocol.split("x")
     page = options.out.parent / "quality" / "-".join([scene, protocol, supervision] + [options.split] * bool(options.split))
-    rays, members = BUDGET.get(protocol, OTHER_BUDGET)
-    rays = round(rays * AVERAGE_RAYS) if supervision == "average" else rays
-    # Far above the trained resolution the field is smooth within a pixel, and one ray shows it all.
-    sub_rays = 2 if float(scale) < 3 else 1
-    settings = {"lr": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "members": members}
-    settings["sub_rays"] = sub_rays
-    if options.refined:
-        settings["rehearsal-field.rays"] = max(REHEARSAL_RAYS, round(rays / float(scale) ** 2))
-    settings |= {"split": options.split} if options.split else {}
-    settings |= dict(setting.split("=", 1) for setting in options.set)
-    settings = [f"{name}={value}" for name, value in settings.items()]
+    chosen = protocols.settings(protocol, supervision, options.refined)
+    chosen |= {"split": options.split} if options.split else {}
+    chosen |= dict(setting.split("=", 1) for setting in options.set)
+    settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
     run = cells.run_refined if options.refined else lambda *how: [cells.run(*how)]
     results = run(options.nerf_sr, page, folder, settings, options.data / "weights")

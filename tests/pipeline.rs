@@ -3,7 +3,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use common::Project;
+use common::{Finished, Project};
 
 #[test]
 fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
@@ -140,7 +140,7 @@ fn two_runners_at_once_make_everything_once() {
     let project = Project::tiny();
     let spawn =
         || project.command(&["run"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
-    let runners = [spawn(), spawn()].map(|child| common::Finished::of(child.wait_with_output().unwrap()));
+    let runners = [spawn(), spawn()].map(|child| Finished::of(child.wait_with_output().unwrap()));
     let mut ran = 0;
     for runner in &runners {
         assert_eq!(runner.code, 0, "{}", runner.stderr);
@@ -213,28 +213,12 @@ fn tables_are_made_of_cells() {
     project.replace("default: [eval]", "default: [report]");
     let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
     project.write("pipeline.yaml", &(text + "  report:\n    inputs: {run: eval}\n"));
-    project.ok(&["run", "demo-scene"]);
-    let dataset = project.object(&project.output_of("demo-scene", &[])[0]);
-    std::fs::create_dir_all(project.path("data")).unwrap();
-    std::os::unix::fs::symlink(&dataset, project.path("data/demo")).unwrap();
-    let scripts = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts");
-    let call = |script: &str, arguments: &[&str]| {
-        let runner = common::bin("nerf-sr");
-        let output = std::process::Command::new("python3")
-            .arg(scripts.join(script))
-            .args(arguments)
-            .args(["--data", "data", "--nerf-sr", runner.to_str().unwrap()])
-            .current_dir(project.path("."))
-            .output()
-            .unwrap();
-        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
-        (output.status.code(), text(&output.stdout), text(&output.stderr))
-    };
+    project.demo_data();
     let rows =
         |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
     let quality = ["--scenes", "demo", "--protocols", "24x2", "12x4", "--out", "out/quality.json", "--set", "rays=60000"];
-    let (code, stdout, stderr) = call("quality.py", &quality);
-    assert_eq!(code, Some(0), "{stderr}");
+    let Finished { code, stdout, stderr } = project.script("quality.py", &quality);
+    assert_eq!(code, 0, "{stderr}");
     assert!(stdout.contains("| 12x4 | demo | kernel |"), "{stdout}");
     let made = rows("out/quality.json");
     assert_eq!(made.len(), 4);
@@ -244,19 +228,19 @@ fn tables_are_made_of_cells() {
         }
         assert!(["scene", "protocol", "supervision"].iter().all(|name| row[name].is_string()), "{row}");
     }
-    let (_, again, _) = call("quality.py", &quality);
+    let again = project.script("quality.py", &quality).stdout;
     assert!(!again.contains("running") && again.contains("| 24x2 | demo | average |"), "{again}");
     assert_eq!(rows("out/quality.json"), made);
 
     let tradeoff = ["tradeoff", "--scenes", "demo", "--protocol", "24x2", "--variants", "2", "--out", "out/tradeoff.json"];
-    let (code, stdout, stderr) = call("ablation.py", &tradeoff);
-    assert_eq!(code, Some(0), "{stderr}");
+    let Finished { code, stdout, stderr } = project.script("ablation.py", &tradeoff);
+    assert_eq!(code, 0, "{stderr}");
     assert!(stdout.contains("| 1.5 M rays |"), "{stdout}");
     assert_eq!(rows("out/tradeoff.json").len(), 2);
     assert!(std::fs::read_to_string(project.path("out/tradeoff.svg")).unwrap().ends_with("</svg>\n"));
 
-    let (code, _, stderr) = call("quality.py", &["--scenes", "nowhere"]);
-    assert_eq!((code, stderr.trim()), (Some(1), "no scene nowhere in data: set DATA=DIR to a folder that has it"));
+    let missing = project.script("quality.py", &["--scenes", "nowhere"]);
+    assert_eq!((missing.code, missing.stderr.trim()), (1, "no scene nowhere in data: set DATA=DIR to a folder that has it"));
 }
 
 /// A field renders at any size, and pictures need not be square.

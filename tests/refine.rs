@@ -28,6 +28,22 @@ const REFINED: &str = "
   refined:
     run: report
     inputs: {run: eval, refined: eval-refined}
+  reference-views:
+    like: render-depth
+    inputs: {field: train-ss, cameras: prep/references}
+  train-referenced:
+    like: train-refine
+    inputs: {views: rehearsal-views, truth: prep/train}
+    parameters: {references: 2}
+  refine-referenced:
+    like: refine
+    inputs: {views: render-depth, refiner: train-referenced, references: prep/references, reference-views: reference-views}
+  eval-referenced:
+    like: eval
+    inputs: {views: refine-referenced, truth: prep/truth}
+  referenced:
+    run: report
+    inputs: {run: eval, refined: eval-refined, referenced: eval-referenced}
 ";
 
 fn project() -> Project {
@@ -101,6 +117,70 @@ fn a_block_like_another_follows_it() {
     }
 }
 
+#[test]
+fn references_are_used_by_a_network_that_knows_how() {
+    let project = project();
+    project.ok(&["run", "refine-referenced", "-p", "prep.references=2"]);
+    let folder = |stage: &str| project.object(&project.output_of(stage, &["refine-referenced", "-p", "prep.references=2"])[0]);
+    let (views, refiner) = (folder("render-depth"), folder("train-referenced"));
+    let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
+    let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
+        let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
+        let output = project.path(name);
+        let mut command = std::process::Command::new(common::bin("refine"));
+        command.arg("--output").arg(&output);
+        for (name, folder) in inputs {
+            command.arg("--input").arg(format!("{name}={}", folder.display()));
+        }
+        (Finished::of(command.output().unwrap()), output)
+    };
+    let references = prep.join("references");
+    let green = |folder: &Path| pixels::read_exr(&folder.join("images/r_0.exr")).unwrap().channel("G").unwrap().to_vec();
+    // Without references it still refines, otherwise, and says so.
+    let (alone, output) = refine("alone", &refiner, &[]);
+    assert!(alone.code == 0 && alone.stderr.contains("there are none"), "{}", alone.stderr);
+    assert_ne!(green(&output), green(&referenced));
+    // Pictures without their rendered views can't be placed.
+    let both = [("references", references.as_path()), ("reference-views", views.as_path())];
+    refine("no", &refiner, &both).0.fails(3, &["input reference-views: no view r_0 with that pose"]);
+    // A network that can't use them says so.
+    project.ok(&["run", "train-refine"]);
+    let plain = project.object(&project.output_of("train-refine", &["train-refine"])[0]);
+    let both = [("references", references.as_path()), ("reference-views", reference_views.as_path())];
+    let (left_out, _) = refine("plain", &plain, &both);
+    assert!(left_out.code == 0 && left_out.stderr.contains("trained without references"), "{}", left_out.stderr);
+}
+
+/// `make refine-table` and `make quality REFINED=1`: rows for what is rendered and what is refined, on the same views.
+#[test]
+fn tables_have_rendered_and_refined_rows() {
+    let project = project();
+    project.demo_data();
+    let table = ["--scenes", "demo", "--protocols", "24x2", "--references", "1", "2", "--out", "out/table.json"];
+    let more = ["--set", "rays=60000", "rehearsal-field.rays=30000"];
+    let made = project.script("refine-table.py", &[&table[..], &more].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert!(made.stdout.contains("| 24x2 | demo | refine | 2 |"), "{}", made.stdout);
+    let read =
+        |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
+    let rows: Vec<(String, u64)> = read("out/table.json")
+        .iter()
+        .map(|r| {
+            assert!(["psnr", "ssim", "seconds_per_view"].iter().all(|k| r[k].as_f64().is_some_and(|v| v > 0.0)), "{r}");
+            (r["method"].as_str().unwrap().to_owned(), r["references"].as_u64().unwrap())
+        })
+        .collect();
+    assert_eq!(rows, [("ss".into(), 0), ("refine".into(), 0), ("refine".into(), 1), ("refine".into(), 2)]);
+
+    let quality =
+        ["--scenes", "demo", "--protocols", "24x2", "--supervision", "kernel", "--refined", "--out", "out/quality.json"];
+    let made = project.script("quality.py", &[&quality[..], &more].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert!(made.stdout.contains("| 24x2 | demo | kernel, refined |"), "{}", made.stdout);
+    let refined: Vec<bool> = read("out/quality.json").iter().map(|r| r["refined"].as_bool().unwrap()).collect();
+    assert_eq!(refined, [false, true]);
+}
+
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
 fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'static str) {
     project.ok(&["run", "rehearsal-views"]);
@@ -159,6 +239,7 @@ fn wrong_views_are_refused_in_a_line() {
         stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
     };
     train(r#"{"square": 15}"#, &views, &truth).fails(2, &["parameter square: 15 is odd"]);
-    train("{}", &views, &truth.with_file_name("rehearsal")).fails(3, &["24×24 pixels where its truth has 12×12"]);
-    train("{}", &views, &truth.with_file_name("truth")).fails(3, &["none of them has a picture, by name and pose, in input truth"]);
+    train("{}", &views, &truth.with_file_name("rehearsal")).fails(3, &["24×24 pixels where its picture has 12×12"]);
+    train("{}", &views, &truth.with_file_name("truth"))
+        .fails(3, &["none of them has a picture, by name and pose, in input truth"]);
 }

@@ -101,6 +101,22 @@ impl Project {
         found.unwrap_or_else(|| panic!("no object {start}"))
     }
 
+    /// The pipeline's own demo scene as `data/demo`, for scripts that are told a data folder.
+    pub fn demo_data(&self) {
+        self.ok(&["run", "demo-scene"]);
+        let dataset = self.object(&self.output_of("demo-scene", &[])[0]);
+        std::fs::create_dir_all(self.path("data")).unwrap();
+        std::os::unix::fs::symlink(&dataset, self.path("data/demo")).unwrap();
+    }
+
+    /// Calls one of the measuring scripts on `data`.
+    pub fn script(&self, script: &str, arguments: &[&str]) -> Finished {
+        let mut command = Command::new("python3");
+        command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(script)).args(arguments);
+        command.args(["--data", "data", "--nerf-sr", bin("nerf-sr").to_str().unwrap()]).current_dir(self.path("."));
+        Finished::of(command.output().unwrap())
+    }
+
     /// Every object and record of the store, sorted.
     pub fn store_listing(&self) -> Vec<String> {
         let mut names: Vec<String> = ["objects", "actions"]

@@ -1,13 +1,25 @@
 //! `refine`: gives rendered views the detail they systematically lack, by a network that `train-refine` trained.
 //!
+//! A network that was trained with references takes them from the inputs `references` (true pictures at HR) and `reference-views` (the
+//! same views as rendered, for what the field sees where).
+//!
+//! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
+//! as it takes to agree with that.
+//!
 //! Colours change; opacity, depth and cameras stay what the field made them.
 
+mod agreement;
+
+use std::path::Path;
+
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Channel, ExrImage, Picture, PixelError, Rgba8, SampleType, read_exr, to_u8, write_exr, write_png};
-use refinement::{REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE, view_over};
-use scene::{VIEWS_FILE, View, Views};
+use pixels::{Channel, ExrImage, Picture, PixelError, SampleType, read_exr, read_premultiplied, write_exr, write_png};
+use refinement::{KnownView, REFINER_FILE, Refiner, RefinerFile, Rendered, WEIGHTS_FILE, guided};
+use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+
+use agreement::Photographs;
 
 /// Parameters of `refine`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -16,6 +28,8 @@ pub struct Params {
     /// Share of what the network predicts that is added. Without it: what was best for the views that its training left out.
     #[schemars(range(min = 0.0, max = 2.0))]
     pub strength: Option<f64>,
+    /// At most so many of the references given, the first. Without it: all.
+    pub references: Option<u32>,
 }
 
 /// The stage.
@@ -30,6 +44,12 @@ impl Stage for Refine {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("refiner", Input::required(&["refiner"], "a trained refiner")),
+            ("references", Input::optional(&["scene/references", "scene/truth"], "true pictures of some other views, at HR")),
+            ("reference-views", Input::optional(&["views"], "those views as rendered")),
+            (
+                "photographs",
+                Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made to agree with its own"),
+            ),
         ]
     }
 
@@ -45,22 +65,64 @@ impl Stage for Refine {
         let strength = params.strength.unwrap_or(file.strength) as f32;
         let input = context.input("views")?;
         let mut views = Views::read(input)?;
-        let background = views.background.shown();
+        let mut references = references(context, &file, views.background)?;
+        references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
+        let photographs = context.optional_input("photographs").map(Photographs::read).transpose()?;
+        let job = Job { context, input, background: views.background.shown(), network, strength, references, photographs };
+        let mut agreed = 0;
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
             context.check_interrupt()?;
-            refine(
-                context,
-                input,
-                view,
-                |picture| Ok(network.refine_by(&view_over(picture, background), strength)?),
-                background,
-            )?;
+            agreed += usize::from(job.refine(view)?);
             progress.add(1);
         }
         context.write_json(VIEWS_FILE, &views)?;
-        context.write_summary(&format!("{} views, with {strength:.2} of what the network adds", views.views.len()))
+        let by = match job.references.len() {
+            0 => String::new(),
+            count => format!(" by {count} references"),
+        };
+        let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
+        context.write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{own}", views.views.len()))
     }
+}
+
+/// The references that a guided network asks for; what another is given is said and left out.
+fn references(context: &Context, file: &RefinerFile, background: Background) -> anyhow::Result<Vec<KnownView>> {
+    let given = context.optional_input("references").zip(context.optional_input("reference-views"));
+    let Some((pictures, rendered)) = given else {
+        if file.architecture.guided {
+            context
+                .say("the network knows how to use references, but there are none: give inputs references and reference-views");
+        }
+        return Ok(Vec::new());
+    };
+    if !file.architecture.guided {
+        context
+            .say("the network was trained without references: those given are left out; set train-refine's parameter references");
+        return Ok(Vec::new());
+    }
+    let (pictures_list, rendered_list) = (Views::read(pictures)?, Views::read(rendered)?);
+    let shown = background.shown();
+    let known = pictures_list.views.iter().filter_map(|picture| Some((picture, picture.image.as_ref()?)));
+    known
+        .map(|(picture, file)| {
+            let name = &picture.camera.name;
+            let same = |v: &&View| v.camera.name == *name && v.camera.camera_to_world == picture.camera.camera_to_world;
+            let view = rendered_list.views.iter().find(same).ok_or_else(|| {
+                Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
+            })?;
+            let truth = read_premultiplied(&pictures.path(file)).bad_input(format!("reference {name}"))?.over(shown);
+            KnownView::new(read(rendered, view, shown)?.0, truth).bad_input("input reference-views")
+        })
+        .collect()
+}
+
+/// A rendered view, and its file's channels.
+fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Rendered, ExrImage)> {
+    let name = &view.camera.name;
+    let file = view.image.as_ref().ok_or_else(|| Failure::BadInput(format!("view {name}: it has no picture")))?;
+    let image = read_exr(&input.path(file)).bad_input(format!("view {name}"))?;
+    Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
 }
 
 /// Channels of a view, and their precision: those that `render-depth` writes.
@@ -73,62 +135,65 @@ const CHANNELS: [(&str, SampleType); 6] = [
     ("distance", SampleType::Float),
 ];
 
-/// Refines one view: its files are written, and named in it.
-fn refine(
-    context: &Context,
-    input: &GivenInput,
-    view: &mut View,
-    network: impl Fn(&Picture) -> anyhow::Result<Picture>,
+/// What all views share.
+struct Job<'a> {
+    context: &'a Context,
+    input: &'a GivenInput,
     background: f32,
-) -> anyhow::Result<()> {
-    let name = view.camera.name.clone();
-    let place = || format!("view {name}");
-    let file = view.image.as_ref().ok_or_else(|| Failure::BadInput(format!("input views: view {name} has no picture")))?;
-    let image = read_exr(&input.path(file)).bad_input(place())?;
-    let [Some(r), Some(g), Some(b), Some(a)] = ["R", "G", "B", "A"].map(|c| image.channel(c)) else {
-        return Err(Failure::BadInput(format!("input views: view {name}: channels R, G, B and A are expected")).into());
-    };
-    let premultiplied = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-    let refined = network(&Picture::new(image.width, image.height, 4, premultiplied))?;
-    let path = format!("images/{name}.exr");
-    write_view(&context.output_path(&path)?, &image, &refined, a, background)?;
-    let preview = refined.data.chunks_exact(3).flat_map(|p| [to_u8(p[0]), to_u8(p[1]), to_u8(p[2]), 255]).collect();
-    let preview = Rgba8::new(image.width, image.height, preview);
-    write_png(&context.output_path(&format!("previews/{name}.png"))?, &preview)?;
-    view.image = Some(path.clone());
-    view.depth = view.depth.as_ref().map(|_| path);
-    Ok(())
+    network: Refiner,
+    strength: f32,
+    references: Vec<KnownView>,
+    photographs: Option<Photographs<'a>>,
 }
 
-/// A view's file with other colours.
-fn write_view(
-    path: &std::path::Path,
-    image: &ExrImage,
-    refined: &Picture,
-    opacity: &[f32],
-    background: f32,
-) -> anyhow::Result<()> {
-    let kept: Vec<(Channel, Option<&[f32]>)> = CHANNELS
-        .into_iter()
-        .enumerate()
-        .filter_map(|(i, (name, sample_type))| {
-            let samples = image.channel(name);
-            samples.map(|s| (Channel { name, sample_type }, (i >= 3).then_some(s)))
-        })
-        .collect();
-    let channels: Vec<Channel> = kept.iter().map(|(c, _)| *c).collect();
-    let note = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
-    let written = write_exr(path, (image.width, image.height), &channels, note, |first, rows, samples| {
-        let pixels = first * image.width..(first + rows) * image.width;
-        for (i, sample) in pixels.zip(samples.chunks_exact_mut(kept.len())) {
-            for (c, (value, (_, same))) in sample.iter_mut().zip(&kept).enumerate() {
-                *value = same.map_or_else(|| refined.data[i * 3 + c] - (1.0 - opacity[i]) * background, |s| s[i]);
-            }
+impl Job<'_> {
+    /// Refines one view: its files are written, and named in it. Whether it was made to agree with its own photograph.
+    fn refine(&self, view: &mut View) -> anyhow::Result<bool> {
+        let name = view.camera.name.clone();
+        let (rendered, image) = read(self.input, view, self.background)?;
+        let mut refined = if self.network.architecture().guided {
+            let references: Vec<&KnownView> = self.references.iter().collect();
+            self.network.refine_by(&guided(&rendered, &references), self.strength)?
+        } else {
+            self.network.refine_by(&rendered.view, self.strength)?
+        };
+        let own = self.photographs.as_ref().map(|p| Ok::<_, anyhow::Error>(p.of(&view.camera)?.map(|picture| (p, picture))));
+        let own = own.transpose()?.flatten();
+        if let Some((photographs, picture)) = &own {
+            refined = photographs.agree(&refined, picture);
         }
-        Ok::<(), PixelError>(())
-    });
-    written.map_err(|error| match error {
-        PixelError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
-        error => error.into(),
-    })
+        let path = format!("images/{name}.exr");
+        self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
+        write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;
+        view.image = Some(path.clone());
+        view.depth = view.depth.as_ref().map(|_| path);
+        Ok(own.is_some())
+    }
+
+    /// A view's file with other colours.
+    fn write(&self, path: &Path, image: &ExrImage, refined: &Picture, opacity: &[f32]) -> anyhow::Result<()> {
+        let kept: Vec<(Channel, Option<&[f32]>)> = CHANNELS
+            .into_iter()
+            .enumerate()
+            .filter_map(|(i, (name, sample_type))| {
+                let samples = image.channel(name);
+                samples.map(|s| (Channel { name, sample_type }, (i >= 3).then_some(s)))
+            })
+            .collect();
+        let channels: Vec<Channel> = kept.iter().map(|(c, _)| *c).collect();
+        let note = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
+        let written = write_exr(path, (image.width, image.height), &channels, note, |first, rows, samples| {
+            let pixels = first * image.width..(first + rows) * image.width;
+            for (i, sample) in pixels.zip(samples.chunks_exact_mut(kept.len())) {
+                for (c, (value, (_, same))) in sample.iter_mut().zip(&kept).enumerate() {
+                    *value = same.map_or_else(|| refined.data[i * 3 + c] - (1.0 - opacity[i]) * self.background, |s| s[i]);
+                }
+            }
+            Ok::<(), PixelError>(())
+        });
+        written.map_err(|error| match error {
+            PixelError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
+            error => error.into(),
+        })
+    }
 }

@@ -43,7 +43,8 @@ impl Stage for Report {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
             ("run", Input::required(&["run"], "folder with run.json, the record of a run")),
-            ("refined", Input::optional(&["run"], "in pipeline.yaml: further scores to show beside those of `run`")),
+            ("refined", Input::optional(&["run"], "in pipeline.yaml: scores to show beside those of `run`")),
+            ("referenced", Input::optional(&["run"], "in pipeline.yaml: further scores to show beside those")),
         ]
     }
 

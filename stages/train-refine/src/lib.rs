@@ -3,6 +3,9 @@
 //! In the pipeline those are of a rehearsal: a field trained from LR pictures that were shrunk once more, rendered at LR size, beside
 //! the LR pictures themselves. So it sees LR pictures alone, and the scene it is for.
 //!
+//! For views that will be refined by references, it sees references in training, too: other views of the rehearsal, of which every one has
+//! its true picture.
+//!
 //! Every eighth view is left out of training; what the network brings there is measured and kept with it.
 
 use std::path::Path;
@@ -10,10 +13,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{psnr_of, read_premultiplied};
+use pixels::{psnr_of, read_exr, read_premultiplied};
 use refinement::{
-    Architecture, Example, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining, WEIGHTS_FILE,
-    view_over,
+    Architecture, KnownView, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining, Rendered,
+    WEIGHTS_FILE,
 };
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -38,6 +41,9 @@ pub struct Params {
     /// Features of the network's hidden layers.
     #[schemars(range(min = 1, max = 512))]
     pub channels: u32,
+    /// References that each view will have when it is refined; 0 trains a network that does without.
+    #[schemars(range(min = 0, max = 64))]
+    pub references: u32,
     /// Its residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64))]
     pub blocks: u32,
@@ -47,7 +53,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { steps: 4000, batch: 8, square: 64, rate: 1e-3, channels: 32, blocks: 4, seed: 0 }
+        Self { steps: 4000, batch: 8, square: 64, rate: 1e-3, references: 0, channels: 32, blocks: 4, seed: 0 }
     }
 }
 
@@ -81,17 +87,21 @@ impl Stage for TrainRefine {
         }
         nets::deterministic();
         let (training, left_out) = examples(context.input("views")?, context.input("truth")?)?;
-        let architecture = Architecture { channels: params.channels, blocks: params.blocks };
+        if params.references > 0 && training.len() < 2 {
+            return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
+        }
+        let architecture = Architecture { channels: params.channels, blocks: params.blocks, guided: params.references > 0 };
         let options = RefinerTraining {
             steps: params.steps,
             batch: params.batch as usize,
             square: params.square as usize,
+            references: params.references as usize,
             rate: params.rate,
             seed: params.seed,
         };
         let mut trainer = RefinerTrainer::new(Refiner::new(architecture, params.seed)?, options)?;
         train(context, params, &mut trainer, &training)?;
-        let scores = trainer.score(&left_out)?;
+        let scores = trainer.score(&left_out, &training)?;
         trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
         let file = RefinerFile {
             architecture,
@@ -110,7 +120,7 @@ impl Stage for TrainRefine {
 }
 
 /// Takes all steps that an earlier run hasn't.
-fn train(context: &Context, params: &Params, trainer: &mut RefinerTrainer, examples: &[Example]) -> anyhow::Result<()> {
+fn train(context: &Context, params: &Params, trainer: &mut RefinerTrainer, examples: &[KnownView]) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
         match trainer.resume(path) {
@@ -149,36 +159,32 @@ fn write_checkpoint(trainer: &RefinerTrainer, path: &Path) -> anyhow::Result<()>
 }
 
 /// Views beside their truth: those to train on, and those left out; where there are fewer than two, the same ones.
-fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<Example>, Vec<Example>)> {
+fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<KnownView>, Vec<KnownView>)> {
     let (rendered, known) = (Views::read(views)?, Views::read(truth)?);
     let background = known.background.shown();
-    let example = |view: &View| -> anyhow::Result<Option<Example>> {
+    let example = |view: &View| -> anyhow::Result<Option<KnownView>> {
         let name = &view.camera.name;
         // Names alone say little: Blender's training and test views have the same.
         let same = |v: &&View| v.camera.name == *name && v.camera.camera_to_world == view.camera.camera_to_world;
         let truth_file = known.views.iter().find(same).and_then(|v| v.image.as_ref());
         let (Some(file), Some(truth_file)) = (&view.image, truth_file) else { return Ok(None) };
         let place = || format!("view {name}");
-        let view = read_premultiplied(&views.path(file)).bad_input(place())?;
-        let truth = read_premultiplied(&truth.path(truth_file)).bad_input(place())?;
-        if (view.width, view.height) != (truth.width, truth.height) {
-            let message = format!(
-                "input views: view {name} has {}×{} pixels where its truth has {}×{}; render it for the truth's cameras",
-                view.width, view.height, truth.width, truth.height
-            );
-            return Err(Failure::BadInput(message).into());
-        }
-        Ok(Some(Example { view: view_over(&view, background), truth: truth.over(background) }))
+        let image = read_exr(&views.path(file)).bad_input(place())?;
+        let rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
+        let truth = read_premultiplied(&truth.path(truth_file)).bad_input(place())?.over(background);
+        KnownView::new(rendered, truth).map(Some).bad_input("input views")
     };
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;
     if all.is_empty() {
-        return Err(Failure::BadInput("input views: none of them has a picture, by name and pose, in input truth".to_owned()).into());
+        return Err(
+            Failure::BadInput("input views: none of them has a picture, by name and pose, in input truth".to_owned()).into()
+        );
     }
     if all.len() == 1 {
         return Ok((all.clone(), all));
     }
     let middle = (LEFT_OUT / 2).min(all.len() - 1);
     let (left_out, training): (Vec<_>, Vec<_>) = all.into_iter().enumerate().partition(|(i, _)| i % LEFT_OUT == middle);
-    let bare = |list: Vec<(usize, Example)>| list.into_iter().map(|(_, e)| e).collect();
+    let bare = |list: Vec<(usize, KnownView)>| list.into_iter().map(|(_, e)| e).collect();
     Ok((bare(training), bare(left_out)))
 }

@@ -32,10 +32,16 @@ impl Square {
         }
     }
 
-    /// A picture's samples at a place in the square; beyond its border, those at the border.
-    pub(crate) fn of(self, picture: &Picture, column: usize, row: usize) -> &[f32] {
+    /// Column and row in a picture of a place in the square; beyond the border, those at the border.
+    pub(crate) fn place(self, picture: &Picture, column: usize, row: usize) -> (usize, usize) {
         let clamped = |start: isize, by: usize, size: usize| (start + by as isize).clamp(0, size as isize - 1) as usize;
-        let at = clamped(self.y, row, picture.height) * picture.width + clamped(self.x, column, picture.width);
+        (clamped(self.x, column, picture.width), clamped(self.y, row, picture.height))
+    }
+
+    /// A picture's samples there.
+    pub(crate) fn of(self, picture: &Picture, column: usize, row: usize) -> &[f32] {
+        let (column, row) = self.place(picture, column, row);
+        let at = row * picture.width + column;
         &picture.data[at * picture.channels..(at + 1) * picture.channels]
     }
 

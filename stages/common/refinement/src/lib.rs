@@ -4,12 +4,15 @@
 //! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR pictures that
 //! were shrunk once more renders views of LR size, whose truth the LR pictures are.
 //!
-//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
-//! * [`Example`]: a rendered view and its true picture; [`RefinerTrainer`], [`RefinerTraining`]: learning from them.
+//! Where true pictures of some views are known at HR, references, a guided network sees what they show of each pixel, too. The field's depth
+//! says where they show it, and whether they see it at all.
+//!
+//! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
+//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes.
+//! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples.
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
 //!
-//! Colours are display-encoded sRGB, composited on the background that is shown. A view is a [`Picture`] of four channels: colour, and
-//! opacity ([`view_over`]).
+//! Colours are display-encoded sRGB, composited on the background that is shown.
 //!
 //! Convolutions go through libtorch, each tile and each shard of a step in one thread; gradients are added in order, so bytes don't
 //! depend on the number of threads.
@@ -18,21 +21,23 @@
 //! use pixels::Picture;
 //! use refinement::{Architecture, Refiner};
 //! nets::deterministic();
-//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1 }, 7)?;
+//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided: false }, 7)?;
 //! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
-//!
-//! [`Picture`]: pixels::Picture
 
 mod folded;
+mod guide;
 mod refiner;
 mod trainer;
+mod view;
 
-pub use refiner::{Architecture, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE, view_over};
-pub use trainer::{Example, RefinerTrainer, RefinerTraining, Scores};
+pub use guide::guided;
+pub use refiner::{Architecture, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
+pub use trainer::{RefinerTrainer, RefinerTraining, Scores};
+pub use view::{KnownView, Rendered};
 
 /// A refiner that can't be read, written, used or trained.
 #[derive(Debug, thiserror::Error)]
@@ -43,11 +48,21 @@ pub enum RefinementError {
     /// A file of weights can't be used.
     #[error(transparent)]
     Weights(#[from] nets::WeightsError),
+    /// A view can't be used.
+    #[error("view {name}: {reason}")]
+    View {
+        /// Which.
+        name: String,
+        /// What is wrong.
+        reason: String,
+    },
     /// A view isn't one.
-    #[error("a view of {channels} channels where colour and opacity are expected")]
+    #[error("a view of {channels} channels where {expected} are expected")]
     Channels {
         /// How many it has.
         channels: usize,
+        /// How many the network takes.
+        expected: usize,
     },
     /// Numbers went wrong.
     #[error("step {step}: the gradient is not finite; lower the rate")]

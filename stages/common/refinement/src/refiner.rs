@@ -18,6 +18,15 @@ pub struct Architecture {
     pub channels: u32,
     /// Residual blocks of two layers each.
     pub blocks: u32,
+    /// Whether it sees what references know, too.
+    pub guided: bool,
+}
+
+impl Architecture {
+    /// Channels of what it takes.
+    pub(crate) fn inputs(self) -> usize {
+        if self.guided { GUIDED_INPUTS } else { INPUTS }
+    }
 }
 
 /// Name of the file that describes a refiner.
@@ -50,6 +59,8 @@ pub struct Refiner {
 
 /// Channels of a rendered view: colour and opacity.
 pub(crate) const INPUTS: usize = 4;
+/// The same with the difference to references, and their confidence.
+pub(crate) const GUIDED_INPUTS: usize = 8;
 /// Channels of a picture.
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
@@ -84,6 +95,11 @@ impl Refiner {
     /// Writes the weights.
     pub fn write(&self, path: &Path) -> Result<(), RefinementError> {
         Ok(nets::write(path, &self.named())?)
+    }
+
+    /// The network's size.
+    pub fn architecture(&self) -> Architecture {
+        self.architecture
     }
 
     /// The parameters by name.
@@ -127,10 +143,12 @@ impl Refiner {
         layer(&x.f_relu()?, 1 + 2 * self.architecture.blocks as usize)
     }
 
-    /// The view with `strength` times what the network adds: a picture of three channels in 0..1.
+    /// The view (for a guided network [`guided`](crate::guided)) with `strength` times what the network adds: a picture of three channels in
+    /// 0..1.
     pub fn refine_by(&self, view: &Picture, strength: f32) -> Result<Picture, RefinementError> {
-        if view.channels != INPUTS {
-            return Err(RefinementError::Channels { channels: view.channels });
+        let inputs = self.architecture.inputs();
+        if view.channels != inputs {
+            return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
         }
         let (width, height) = (view.width, view.height);
         let tiles: Vec<(usize, usize, Self)> = (0..height)
@@ -145,7 +163,7 @@ impl Refiner {
                 let square = Square { x: x as isize, y: y as isize, size: (side(x, width), side(y, height)) };
                 let (around, mut input) = (square.grown(refiner.reach()), Vec::new());
                 around.fold(|x, y| input.extend_from_slice(around.of(view, x, y)));
-                let added = no_grad(|| refiner.forward(&around.tensor(&input, INPUTS)?))?;
+                let added = no_grad(|| refiner.forward(&around.tensor(&input, inputs)?))?;
                 Ok((square, samples(&added)?))
             })
             .collect::<Result<_, _>>()?;
@@ -156,7 +174,7 @@ impl Refiner {
                 if column < width && row < height {
                     let at = row * width + column;
                     for c in 0..OUTPUTS {
-                        data[at * OUTPUTS + c] = (view.data[at * INPUTS + c] + strength * added[c]).clamp(0.0, 1.0);
+                        data[at * OUTPUTS + c] = (view.data[at * inputs + c] + strength * added[c]).clamp(0.0, 1.0);
                     }
                 }
             });
@@ -170,22 +188,12 @@ impl Refiner {
     }
 }
 
-/// A picture of premultiplied RGBA as a refiner takes it: colour over a grey level, and opacity.
-///
-/// # Panics
-/// On a picture without alpha.
-pub fn view_over(picture: &Picture, background: f32) -> Picture {
-    let over = picture.over(background);
-    let pixels = over.data.chunks_exact(OUTPUTS).zip(picture.data.chunks_exact(INPUTS));
-    Picture::new(picture.width, picture.height, INPUTS, pixels.flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]).collect())
-}
-
 /// Name, inputs and outputs of each layer.
 fn layers(architecture: Architecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks)
         .flat_map(|i| [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]);
-    let first = ("first".to_owned(), INPUTS * FOLD * FOLD, width);
+    let first = ("first".to_owned(), architecture.inputs() * FOLD * FOLD, width);
     let last = ("last".to_owned(), width, OUTPUTS * FOLD * FOLD);
     std::iter::once(first).chain(blocks).chain([last]).collect()
 }

@@ -9,16 +9,9 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square};
-use crate::refiner::{INPUTS, OUTPUTS, Refiner};
-
-/// A rendered view and what it should look like.
-#[derive(Clone, Debug)]
-pub struct Example {
-    /// Colour, on the background, and opacity.
-    pub view: Picture,
-    /// Colour, on the background; of the view's size.
-    pub truth: Picture,
-}
+use crate::guide::{guide, guided};
+use crate::refiner::{OUTPUTS, Refiner};
+use crate::view::KnownView;
 
 /// How to train a [`Refiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,6 +22,8 @@ pub struct RefinerTraining {
     pub batch: usize,
     /// Pixels along a square's side; an even number.
     pub square: usize,
+    /// References that a guided network gets for a view.
+    pub references: usize,
     /// Highest learning rate; it rises over the first steps and falls to nothing, as a cosine.
     pub rate: f64,
     /// Seed of what is drawn.
@@ -51,8 +46,11 @@ const WARM_UP: u64 = 50;
 /// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach nothing.
 const CONTRAST: f32 = 0.08;
 const REDRAWS: usize = 8;
-/// Purpose of draws.
+/// A guided network gets no reference once in so many times, so that it can do without.
+const ALONE: u64 = 8;
+/// Purposes of draws.
 const SQUARES: u64 = 301;
+const SCORES: u64 = 302;
 /// Name of a checkpoint's counters.
 const COUNTERS: &str = "counters";
 
@@ -86,7 +84,7 @@ impl RefinerTrainer {
 
     /// Takes a step on some of the examples, of which there is at least one; the mean squared error before it, `None` once all steps are
     /// taken.
-    pub fn step(&mut self, examples: &[Example]) -> Result<Option<f64>, RefinementError> {
+    pub fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let RefinerTraining { steps, batch, rate, .. } = self.options;
         if self.step >= steps {
             return Ok(None);
@@ -115,12 +113,22 @@ impl RefinerTrainer {
         Ok(Some(loss))
     }
 
-    /// Scores examples that training left out, and finds the share of the prediction that serves them best.
-    pub fn score(&self, examples: &[Example]) -> Result<Scores, RefinementError> {
+    /// Scores examples that training left out, with references drawn from those that it had, and finds the share of the prediction that
+    /// serves them best.
+    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
+        let view = |(i, example): (usize, &KnownView)| -> Picture {
+            if !self.refiner.architecture().guided {
+                return example.rendered.view.clone();
+            }
+            let mut draws = Draws::new(self.options.seed, SCORES, i as u64);
+            let drawn = (0..self.options.references).map(|_| draws.below(references.len() as u64) as usize);
+            guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>())
+        };
+        let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
         let (mut rendered, mut agreement, mut power) = (0.0, 0.0, 0.0);
-        for Example { view, truth } in examples {
+        for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
-            let colours = view.data.chunks_exact(INPUTS).flat_map(|p| &p[..OUTPUTS]);
+            let colours = view.data.chunks_exact(view.channels).flat_map(|p| &p[..OUTPUTS]);
             let mut error = 0.0;
             for ((r, v), t) in refined.data.iter().zip(colours).zip(&truth.data) {
                 let (added, lacks) = (f64::from(r - v), f64::from(t - v));
@@ -132,7 +140,7 @@ impl RefinerTrainer {
         }
         let strength = if power > 0.0 { (agreement / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
-        for Example { view, truth } in examples {
+        for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let by = self.refiner.refine_by(view, strength as f32)?;
             let error: f64 = by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
             refined += psnr_of(error / truth.data.len() as f64);
@@ -169,7 +177,7 @@ fn shard(
     options: &RefinerTraining,
     step: u64,
     range: Range<usize>,
-    examples: &[Example],
+    examples: &[KnownView],
 ) -> Result<(f64, Vec<Tensor>), TchError> {
     let (mut inputs, mut lacks) = (Vec::new(), Vec::new());
     let size = (options.square, options.square);
@@ -177,9 +185,9 @@ fn shard(
     let square = Square { x: 0, y: 0, size };
     for i in range {
         let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, examples);
-        drawn.append(refiner.reach(), &mut inputs, &mut lacks);
+        drawn.append(refiner, &mut inputs, &mut lacks);
     }
-    let added = refiner.forward(&around.tensor(&inputs, INPUTS)?)?;
+    let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
     let all = (options.batch * options.square * options.square * OUTPUTS) as f64;
     let loss = added.f_sub(&square.tensor(&lacks, OUTPUTS)?)?.f_square()?.f_sum(None::<Kind>)?.f_div_scalar(all)?;
     let parameters: Vec<Tensor> = refiner.parameters().collect();
@@ -189,12 +197,14 @@ fn shard(
 
 /// A square of an example, as it is shown to the network.
 struct Drawn<'a> {
-    example: &'a Example,
+    example: &'a KnownView,
     square: Square,
     /// Rows for columns; mirrored along each.
     turn: [bool; 3],
     /// Which channel comes first, second, third.
     order: [usize; OUTPUTS],
+    /// Examples that are its references.
+    references: Vec<&'a KnownView>,
     /// Contrast; negative for the negative.
     gain: f32,
     offset: f32,
@@ -202,14 +212,14 @@ struct Drawn<'a> {
 
 impl<'a> Drawn<'a> {
     /// The square with that number.
-    fn new(options: &RefinerTraining, number: u64, examples: &'a [Example]) -> Self {
+    fn new(options: &RefinerTraining, number: u64, examples: &'a [KnownView]) -> Self {
         let mut draws = Draws::new(options.seed, SQUARES, number);
         let mut place = || {
             let example = &examples[draws.below(examples.len() as u64) as usize];
             // On even pixels, as the folds of whole views lie.
             let mut start =
                 |size: usize| (draws.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
-            let (x, y) = (start(example.view.width), start(example.view.height));
+            let (x, y) = (start(example.rendered.view.width), start(example.rendered.view.height));
             (example, Square { x, y, size: (options.square, options.square) })
         };
         let mut placed = place();
@@ -227,18 +237,27 @@ impl<'a> Drawn<'a> {
         let sign = if draws.below(2) == 1 { -1.0 } else { 1.0 };
         // Around the middle of all colours.
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
-        Self { example, square, turn, order, gain, offset }
+        let alone = draws.below(ALONE) == 0;
+        let count = if alone { 0 } else { options.references };
+        let references = (0..count).filter_map(|_| draw_reference(&mut draws, example, examples)).collect();
+        Self { example, square, turn, order, references, gain, offset }
     }
 
-    /// Appends what the network gets, which reaches so many folds farther than the square, and what it should add.
-    fn append(&self, reach: usize, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
-        let Example { view, truth } = self.example;
-        let around = self.square.grown(reach);
+    /// Appends what the network gets, which reaches farther than the square, and what it should add.
+    fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
+        let KnownView { rendered, truth } = self.example;
+        let (view, surface) = (&rendered.view, rendered.surface());
+        let around = self.square.grown(refiner.reach());
         around.fold(|x, y| {
             let (x, y) = self.source(x, y, around.size.0);
             let pixel = around.of(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
+            if refiner.architecture().guided {
+                let known = guide(&surface, self.references.iter().copied(), around.place(view, x, y), pixel);
+                inputs.extend(self.order.map(|c| self.gain * known[c]));
+                inputs.push(known[OUTPUTS]);
+            }
         });
         self.square.fold(|x, y| {
             let (x, y) = self.source(x, y, self.square.size.0);
@@ -255,8 +274,19 @@ impl<'a> Drawn<'a> {
     }
 }
 
+/// A reference for an example: the nearest of one to four others, so that near and far ones come, and near ones often enough to be learnt
+/// from.
+fn draw_reference<'a>(draws: &mut Draws, example: &KnownView, examples: &'a [KnownView]) -> Option<&'a KnownView> {
+    let centre = example.rendered.camera.centre();
+    let away = |other: &KnownView| (other.rendered.camera.centre() - centre).length_squared();
+    let drawn = (0..draws.below(4) + 1).map(|_| &examples[draws.below(examples.len() as u64) as usize]);
+    // A view is no reference for itself.
+    let others = drawn.collect::<Vec<_>>().into_iter().filter(|other| !std::ptr::eq(*other, example));
+    others.min_by(|a, b| away(a).total_cmp(&away(b)))
+}
+
 /// Range of the green in a square of the truth.
-fn contrast(example: &Example, square: Square) -> f32 {
+fn contrast(example: &KnownView, square: Square) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
     square.fold(|x, y| {
         let green = square.of(&example.truth, x, y)[1];
@@ -267,36 +297,69 @@ fn contrast(example: &Example, square: Square) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use scene::{Camera, Intrinsics};
+
     use super::*;
-    use crate::Architecture;
+    use crate::{Architecture, Rendered};
 
     /// Stripes, and the same blurred by a pixel.
-    fn example(phase: usize) -> Example {
+    fn example(phase: usize) -> KnownView {
         let level = |i: usize, blur: bool| {
-            let at = |x: usize| if (x + phase) / 4 % 2 == 0 { 0.2 } else { 0.8f32 };
+            let at = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };
             let x = i % 32 + 1;
             if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
         };
         let view = (0..32 * 32).flat_map(|i| [level(i, true), level(i, true), level(i, true), 1.0]).collect();
         let truth = (0..32 * 32).flat_map(|i| [level(i, false); 3]).collect();
-        Example { view: Picture::new(32, 32, 4, view), truth: Picture::new(32, 32, 3, truth) }
+        let camera = Camera {
+            name: phase.to_string(),
+            intrinsics: Intrinsics { width: 32, height: 32, fx: 32.0, fy: 32.0, cx: 16.0, cy: 16.0 },
+            // A wall at distance 2, along which the camera moves by a pixel a phase.
+            camera_to_world: [[1.0, 0.0, 0.0, phase as f64 / 16.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+        };
+        let view = Picture::new(32, 32, 4, view);
+        let rendered = Rendered { camera, view, depth: vec![2.0; 32 * 32], opacity: vec![1.0; 32 * 32] };
+        KnownView { rendered, truth: Picture::new(32, 32, 3, truth) }
     }
 
-    fn trained(steps: u64, threads: usize) -> RefinerTrainer {
+    fn trained(guided: bool) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        let options = RefinerTraining { steps, batch: 8, square: 16, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1 }, 3).unwrap();
+        let options = RefinerTraining { steps: 150, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
+        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
-        let examples: Vec<Example> = (0..4).map(example).collect();
-        while pool.install(|| trainer.step(&examples)).unwrap().is_some() {}
-        trainer
+        let examples: Vec<KnownView> = (0..4).map(example).collect();
+        while trainer.step(&examples).unwrap().is_some() {}
+        (trainer, examples)
     }
 
     #[test]
     fn a_blur_is_unlearnt() {
-        let scores = trained(150, 2).score(&[example(5)]).unwrap();
-        assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
-        assert!(scores.strength > 0.8, "{scores:?}");
+        for guided in [false, true] {
+            let (trainer, examples) = trained(guided);
+            let scores = trainer.score(&[example(5)], &examples).unwrap();
+            assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
+            assert!(scores.strength > 0.8, "{scores:?}");
+        }
+    }
+
+    /// References of the stripes' own wall show them as they are, at their place, with full confidence; wherever they can't see, nothing.
+    #[test]
+    fn references_show_what_is_there() {
+        let (view, other) = (example(5), example(2));
+        let pixels = guided(&view.rendered, &[&other]);
+        let (mut seen, mut worst) = (0, 0.0f32);
+        for (i, pixel) in pixels.data.chunks_exact(8).enumerate() {
+            let column = i % 32;
+            if pixel[7] == 0.0 {
+                // The other camera stands three pixels to the left: it doesn't see the last three columns.
+                assert!(column >= 29 && pixel[4..7] == [0.0; 3], "column {column}");
+                continue;
+            }
+            seen += 1;
+            worst = worst.max((pixel[0] + pixel[4] - view.truth.data[i * 3]).abs());
+            assert!(pixel[7] > 0.95, "column {column}: {}", pixel[7]);
+        }
+        assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
+        assert!(guided(&view.rendered, &[]).data.chunks_exact(8).all(|p| p[4..] == [0.0; 4]));
     }
 }

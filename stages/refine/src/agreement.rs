@@ -1,0 +1,82 @@
+use artifact::{FailureExt as _, GivenInput};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling, read_premultiplied};
+use scene::{Camera, View, Views};
+
+/// LR photographs of some of the views.
+pub(crate) struct Photographs<'a> {
+    input: &'a GivenInput,
+    views: Views,
+    filter: Filter,
+}
+
+/// LR pixels that the nearest picture looks at on each side.
+const REACH: usize = 12;
+
+impl<'a> Photographs<'a> {
+    pub(crate) fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
+        let degradation: Degradation = input.read_json(DEGRADATION_FILE)?;
+        Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
+    }
+
+    /// The LR photograph that was taken by a view's own camera, where there is one: of that name and pose, and smaller.
+    pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Picture>> {
+        let same = |v: &&View| v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world;
+        let file = self.views.views.iter().find(same).and_then(|v| v.image.as_ref());
+        let Some(file) = file else { return Ok(None) };
+        let photograph = read_premultiplied(&self.input.path(file)).bad_input(format!("photograph {}", camera.name))?;
+        let k = &camera.intrinsics;
+        let is_smaller = photograph.width <= k.width as usize && photograph.height <= k.height as usize;
+        Ok(is_smaller.then(|| photograph.over(self.views.background.shown())))
+    }
+
+    /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
+    /// photograph was clipped to black or white and the prediction lies beyond, it says nothing.
+    pub(crate) fn agree(&self, refined: &Picture, photograph: &Picture) -> Picture {
+        let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
+        let mut residual = kernel.apply(refined);
+        for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
+            let clipped = (y >= 1.0 && *r > 1.0) || (y <= 0.0 && *r < 0.0);
+            *r = if clipped { 0.0 } else { y - *r };
+        }
+        let share = (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
+        let mut moved = kernel.inverse(REACH).adjoint(&residual);
+        for (m, r) in moved.data.iter_mut().zip(&refined.data) {
+            *m = (share * *m + r).clamp(0.0, 1.0);
+        }
+        moved
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_agrees_stays_and_what_does_not_is_moved_to_agree() {
+        for (filter, wide, narrow) in [(Filter::Lanczos, 48, 24), (Filter::Box, 45, 30), (Filter::Bicubic, 48, 12)] {
+            let size = (wide, wide * 2 / 3);
+            let low_size = (narrow, narrow * 2 / 3);
+            let level =
+                |i: usize, c: usize| 0.5 + 0.3 * ((i % wide * (c + 3)) as f32 * 0.08).sin() * ((i / wide) as f32 * 0.21).cos();
+            let data = (0..size.0 * size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
+            let truth = Picture::new(size.0, size.1, 3, data);
+            let kernel = Resampling::new(filter, size, low_size);
+            let low = kernel.apply(&truth);
+            let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
+            let folder = tempfile::tempdir().unwrap();
+            let input = GivenInput::open("photographs", folder.path()).unwrap();
+            let photographs = Photographs { input: &input, views, filter };
+            let error = |a: &Picture, b: &Picture| {
+                let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
+                (squares.sum::<f64>() / a.data.len() as f64).sqrt()
+            };
+            assert!(error(&photographs.agree(&truth, &low), &truth) < 1e-5, "{filter:?}");
+            let softer = Picture { data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(), ..truth.clone() };
+            let agreed = photographs.agree(&softer, &low);
+            let (off, was) = (error(&kernel.apply(&agreed), &low), error(&kernel.apply(&softer), &low));
+            assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
+            let (off, was) = (error(&agreed, &truth), error(&softer, &truth));
+            assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");
+        }
+    }
+}
