@@ -21,7 +21,7 @@ const REFINED: &str = "
     inputs: {views: rehearsal-views, truth: prep/train}
     parameters: {steps: 60, batch: 4, square: 16, channels: 8, blocks: 1}
   refine:
-    inputs: {views: render-depth, refiner: train-refine}
+    inputs: {views: render-depth, refiner: train-refine, photographs: prep/train}
   eval-refined:
     like: eval
     inputs: {views: refine, truth: prep/truth}
@@ -115,6 +115,27 @@ fn a_block_like_another_follows_it() {
         project.run(&["plan", "refined"]).fails(2, words);
         project.replace(to, from);
     }
+}
+
+/// In the paper's split all views are trained on, so each one's LR picture is known; where views are withheld, none is.
+#[test]
+fn views_agree_with_their_own_photographs() {
+    let project = project();
+    let at_low_resolution = |more: &[&str]| -> Vec<f64> {
+        project.ok(&[&["run", "refined"], more].concat());
+        let rows: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
+        rows.as_array().unwrap().iter().map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap()).collect()
+    };
+    let said = |more: &[&str]| {
+        let folder = project.object(&project.output_of("refine", &[&["refined"], more].concat())[0]);
+        std::fs::read_to_string(folder.join("summary.txt")).unwrap()
+    };
+    let given = at_low_resolution(&[]);
+    assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
+    let papers = at_low_resolution(&["-p", "split=paper"]);
+    assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
+    assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
 }
 
 #[test]

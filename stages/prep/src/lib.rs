@@ -200,7 +200,10 @@ impl Stage for Prep {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
+        let mut set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
+        if matches!(params.split, Some(SplitKind::Holdout | SplitKind::Paper)) {
+            set = set.merged();
+        }
         let mut split = split(&set, params).map_err(Failure::Usage)?;
         if let Some(most) = params.test_views {
             let (most, all) = (most as usize, split.test.len());

@@ -9,7 +9,7 @@ use crate::{DatasetError, Lens};
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Unique within the data set; fit for a file's name.
+    /// Unique within its side of the folder's own split; fit for a file's name.
     pub name: String,
     /// The picture: PNG, JPEG or EXR.
     pub image: PathBuf,

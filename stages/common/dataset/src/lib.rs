@@ -144,6 +144,21 @@ impl Dataset {
         Ok(set)
     }
 
+    /// All frames together, whatever the folder itself says of their use. Blender's training and test views have the same names: then
+    /// the one for testing is called `test_NAME`.
+    #[must_use]
+    pub fn merged(mut self) -> Self {
+        let split = self.split.take().unwrap_or_default();
+        let taken: std::collections::BTreeSet<String> = split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
+        for &i in &split.test {
+            let name = &mut self.frames[i].name;
+            while taken.contains(name) {
+                *name = format!("test_{name}");
+            }
+        }
+        self
+    }
+
     /// Says what is done to pictures that aren't all alike, upright and from a pinhole.
     fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
