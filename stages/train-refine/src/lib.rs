@@ -41,19 +41,19 @@ pub struct Params {
     /// Features of the network's hidden layers.
     #[schemars(range(min = 1, max = 512))]
     pub channels: u32,
-    /// References that each view will have when it is refined; 0 trains a network that does without.
-    #[schemars(range(min = 0, max = 64))]
-    pub references: u32,
     /// Its residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64))]
     pub blocks: u32,
+    /// References that each view will have when it is refined; 0 trains a network that does without.
+    #[schemars(range(min = 0, max = 64))]
+    pub references: u32,
     /// Seed of everything that is drawn.
     pub seed: u64,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { steps: 4000, batch: 8, square: 64, rate: 1e-3, references: 0, channels: 32, blocks: 4, seed: 0 }
+        Self { steps: 4000, batch: 8, square: 64, rate: 1e-3, channels: 32, blocks: 4, references: 0, seed: 0 }
     }
 }
 

@@ -48,6 +48,14 @@ pub enum RefinementError {
     /// A file of weights can't be used.
     #[error(transparent)]
     Weights(#[from] nets::WeightsError),
+    /// A network that can't be.
+    #[error("a network {channels} wide with {blocks} blocks: not one of ours")]
+    Architecture {
+        /// Its width.
+        channels: u32,
+        /// Its blocks.
+        blocks: u32,
+    },
     /// A view can't be used.
     #[error("view {name}: {reason}")]
     View {

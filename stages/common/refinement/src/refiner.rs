@@ -65,6 +65,8 @@ pub(crate) const GUIDED_INPUTS: usize = 8;
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
 const TILE: usize = 128;
+/// Most channels, and most blocks, of a network that is read.
+const MOST: u32 = 4096;
 /// Purpose of draws.
 const WEIGHTS: u64 = 300;
 
@@ -87,6 +89,11 @@ impl Refiner {
 
     /// Reads weights that [`Refiner::write`] wrote.
     pub fn read(path: &Path, architecture: Architecture) -> Result<Self, RefinementError> {
+        let Architecture { channels, blocks, .. } = architecture;
+        // Before anything is made of such numbers.
+        if !(1..=MOST).contains(&channels) || blocks > MOST {
+            return Err(RefinementError::Architecture { channels, blocks });
+        }
         let weights = nets::Weights::read(path)?;
         let tensors = shapes(architecture).into_iter().map(|(name, shape)| weights.tensor(&name, &shape));
         Ok(Self { architecture, parameters: tensors.collect::<Result<_, _>>()? })
@@ -208,4 +215,74 @@ fn shapes(architecture: Architecture) -> Vec<(String, Vec<i64>)> {
         [(format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()), (format!("{name}.bias"), vec![outputs as i64])]
     };
     layers(architecture).into_iter().flat_map(both).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn picture(width: usize, height: usize) -> Picture {
+        let mut draws = Draws::new(1, 2, 3);
+        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| draws.uniform()).collect())
+    }
+
+    /// A network whose every weight says something.
+    fn random(architecture: Architecture) -> Refiner {
+        let mut refiner = Refiner::new(architecture, 5).unwrap();
+        let mut draws = Draws::new(5, 6, 7);
+        for parameter in &mut refiner.parameters {
+            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (draws.uniform() - 0.5)).collect();
+            *parameter = Tensor::from_slice(&values).reshape(parameter.size());
+        }
+        refiner
+    }
+
+    /// Tiles meet exactly: a view of several is what one convolution of the whole gives.
+    #[test]
+    fn tiles_leave_no_seams() {
+        nets::deterministic();
+        let architecture = Architecture { channels: 6, blocks: 2, guided: false };
+        let refiner = random(architecture);
+        for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
+            let view = picture(width, height);
+            let square = Square { x: 0, y: 0, size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)) };
+            let around = square.grown(refiner.reach());
+            let mut input = Vec::new();
+            around.fold(|x, y| input.extend_from_slice(around.of(&view, x, y)));
+            let added = samples(&no_grad(|| refiner.forward(&around.tensor(&input, INPUTS).unwrap())).unwrap()).unwrap();
+            let refined = refiner.refine(&view).unwrap();
+            square.unfold(&added, OUTPUTS, |x, y, added| {
+                if x < width && y < height {
+                    for c in 0..OUTPUTS {
+                        let whole = (view.data[(y * width + x) * INPUTS + c] + added[c]).clamp(0.0, 1.0);
+                        let tiled = refined.data[(y * width + x) * OUTPUTS + c];
+                        assert!((whole - tiled).abs() < 1e-5, "{width}×{height} at {x}, {y}: {tiled} where {whole} is right");
+                    }
+                }
+            });
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read_and_other_networks_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(WEIGHTS_FILE);
+        let architecture = Architecture { channels: 6, blocks: 1, guided: true };
+        let refiner = random(architecture);
+        refiner.write(&path).unwrap();
+        let again = Refiner::read(&path, architecture).unwrap();
+        assert!(refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t));
+        for other in [Architecture { channels: 7, ..architecture }, Architecture { blocks: 2, ..architecture }] {
+            assert!(Refiner::read(&path, other).is_err());
+        }
+        for other in [Architecture { channels: 0, ..architecture }, Architecture { blocks: u32::MAX, ..architecture }] {
+            assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
+        }
+        assert!(matches!(again.refine(&picture(8, 8)), Err(RefinementError::Channels { channels: 4, expected: 8 })));
+        let bytes = std::fs::read(&path).unwrap();
+        for end in [0, 7, 100, bytes.len() - 1] {
+            std::fs::write(&path, &bytes[..end]).unwrap();
+            assert!(Refiner::read(&path, architecture).is_err());
+        }
+    }
 }
