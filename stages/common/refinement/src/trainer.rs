@@ -239,7 +239,9 @@ impl<'a> Drawn<'a> {
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
         let alone = draws.below(ALONE) == 0;
         let count = if alone { 0 } else { options.references };
-        let references = (0..count).filter_map(|_| draw_reference(&mut draws, example, examples)).collect();
+        let drawn = (0..count).map(|_| &examples[draws.below(examples.len() as u64) as usize]);
+        // A view is no reference for itself.
+        let references = drawn.filter(|other| !std::ptr::eq(*other, example)).collect();
         Self { example, square, turn, order, references, gain, offset }
     }
 
@@ -272,17 +274,6 @@ impl<'a> Drawn<'a> {
         let (x, y) = if swap { (y, x) } else { (x, y) };
         (if flip_x { side - 1 - x } else { x }, if flip_y { side - 1 - y } else { y })
     }
-}
-
-/// A reference for an example: the nearest of one to four others, so that near and far ones come, and near ones often enough to be learnt
-/// from.
-fn draw_reference<'a>(draws: &mut Draws, example: &KnownView, examples: &'a [KnownView]) -> Option<&'a KnownView> {
-    let centre = example.rendered.camera.centre();
-    let away = |other: &KnownView| (other.rendered.camera.centre() - centre).length_squared();
-    let drawn = (0..draws.below(4) + 1).map(|_| &examples[draws.below(examples.len() as u64) as usize]);
-    // A view is no reference for itself.
-    let others = drawn.collect::<Vec<_>>().into_iter().filter(|other| !std::ptr::eq(*other, example));
-    others.min_by(|a, b| away(a).total_cmp(&away(b)))
 }
 
 /// Range of the green in a square of the truth.
