@@ -3,30 +3,15 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::path::Path;
 use std::process::Stdio;
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
-use common::{Finished, Project, demo_train, manifest, signal, stage, stage_command};
+use common::{
+    Finished, Project, demo_train, kill_again_and_again, last_checkpoint, manifest, signal, stage, stage_command, wait_until,
+};
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint may hold.
 const PARAMS: &str = r#"{"supervision": "kernel", "members": 2, "rays": 900000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 256, "batch": 2048, "samples": 16384}"#;
-
-/// When the last of a work folder's checkpoints was written.
-fn last_checkpoint(work: &Path) -> Option<SystemTime> {
-    let files = walkdir::WalkDir::new(work).into_iter().flatten().filter(|f| f.file_name() == "checkpoint.safetensors");
-    files.filter_map(|f| f.metadata().ok()?.modified().ok()).max()
-}
-
-/// Waits for what comes sooner or later, however slow the machine is just now.
-fn wait_until(mut happened: impl FnMut() -> bool) {
-    for _ in 0..2400 {
-        if happened() {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(25));
-    }
-}
 
 #[test]
 fn training_killed_at_any_moment_ends_in_the_same_bytes() {
@@ -38,22 +23,7 @@ fn training_killed_at_any_moment_ends_in_the_same_bytes() {
 
     let (output, work) = (project.path("killed"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];
-    let mut resumed = 0;
-    for (round, milliseconds) in [100, 0, 300, 20, 700].into_iter().enumerate() {
-        let before = last_checkpoint(&work);
-        let mut child = stage_command("train-ss", PARAMS, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
-        if round > 0 {
-            wait_until(|| last_checkpoint(&work) != before || child.try_wait().unwrap().is_some());
-        }
-        std::thread::sleep(Duration::from_millis(milliseconds));
-        if child.try_wait().unwrap().is_some() {
-            break;
-        }
-        signal(&child, "-KILL");
-        child.wait().unwrap();
-        assert!(!output.exists(), "a killed stage leaves no output");
-        resumed += usize::from(last_checkpoint(&work).is_some());
-    }
+    let resumed = kill_again_and_again("train-ss", PARAMS, &inputs, &output, &work, &[100, 0, 300, 20, 700]);
     assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
     if !output.exists() {
         let finished = stage("train-ss", PARAMS, &inputs, &output, &more);

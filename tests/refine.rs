@@ -4,10 +4,8 @@
 mod common;
 
 use std::path::Path;
-use std::process::Stdio;
-use std::time::Duration;
 
-use common::{Finished, Project, manifest, signal, stage, stage_command};
+use common::{Finished, Project, kill_again_and_again, manifest, stage, stage_command};
 
 const REFINED: &str = "
   rehearsal-field:
@@ -222,25 +220,7 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
     assert_eq!(stage("train-refine", params, &inputs, &whole, &["--threads", "1"]).code, 0);
     let more = ["--work", work.to_str().unwrap()];
     let checkpoint = work.join("checkpoint.safetensors");
-    let mut resumed = 0;
-    for milliseconds in [100, 300, 700] {
-        let before = checkpoint.metadata().and_then(|m| m.modified()).ok();
-        let mut child = stage_command("train-refine", params, &inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
-        for _ in 0..2400 {
-            if checkpoint.metadata().and_then(|m| m.modified()).ok() != before || child.try_wait().unwrap().is_some() {
-                break;
-            }
-            std::thread::sleep(Duration::from_millis(25));
-        }
-        std::thread::sleep(Duration::from_millis(milliseconds));
-        if child.try_wait().unwrap().is_some() {
-            break;
-        }
-        signal(&child, "-KILL");
-        child.wait().unwrap();
-        assert!(!output.exists(), "a killed stage leaves no output");
-        resumed += usize::from(checkpoint.exists());
-    }
+    let resumed = kill_again_and_again("train-refine", params, &inputs, &output, &work, &[100, 100, 300, 700]);
     assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
     if !output.exists() {
         // A checkpoint cut short is said and left out, not trusted.

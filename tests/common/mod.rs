@@ -4,7 +4,8 @@
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, SystemTime};
 
 /// The binaries' folder: that of the runner, where `make build` put the stages, too.
 pub fn bin(name: &str) -> PathBuf {
@@ -191,6 +192,52 @@ pub fn manifest(folder: &Path) -> String {
 /// Sends a running stage a signal: "-TERM", "-KILL".
 pub fn signal(child: &std::process::Child, name: &str) {
     Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
+}
+
+/// When the last of a work folder's checkpoints was written.
+pub fn last_checkpoint(work: &Path) -> Option<SystemTime> {
+    let files = walkdir::WalkDir::new(work).into_iter().flatten().filter(|f| f.file_name() == "checkpoint.safetensors");
+    files.filter_map(|f| f.metadata().ok()?.modified().ok()).max()
+}
+
+/// Waits for what comes sooner or later, however slow the machine is just now.
+pub fn wait_until(mut happened: impl FnMut() -> bool) {
+    for _ in 0..2400 {
+        if happened() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(25));
+    }
+}
+
+/// Kills a stage so many milliseconds after its start, and then each time so long after another checkpoint was written. How often there was
+/// one to go on from; the output may be there, if the stage was faster.
+pub fn kill_again_and_again(
+    name: &str,
+    params: &str,
+    inputs: &[(&str, &Path)],
+    output: &Path,
+    work: &Path,
+    milliseconds: &[u64],
+) -> usize {
+    let mut resumed = 0;
+    for (round, pause) in milliseconds.iter().enumerate() {
+        let before = last_checkpoint(work);
+        let more = ["--work", work.to_str().unwrap()];
+        let mut child = stage_command(name, params, inputs, output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        if round > 0 {
+            wait_until(|| last_checkpoint(work) != before || child.try_wait().unwrap().is_some());
+        }
+        std::thread::sleep(Duration::from_millis(*pause));
+        if child.try_wait().unwrap().is_some() {
+            break;
+        }
+        signal(&child, "-KILL");
+        child.wait().unwrap();
+        assert!(!output.exists(), "a killed stage leaves no output");
+        resumed += usize::from(last_checkpoint(work).is_some());
+    }
+    resumed
 }
 
 /// The data folder with real scenes and weights; without it a test says so and ends.
