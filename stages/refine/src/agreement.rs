@@ -1,6 +1,6 @@
 use artifact::{FailureExt as _, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling, read_premultiplied};
-use scene::{Camera, View, Views};
+use scene::{Camera, Views};
 
 /// LR photographs of some of the views.
 pub(crate) struct Photographs<'a> {
@@ -20,9 +20,7 @@ impl<'a> Photographs<'a> {
 
     /// The LR photograph that was taken by a view's own camera, where there is one: of that name and pose, and smaller.
     pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Picture>> {
-        let same = |v: &&View| v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world;
-        let file = self.views.views.iter().find(same).and_then(|v| v.image.as_ref());
-        let Some(file) = file else { return Ok(None) };
+        let Some(file) = self.views.taken_by(camera).and_then(|v| v.image.as_ref()) else { return Ok(None) };
         let photograph = read_premultiplied(&self.input.path(file)).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
         let is_smaller = photograph.width <= k.width as usize && photograph.height <= k.height as usize;

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Channel, PixelError, PngRows, SampleType, to_u8, write_exr};
+use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
 use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Ray, RayField};
 use scene::{Background, Camera, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -147,16 +147,10 @@ impl Job<'_> {
     fn render(&self, progress: &artifact::Progress) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        let half = |name| Channel { name, sample_type: SampleType::Half };
-        let single = |name| Channel { name, sample_type: SampleType::Float };
-        let mut channels = vec![half("R"), half("G"), half("B"), half("A"), single("Z")];
-        if self.params.ray_distance {
-            channels.push(single("distance"));
-        }
-        let note = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
+        let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
         let exr = self.context.output_path(&format!("images/{}.exr", self.camera.name))?;
         let mut png = PngRows::create(&self.context.output_path(&format!("previews/{}.png", self.camera.name))?, width, height)?;
-        write_exr(&exr, (width, height), &channels, note, |first, rows, samples| -> Result<(), Stopped> {
+        write_exr(&exr, (width, height), channels, VIEW_NOTE, |first, rows, samples| -> Result<(), Stopped> {
             self.context.check_interrupt().map_err(Stopped::Other)?;
             let bytes = self.band(first, rows, samples, channels.len()).map_err(Stopped::Other)?;
             png.write(&bytes)?;

@@ -164,9 +164,7 @@ fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<Known
     let background = known.background.shown();
     let example = |view: &View| -> anyhow::Result<Option<KnownView>> {
         let name = &view.camera.name;
-        // Names alone say little: Blender's training and test views have the same.
-        let same = |v: &&View| v.camera.name == *name && v.camera.camera_to_world == view.camera.camera_to_world;
-        let truth_file = known.views.iter().find(same).and_then(|v| v.image.as_ref());
+        let truth_file = known.taken_by(&view.camera).and_then(|v| v.image.as_ref());
         let (Some(file), Some(truth_file)) = (&view.image, truth_file) else { return Ok(None) };
         let place = || format!("view {name}");
         let image = read_exr(&views.path(file)).bad_input(place())?;

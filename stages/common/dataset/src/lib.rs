@@ -149,10 +149,10 @@ impl Dataset {
     #[must_use]
     pub fn merged(mut self) -> Self {
         let split = self.split.take().unwrap_or_default();
-        let taken: std::collections::BTreeSet<String> = split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
+        let mut taken: std::collections::BTreeSet<String> = split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
         for &i in &split.test {
             let name = &mut self.frames[i].name;
-            while taken.contains(name) {
+            while !taken.insert(name.clone()) {
                 *name = format!("test_{name}");
             }
         }

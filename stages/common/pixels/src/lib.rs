@@ -2,7 +2,8 @@
 //!
 //! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Picture`]: floating-point samples, channels interleaved.
 //! * [`read_premultiplied`]: a view's picture, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
-//! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat.
+//! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat;
+//!   [`VIEW_CHANNELS`]: what a rendered view's EXR has.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
 //! * [`sample_cubic`], [`Picture::colour_at`]: a picture between its pixels.
@@ -31,7 +32,7 @@ mod srgb;
 
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
-pub use exr_file::{Channel, ExrImage, SampleType, read_exr, write_exr};
+pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr};
 pub use heat::{Palette, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
 pub use operator::{AxisTaps, Resampling};

@@ -168,6 +168,11 @@ impl Views {
         Self { conventions: Conventions::default(), background, bounds, hull: None, views }
     }
 
+    /// The view that has a camera's name and pose. Names alone say little: Blender's training and test views have the same.
+    pub fn taken_by(&self, camera: &Camera) -> Option<&View> {
+        self.views.iter().find(|v| v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world)
+    }
+
     /// Reads and checks the `views.json` of an input.
     pub fn read(input: &artifact::GivenInput) -> anyhow::Result<Self> {
         use artifact::FailureExt as _;
