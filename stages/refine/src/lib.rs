@@ -13,7 +13,9 @@ mod agreement;
 use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Channel, ExrImage, Picture, PixelError, SampleType, read_exr, read_premultiplied, write_exr, write_png};
+use pixels::{
+    Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
+};
 use refinement::{KnownView, REFINER_FILE, Refiner, RefinerFile, Rendered, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -22,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use agreement::Photographs;
 
 /// Parameters of `refine`.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Share of what the network predicts that is added. Without it: what was best for the views that its training left out.
@@ -30,6 +32,15 @@ pub struct Params {
     pub strength: Option<f64>,
     /// At most so many of the references given, the first. Without it: all.
     pub references: Option<u32>,
+    /// Ways to turn and mirror a view in which the network sees it; the mean of what it adds is taken. Time grows with them.
+    #[schemars(range(min = 1, max = 8))]
+    pub turns: u32,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { strength: None, references: None, turns: 8 }
+    }
 }
 
 /// The stage.
@@ -68,7 +79,16 @@ impl Stage for Refine {
         let mut references = references(context, &file, views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(Photographs::read).transpose()?;
-        let job = Job { context, input, background: views.background.shown(), network, strength, references, photographs };
+        let job = Job {
+            context,
+            input,
+            background: views.background.shown(),
+            network,
+            strength,
+            turns: params.turns,
+            references,
+            photographs,
+        };
         let mut agreed = 0;
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
@@ -107,8 +127,7 @@ fn references(context: &Context, file: &RefinerFile, background: Background) -> 
     known
         .map(|(picture, file)| {
             let name = &picture.camera.name;
-            let same = |v: &&View| v.camera.name == *name && v.camera.camera_to_world == picture.camera.camera_to_world;
-            let view = rendered_list.views.iter().find(same).ok_or_else(|| {
+            let view = rendered_list.taken_by(&picture.camera).ok_or_else(|| {
                 Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
             })?;
             let truth = read_premultiplied(&pictures.path(file)).bad_input(format!("reference {name}"))?.over(shown);
@@ -125,16 +144,6 @@ fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Ren
     Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
 }
 
-/// Channels of a view, and their precision: those that `render-depth` writes.
-const CHANNELS: [(&str, SampleType); 6] = [
-    ("R", SampleType::Half),
-    ("G", SampleType::Half),
-    ("B", SampleType::Half),
-    ("A", SampleType::Half),
-    ("Z", SampleType::Float),
-    ("distance", SampleType::Float),
-];
-
 /// What all views share.
 struct Job<'a> {
     context: &'a Context,
@@ -142,6 +151,7 @@ struct Job<'a> {
     background: f32,
     network: Refiner,
     strength: f32,
+    turns: u32,
     references: Vec<KnownView>,
     photographs: Option<Photographs<'a>>,
 }
@@ -151,38 +161,35 @@ impl Job<'_> {
     fn refine(&self, view: &mut View) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
         let (rendered, image) = read(self.input, view, self.background)?;
-        let mut refined = if self.network.architecture().guided {
+        let refined = if self.network.architecture().guided {
             let references: Vec<&KnownView> = self.references.iter().collect();
-            self.network.refine_by(&guided(&rendered, &references), self.strength)?
+            self.network.refine_by(&guided(&rendered, &references), self.strength, self.turns)?
         } else {
-            self.network.refine_by(&rendered.view, self.strength)?
+            self.network.refine_by(&rendered.view, self.strength, self.turns)?
         };
-        let own = self.photographs.as_ref().map(|p| Ok::<_, anyhow::Error>(p.of(&view.camera)?.map(|picture| (p, picture))));
-        let own = own.transpose()?.flatten();
-        if let Some((photographs, picture)) = &own {
-            refined = photographs.agree(&refined, picture);
-        }
+        let agreed = match &self.photographs {
+            Some(photographs) => photographs.of(&view.camera)?.map(|own| photographs.agree(&refined, &own)),
+            None => None,
+        };
+        let (refined, is_own) = agreed.map_or((refined, false), |agreed| (agreed, true));
         let path = format!("images/{name}.exr");
         self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;
         view.image = Some(path.clone());
         view.depth = view.depth.as_ref().map(|_| path);
-        Ok(own.is_some())
+        Ok(is_own)
     }
 
     /// A view's file with other colours.
     fn write(&self, path: &Path, image: &ExrImage, refined: &Picture, opacity: &[f32]) -> anyhow::Result<()> {
-        let kept: Vec<(Channel, Option<&[f32]>)> = CHANNELS
+        // All but the colours stay.
+        let kept: Vec<(Channel, Option<&[f32]>)> = VIEW_CHANNELS
             .into_iter()
             .enumerate()
-            .filter_map(|(i, (name, sample_type))| {
-                let samples = image.channel(name);
-                samples.map(|s| (Channel { name, sample_type }, (i >= 3).then_some(s)))
-            })
+            .filter_map(|(i, channel)| Some((channel, image.channel(channel.name).map(|s| (i >= 3).then_some(s))?)))
             .collect();
         let channels: Vec<Channel> = kept.iter().map(|(c, _)| *c).collect();
-        let note = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
-        let written = write_exr(path, (image.width, image.height), &channels, note, |first, rows, samples| {
+        let written = write_exr(path, (image.width, image.height), &channels, VIEW_NOTE, |first, rows, samples| {
             let pixels = first * image.width..(first + rows) * image.width;
             for (i, sample) in pixels.zip(samples.chunks_exact_mut(kept.len())) {
                 for (c, (value, (_, same))) in sample.iter_mut().zip(&kept).enumerate() {

@@ -64,6 +64,41 @@ impl Square {
     }
 }
 
+/// One of the eight ways to lay a square of pixels: turned by right angles, mirrored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Turn {
+    /// Rows for columns.
+    swap: bool,
+    flip_x: bool,
+    flip_y: bool,
+}
+
+impl Turn {
+    /// All of them; the first leaves a square as it is.
+    pub(crate) const ALL: [Self; 8] = {
+        let mut all = [Self { swap: false, flip_x: false, flip_y: false }; 8];
+        let mut i = 0;
+        while i < 8 {
+            all[i] = Self { swap: i & 4 != 0, flip_x: i & 1 != 0, flip_y: i & 2 != 0 };
+            i += 1;
+        }
+        all
+    };
+
+    /// The size of a square once it is turned.
+    pub(crate) fn of(self, square: Square) -> Square {
+        let (width, height) = square.size;
+        Square { size: if self.swap { (height, width) } else { (width, height) }, ..square }
+    }
+
+    /// Where in a square a place of the turned one comes from.
+    pub(crate) fn source(self, square: Square, x: usize, y: usize) -> (usize, usize) {
+        let (x, y) = if self.swap { (y, x) } else { (x, y) };
+        let (width, height) = square.size;
+        (if self.flip_x { width - 1 - x } else { x }, if self.flip_y { height - 1 - y } else { y })
+    }
+}
+
 /// A tensor's samples as [`Square::unfold`] takes them.
 pub(crate) fn samples(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     let flat = tensor.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
@@ -89,5 +124,21 @@ mod tests {
             count += 1;
         });
         assert_eq!(count, 24);
+    }
+
+    #[test]
+    fn turns_are_eight_and_lose_nothing() {
+        let square = Square { x: 3, y: 4, size: (6, 2) };
+        let mut seen = std::collections::BTreeSet::new();
+        for turn in Turn::ALL {
+            let mut places = Vec::new();
+            turn.of(square).fold(|x, y| places.push(turn.source(square, x, y)));
+            let all: std::collections::BTreeSet<_> = places.iter().copied().collect();
+            assert_eq!(all.len(), 12);
+            assert!(all.iter().all(|&(x, y)| x < 6 && y < 2));
+            seen.insert(places);
+        }
+        assert_eq!(seen.len(), 8);
+        assert_eq!(Turn::ALL[0].source(square, 4, 1), (4, 1));
     }
 }

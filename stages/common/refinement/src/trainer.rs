@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
-use crate::folded::{FOLD, Square};
+use crate::folded::{FOLD, Square, Turn};
 use crate::guide::{guide, guided};
 use crate::refiner::{OUTPUTS, Refiner};
 use crate::view::KnownView;
@@ -141,7 +141,7 @@ impl RefinerTrainer {
         let strength = if power > 0.0 { (agreement / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
-            let by = self.refiner.refine_by(view, strength as f32)?;
+            let by = self.refiner.refine_by(view, strength as f32, 1)?;
             let error: f64 = by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
             refined += psnr_of(error / truth.data.len() as f64);
         }
@@ -199,8 +199,7 @@ fn shard(
 struct Drawn<'a> {
     example: &'a KnownView,
     square: Square,
-    /// Rows for columns; mirrored along each.
-    turn: [bool; 3],
+    turn: Turn,
     /// Which channel comes first, second, third.
     order: [usize; OUTPUTS],
     /// Examples that are its references.
@@ -230,7 +229,7 @@ impl<'a> Drawn<'a> {
             placed = place();
         }
         let (example, square) = placed;
-        let turn = [(); 3].map(|()| draws.below(2) == 1);
+        let turn = Turn::ALL[draws.below(Turn::ALL.len() as u64) as usize];
         let mut order = [0, 1, 2];
         (1..OUTPUTS).for_each(|i| order.swap(i, draws.below(i as u64 + 1) as usize));
         let (contrast, shift) = (0.5 + 0.7 * draws.uniform(), 0.4 * (draws.uniform() - 0.5));
@@ -251,7 +250,7 @@ impl<'a> Drawn<'a> {
         let (view, surface) = (&rendered.view, rendered.surface());
         let around = self.square.grown(refiner.reach());
         around.fold(|x, y| {
-            let (x, y) = self.source(x, y, around.size.0);
+            let (x, y) = self.turn.source(around, x, y);
             let pixel = around.of(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
@@ -262,17 +261,10 @@ impl<'a> Drawn<'a> {
             }
         });
         self.square.fold(|x, y| {
-            let (x, y) = self.source(x, y, self.square.size.0);
+            let (x, y) = self.turn.source(self.square, x, y);
             let (seen, wanted) = (self.square.of(view, x, y), self.square.of(truth, x, y));
             lacks.extend(self.order.map(|c| self.gain * (wanted[c] - seen[c])));
         });
-    }
-
-    /// Where a place of a turned square of that side comes from.
-    fn source(&self, x: usize, y: usize, side: usize) -> (usize, usize) {
-        let [swap, flip_x, flip_y] = self.turn;
-        let (x, y) = if swap { (y, x) } else { (x, y) };
-        (if flip_x { side - 1 - x } else { x }, if flip_y { side - 1 - y } else { y })
     }
 }
 
@@ -315,7 +307,7 @@ mod tests {
 
     fn trained(guided: bool) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
-        let options = RefinerTraining { steps: 150, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
+        let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
         let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
