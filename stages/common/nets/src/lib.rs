@@ -2,8 +2,9 @@
 //!
 //! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes don't depend on threads.
 //! * [`device`]: the device that a stage was asked to use, or why it can't be.
+//! * [`tensor_of`], [`picture_of`]: pictures as tensors.
 //! * [`Adam`]: the optimiser, on gradients that are given.
-//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have.
+//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have; [`Conv`]: a layer of them.
 //!
 //! ```no_run,standalone_crate
 //! nets::deterministic();
@@ -13,6 +14,8 @@
 //! ```
 
 mod adam;
+mod conv;
+mod picture;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -22,6 +25,8 @@ use safetensors::{Dtype, SafeTensors};
 use tch::{Cuda, Device, Kind, TchError, Tensor};
 
 pub use adam::{Adam, all_finite};
+pub use conv::Conv;
+pub use picture::{picture_of, tensor_of};
 
 /// Makes libtorch repeat its bytes: sums are split by thread, so it gets one.
 pub fn deterministic() {
@@ -132,6 +137,18 @@ impl Weights {
             .ok_or_else(|| WeightsError::Format { path: self.path.clone(), reason: format!("no tensor {name} of {count} bytes") })
     }
 
+    /// Whether there is a tensor of that name.
+    pub fn has(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
+    /// The shape of a tensor that must have so many dimensions: for networks whose size is what their file says.
+    pub fn shape<const N: usize>(&self, name: &str) -> Result<[i64; N], WeightsError> {
+        let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
+        let size = self.tensors.get(name).ok_or_else(|| format(format!("no tensor {name}")))?.size();
+        size.as_slice().try_into().map_err(|_| format(format!("tensor {name} is {size:?} where {N} dimensions are expected")))
+    }
+
     /// A tensor of floats that must have a shape.
     pub fn tensor(&self, name: &str, shape: &[i64]) -> Result<Tensor, WeightsError> {
         let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
@@ -201,6 +218,8 @@ mod tests {
         assert_eq!(f64::try_from(weights.tensor("a", &[2, 3]).unwrap().sum(Kind::Double)).unwrap(), 15.0);
         assert!(weights.tensor("a", &[3, 2]).unwrap_err().to_string().contains("[2, 3]"));
         assert!(weights.tensor("b", &[1]).is_err());
+        assert_eq!(weights.shape::<2>("a").unwrap(), [2, 3]);
+        assert!(weights.shape::<3>("a").is_err() && weights.shape::<1>("b").is_err() && weights.has("a") && !weights.has("b"));
         std::fs::write(&path, b"not safetensors").unwrap();
         assert!(Weights::read(&path).is_err());
     }

@@ -1,0 +1,209 @@
+//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each picture alone: the baselines of the paper's tables.
+//!
+//! * `bicubic`: Pillow's, on 8 bits, to the last bit.
+//! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much smaller.
+//! * `liif`: a network for any scale.
+//!
+//! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py` makes them from released checkpoints);
+//! every tensor's shape is checked. Pictures are composited on their background, enlarged as display-encoded sRGB, and are opaque
+//! afterwards: there is no depth to them.
+//!
+//! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on how many there are.
+
+#[cfg(test)]
+mod goldens;
+mod imdn;
+mod layers;
+mod liif;
+mod swinir;
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use nets::Weights;
+use pixels::{Filter, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_premultiplied, resize_pillow, write_exr, write_png};
+use rayon::prelude::*;
+use scene::{Camera, VIEWS_FILE, View, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use tch::{TchError, Tensor, no_grad};
+
+/// Parameters of `upsample`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// How views are enlarged.
+    pub method: Method,
+    /// The network's file in input weights. Without it: `imdn_xS.safetensors` or `swinir_xS.safetensors`, where S is the scale, or
+    /// `liif.safetensors`.
+    pub file: Option<String>,
+}
+
+/// Ways to enlarge a picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// Pillow's bicubic filter, on 8 bits.
+    #[default]
+    Bicubic,
+    /// IMDN, a light convolutional network (Hui et al. 2019).
+    Imdn,
+    /// LIIF, a local implicit image function behind EDSR's baseline encoder, for any scale (Chen et al. 2021).
+    Liif,
+    /// SwinIR, a transformer (Liang et al. 2021).
+    Swinir,
+}
+
+/// The stage.
+pub struct Upsample;
+
+impl Stage for Upsample {
+    type Params = Params;
+    const NAME: &'static str = "upsample";
+    const SUMMARY: &'static str = "Enlarges views by a 2-D method, as a baseline.";
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        let cameras = ["scene/cameras", "scene/truth", "cameras"];
+        vec![
+            ("views", Input::required(&["views"], "rendered views, at LR")),
+            ("cameras", Input::required(&cameras, "their cameras, at HR: how large the views become")),
+            ("weights", Input::optional(&["weights"], "folder with the network's safetensors file")),
+        ]
+    }
+
+    fn output() -> Output {
+        Output::kind("views")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        nets::deterministic();
+        let input = context.input("views")?;
+        let (views, cameras) = (Views::read(input)?, Views::read(context.input("cameras")?)?);
+        let pairs = views.views.iter().map(|view| pair(view, &cameras)).collect::<anyhow::Result<Vec<_>>>()?;
+        let networks = networks(context, params, &pairs)?;
+        let progress = context.progress("enlarging", pairs.len() as u64);
+        let lanes = networks.len();
+        let work = networks.into_par_iter().enumerate().map(|(lane, network)| -> anyhow::Result<()> {
+            for (view, camera) in pairs.iter().skip(lane).step_by(lanes) {
+                context.check_interrupt()?;
+                let file = view.image.as_ref().with_context(|| format!("view {}: it has no picture", camera.name));
+                let low = read_premultiplied(&input.path(file.bad_input("input views")?));
+                let low = low.bad_input(format!("view {}", camera.name))?.over(views.background.shown());
+                let large = enlarge(network.as_deref(), &low, camera).with_context(|| format!("view {}", camera.name))?;
+                write(context, &camera.name, &large)?;
+                progress.add(1);
+            }
+            Ok(())
+        });
+        work.collect::<anyhow::Result<Vec<_>>>()?;
+        let large = pairs.iter().map(|(_, camera)| {
+            let image = Some(format!("images/{}.exr", camera.name));
+            View { image, ..View::camera_only((*camera).clone()) }
+        });
+        let large = Views { hull: None, ..Views::new(views.background, views.bounds, large.collect()) };
+        context.write_json(VIEWS_FILE, &large)?;
+        let name = format!("{:?}", params.method).to_lowercase();
+        context.write_summary(&format!("{} views, by {name}", large.views.len()))
+    }
+}
+
+/// A network that enlarges pictures.
+trait Network: Send {
+    /// Times that it enlarges; `None`: any.
+    fn scale(&self) -> Option<i64>;
+
+    /// A picture (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one scale enlarges by that.
+    fn enlarge(&self, picture: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
+}
+
+/// A view and its HR camera.
+fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a Camera)> {
+    let camera = cameras.taken_by(&view.camera).map(|v| &v.camera);
+    let missing = || Failure::BadInput(format!("input cameras: no camera {} with that view's pose", view.camera.name));
+    Ok((view, camera.ok_or_else(missing)?))
+}
+
+/// A network for each thread, none for what needs none.
+fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
+    if params.method == Method::Bicubic {
+        return Ok((0..context.threads).map(|_| None).collect());
+    }
+    let widths = pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
+    let (low, high) = widths.unwrap_or((1, 1));
+    let scale = (f64::from(high) / f64::from(low)).round();
+    let default = match params.method {
+        Method::Imdn => format!("imdn_x{scale}.safetensors"),
+        Method::Swinir => format!("swinir_x{scale}.safetensors"),
+        Method::Liif | Method::Bicubic => "liif.safetensors".to_owned(),
+    };
+    let file = params.file.as_ref().unwrap_or(&default);
+    let weights = open(context.optional_input("weights"), file)?;
+    let read = || -> Result<Box<dyn Network>, nets::WeightsError> {
+        Ok(match params.method {
+            Method::Imdn => Box::new(imdn::Imdn::read(&weights)?),
+            Method::Swinir => Box::new(swinir::SwinIr::read(&weights)?),
+            Method::Liif | Method::Bicubic => Box::new(liif::Liif::read(&weights)?),
+        })
+    };
+    let networks = (0..context.threads).map(|_| read().map(Some)).collect::<Result<Vec<_>, _>>();
+    let networks = networks.bad_input("input weights")?;
+    let scale = networks.first().and_then(|n| n.as_ref()?.scale());
+    for (view, camera) in pairs {
+        let [low, high] = [&view.camera, *camera].map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
+        fit(scale, low, high).map_err(|reason| Failure::BadInput(format!("view {}: {file} {reason}", camera.name)))?;
+    }
+    Ok(networks)
+}
+
+/// Whether a network of that scale makes the high size of the low one; what is wrong otherwise.
+fn fit(scale: Option<i64>, low: [i64; 2], high: [i64; 2]) -> Result<(), String> {
+    match scale.filter(|by| low.map(|size| size * by) != high) {
+        None => Ok(()),
+        Some(by) => Err(format!(
+            "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, or bicubic or liif",
+            high[0], high[1], low[0], low[1]
+        )),
+    }
+}
+
+/// The network's tensors, from a file of that name in the input.
+fn open(input: Option<&GivenInput>, file: &str) -> anyhow::Result<Weights> {
+    let make = "scripts/convert-weights.py makes it from the published checkpoint";
+    let Some(input) = input else {
+        return Err(Failure::BadInput(format!("input weights is missing: give a folder with {file}; {make}")).into());
+    };
+    if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
+        return Err(Failure::Usage(format!("file: {file:?} is no name of a file in input weights")).into());
+    }
+    let path = input.path(file);
+    if !path.is_file() {
+        return Err(Failure::BadInput(format!("input weights: no file {file} in it; {make}")).into());
+    }
+    Weights::read(&path).bad_input("input weights")
+}
+
+/// A picture at the size of a camera.
+fn enlarge(network: Option<&dyn Network>, low: &Picture, camera: &Camera) -> anyhow::Result<Picture> {
+    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let Some(network) = network else {
+        let large = resize_pillow(&low.to_rgba8(), width as usize, height as usize, Filter::Bicubic);
+        return Ok(Picture::premultiplied(&large).over(0.0));
+    };
+    let size = [i64::from(height), i64::from(width)];
+    let large = no_grad(|| network.enlarge(&nets::tensor_of(low)?, size))?.f_clamp(0.0, 1.0)?;
+    Ok(nets::picture_of(&large)?)
+}
+
+/// A view's files: opaque colours, and a preview.
+fn write(context: &Context, name: &str, large: &Picture) -> anyhow::Result<()> {
+    let channels = &VIEW_CHANNELS[..4];
+    let path = context.output_path(&format!("images/{name}.exr"))?;
+    write_exr(&path, (large.width, large.height), channels, VIEW_NOTE, |first, rows, samples| {
+        let pixels = large.data[first * large.width * 3..(first + rows) * large.width * 3].chunks_exact(3);
+        for (sample, pixel) in samples.chunks_exact_mut(4).zip(pixels) {
+            sample[..3].copy_from_slice(pixel);
+            sample[3] = 1.0;
+        }
+        Ok::<(), PixelError>(())
+    })?;
+    Ok(write_png(&context.output_path(&format!("previews/{name}.png"))?, &large.to_rgba8())?)
+}

@@ -1,0 +1,285 @@
+use nets::{Conv, Weights, WeightsError};
+use tch::{Kind, TchError, Tensor};
+
+use crate::Network;
+use crate::layers::{Linear, Norm, count, leaky, root};
+
+/// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for super-resolution, by the names of its released weights:
+/// the classical, the lightweight and the real-world models. Width, depth, heads, window, scale and kind are what the file says.
+pub(crate) struct SwinIr {
+    first: Conv,
+    embedded: Option<Norm>,
+    groups: Vec<Group>,
+    norm: Norm,
+    after: Convs,
+    head: Head,
+    window: i64,
+    scale: i64,
+}
+
+/// Mean colour of the pictures that it was trained on.
+const MEAN: [f32; 3] = [0.4488, 0.4371, 0.4040];
+/// What leaks through the ReLUs between three convolutions in a row, and of the real-world head.
+const SLOPE: f64 = 0.2;
+/// What leaks through the ReLU before enlarging.
+const HEAD_SLOPE: f64 = 0.01;
+/// What keeps places in a window that aren't neighbours in the picture from seeing each other.
+const FAR: f32 = -100.0;
+
+/// Transformer blocks, and a convolution after them.
+struct Group {
+    blocks: Vec<Block>,
+    after: Convs,
+}
+
+/// One convolution, or three of which the middle ones are narrow.
+struct Convs(Vec<Conv>);
+
+/// From features to a larger picture.
+enum Head {
+    /// Pixels shuffled one or several times, by so many; the classical models.
+    Shuffled { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
+    /// Shuffled at once; the lightweight models.
+    Direct { up: Conv },
+    /// Pixels repeated and filtered; the real-world models.
+    Repeated { before: Conv, steps: Vec<Conv>, high: Conv, last: Conv },
+}
+
+/// Attention within windows, then a network of two layers, each added to what came in.
+struct Block {
+    norms: [Norm; 2],
+    qkv: Linear,
+    /// Heads × places × places.
+    bias: Tensor,
+    projection: Linear,
+    layers: [Linear; 2],
+    heads: i64,
+    /// How far windows are shifted.
+    shift: i64,
+}
+
+impl SwinIr {
+    pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
+        let [width, ..] = weights.shape::<4>("conv_first.weight")?;
+        let table = "layers.0.residual_group.blocks.0.attn.relative_position_bias_table";
+        let window = ((root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
+        let groups = count(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
+        let (head, scale) = Head::read(weights, width)?;
+        let embedded = weights.has("patch_embed.norm.weight").then(|| Norm::read(weights, "patch_embed.norm", width));
+        Ok(Self {
+            first: Conv::read(weights, "conv_first", [width, 3, 3, 3])?,
+            embedded: embedded.transpose()?,
+            groups: (0..groups).map(|i| Group::read(weights, i, width, window)).collect::<Result<_, _>>()?,
+            norm: Norm::read(weights, "norm", width)?,
+            after: Convs::read(weights, "conv_after_body", width)?,
+            head,
+            window,
+            scale,
+        })
+    }
+}
+
+impl Network for SwinIr {
+    fn scale(&self) -> Option<i64> {
+        Some(self.scale)
+    }
+
+    fn enlarge(&self, picture: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
+        let [_, _, rows, columns] = picture.size()[..] else {
+            return Err(TchError::Shape("a picture has four dimensions".to_owned()));
+        };
+        let mean = Tensor::f_from_slice(&MEAN)?.f_reshape([1, 3, 1, 1])?;
+        let whole = self.whole_windows(&picture.f_sub(&mean)?)?;
+        let first = self.first.forward(&whole, 1, 1)?;
+        let mut x = first.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        if let Some(norm) = &self.embedded {
+            x = norm.forward(&x)?;
+        }
+        let mask = far(x.size()[1], x.size()[2], self.window)?;
+        for group in &self.groups {
+            x = group.forward(&x, self.window, &mask)?;
+        }
+        let deep = self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
+        let large = self.head.forward(&deep)?.f_add(&mean)?;
+        large.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
+    }
+}
+
+impl SwinIr {
+    /// The picture mirrored beyond its last row and column until windows are whole.
+    fn whole_windows(&self, picture: &Tensor) -> Result<Tensor, TchError> {
+        let mut x = picture.shallow_clone();
+        for axis in [2, 3] {
+            let size = picture.size()[axis];
+            let lacks = size.rem_euclid(self.window);
+            if lacks > 0 {
+                // Mirrored at the last one, as often as it takes: a picture may be smaller than a window.
+                let period = (2 * (size - 1)).max(1);
+                let source = |i: i64| if i % period < size { i % period } else { period - i % period };
+                let index: Vec<i64> = (0..size + self.window - lacks).map(source).collect();
+                x = x.f_index_select(axis as i64, &Tensor::f_from_slice(&index)?)?;
+            }
+        }
+        Ok(x)
+    }
+}
+
+impl Group {
+    fn read(weights: &Weights, index: usize, width: i64, window: i64) -> Result<Self, WeightsError> {
+        let name = |i: usize| format!("layers.{index}.residual_group.blocks.{i}");
+        let blocks = count(weights, 0, |i| format!("{}.norm1.weight", name(i)));
+        // Windows of every other block are shifted by half a window.
+        let block = |i: usize| Block::read(weights, &name(i), width, window, if i % 2 == 1 { window / 2 } else { 0 });
+        Ok(Self {
+            blocks: (0..blocks).map(block).collect::<Result<_, _>>()?,
+            after: Convs::read(weights, &format!("layers.{index}.conv"), width)?,
+        })
+    }
+
+    fn forward(&self, x: &Tensor, window: i64, mask: &Tensor) -> Result<Tensor, TchError> {
+        let mut inner = x.shallow_clone();
+        for block in &self.blocks {
+            inner = block.forward(&inner, window, mask)?;
+        }
+        self.after.forward(&inner.f_permute([0, 3, 1, 2])?)?.f_permute([0, 2, 3, 1])?.f_add(x)
+    }
+}
+
+impl Convs {
+    fn read(weights: &Weights, name: &str, width: i64) -> Result<Self, WeightsError> {
+        if weights.has(&format!("{name}.weight")) {
+            return Ok(Self(vec![Conv::read(weights, name, [width, width, 3, 3])?]));
+        }
+        let narrow = width / 4;
+        Ok(Self(vec![
+            Conv::read(weights, &format!("{name}.0"), [narrow, width, 3, 3])?,
+            Conv::read(weights, &format!("{name}.2"), [narrow, narrow, 1, 1])?,
+            Conv::read(weights, &format!("{name}.4"), [width, narrow, 3, 3])?,
+        ]))
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        match &self.0[..] {
+            [one, two, three] => {
+                let inner = leaky(&one.forward(x, 1, 1)?, SLOPE)?;
+                three.forward(&leaky(&two.forward(&inner, 1, 0)?, SLOPE)?, 1, 1)
+            }
+            convs => convs[0].forward(x, 1, 1),
+        }
+    }
+}
+
+impl Head {
+    /// The head that the weights are for, and how much it enlarges.
+    fn read(weights: &Weights, width: i64) -> Result<(Self, i64), WeightsError> {
+        let conv = |name: &str, outputs: i64, inputs: i64| Conv::read(weights, name, [outputs, inputs, 3, 3]);
+        if !weights.has("conv_before_upsample.0.weight") {
+            let scale = root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
+            return Ok((Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)? }, scale));
+        }
+        let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
+        let (before, last) = (conv("conv_before_upsample.0", middle, width)?, conv("conv_last", 3, middle)?);
+        if weights.has("conv_up1.weight") {
+            let steps = count(weights, 1, |i| format!("conv_up{i}.weight"));
+            let read = (1..=steps).map(|i| conv(&format!("conv_up{i}"), middle, middle)).collect::<Result<Vec<_>, _>>()?;
+            let high = conv("conv_hr", middle, middle)?;
+            return Ok((Self::Repeated { before, steps: read, high, last }, 1 << steps.min(8)));
+        }
+        let (mut scale, mut steps) = (1, Vec::new());
+        for i in 0..count(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
+            let name = format!("upsample.{}", 2 * i);
+            let by = root(weights.shape::<4>(&format!("{name}.weight"))?[0] / middle.max(1));
+            steps.push((conv(&name, by * by * middle, middle)?, by));
+            scale *= by;
+        }
+        Ok((Self::Shuffled { before, steps, last }, scale))
+    }
+
+    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        match self {
+            Self::Direct { up } => up.forward(x, 1, 1)?.f_pixel_shuffle(root(up.outputs() / 3)),
+            Self::Shuffled { before, steps, last } => {
+                let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
+                for (conv, by) in steps {
+                    x = conv.forward(&x, 1, 1)?.f_pixel_shuffle(*by)?;
+                }
+                last.forward(&x, 1, 1)
+            }
+            Self::Repeated { before, steps, high, last } => {
+                let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
+                for conv in steps {
+                    let repeated = x.f_repeat_interleave_self_int(2, 2, None)?.f_repeat_interleave_self_int(2, 3, None)?;
+                    x = leaky(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
+                }
+                last.forward(&leaky(&high.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
+            }
+        }
+    }
+}
+
+impl Block {
+    fn read(weights: &Weights, name: &str, width: i64, window: i64, shift: i64) -> Result<Self, WeightsError> {
+        let part = |part: &str| format!("{name}.{part}");
+        let table = part("attn.relative_position_bias_table");
+        let heads = weights.shape::<2>(&table)?[1].max(1);
+        let reach = 2 * window - 1;
+        let table = weights.tensor(&table, &[reach * reach, heads])?;
+        let [hidden, _] = weights.shape::<2>(&part("mlp.fc1.weight"))?;
+        let linear = |of: &str, outputs: i64, inputs: i64| Linear::read(weights, &part(of), [outputs, inputs]);
+        Ok(Self {
+            norms: [Norm::read(weights, &part("norm1"), width)?, Norm::read(weights, &part("norm2"), width)?],
+            qkv: linear("attn.qkv", 3 * width, width)?,
+            bias: table.index_select(0, &relative(window)).reshape([window * window, window * window, heads]).permute([2, 0, 1]),
+            projection: linear("attn.proj", width, width)?,
+            layers: [linear("mlp.fc1", hidden, width)?, linear("mlp.fc2", width, hidden)?],
+            heads,
+            shift,
+        })
+    }
+
+    /// `x`: 1 × rows × columns × channels, whole windows.
+    fn forward(&self, x: &Tensor, window: i64, mask: &Tensor) -> Result<Tensor, TchError> {
+        let [_, rows, columns, width] = x.size()[..] else {
+            return Err(TchError::Shape("features have four dimensions".to_owned()));
+        };
+        let shifted = self.norms[0].forward(x)?.f_roll([-self.shift, -self.shift], [1, 2])?;
+        let (down, across, places) = (rows / window, columns / window, window * window);
+        let windows = shifted.f_reshape([down, window, across, window, width])?.f_permute([0, 2, 1, 3, 4])?;
+        let windows = windows.f_reshape([down * across, places, width])?;
+        let parts = self.qkv.forward(&windows)?.f_reshape([down * across, places, 3, self.heads, width / self.heads])?;
+        let parts = parts.f_permute([2, 0, 3, 1, 4])?;
+        let part = |i: i64| parts.f_select(0, i);
+        let scale = 1.0 / ((width / self.heads) as f64).sqrt();
+        let mut attention = part(0)?.f_mul_scalar(scale)?.f_matmul(&part(1)?.f_transpose(-2, -1)?)?.f_add(&self.bias)?;
+        if self.shift > 0 {
+            attention = attention.f_add(mask)?;
+        }
+        let seen = attention.f_softmax(-1, Kind::Float)?.f_matmul(&part(2)?)?;
+        let seen = self.projection.forward(&seen.f_transpose(1, 2)?.f_reshape([down * across, places, width])?)?;
+        let seen = seen.f_reshape([down, across, window, window, width])?.f_permute([0, 2, 1, 3, 4])?;
+        let x = seen.f_reshape([1, rows, columns, width])?.f_roll([self.shift, self.shift], [1, 2])?.f_add(x)?;
+        let inner = self.layers[0].forward(&self.norms[1].forward(&x)?)?.f_gelu("none")?;
+        self.layers[1].forward(&inner)?.f_add(&x)
+    }
+}
+
+/// For each pair of places in a window, which entry of the table has their bias.
+fn relative(window: i64) -> Tensor {
+    let places = || (0..window).flat_map(|y| (0..window).map(move |x| (y, x)));
+    let index = |(a, b): ((i64, i64), (i64, i64))| (a.0 - b.0 + window - 1) * (2 * window - 1) + a.1 - b.1 + window - 1;
+    let all: Vec<i64> = places().flat_map(|a| places().map(move |b| index((a, b)))).collect();
+    Tensor::from_slice(&all)
+}
+
+/// What is added to the attention of shifted windows (windows × 1 × places × places): what is rolled around from the other end isn't near.
+fn far(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
+    let region = |i: i64, size: i64| i64::from(i >= size - window) + i64::from(i >= size - window / 2);
+    let (down, across, places) = (rows / window, columns / window, window * window);
+    let mut mask = Vec::with_capacity((down * across * places * places) as usize);
+    for w in 0..down * across {
+        let of = |p: i64| (region(w / across * window + p / window, rows), region(w % across * window + p % window, columns));
+        let regions: Vec<(i64, i64)> = (0..places).map(of).collect();
+        mask.extend(regions.iter().flat_map(|a| regions.iter().map(move |b| if a == b { 0.0 } else { FAR })));
+    }
+    Tensor::f_from_slice(&mask)?.f_reshape([down * across, 1, places, places])
+}
