@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality refine-table ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build setup test lint lego sweep quality table refine-table ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -76,6 +76,11 @@ SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --out $(or $(OUT),out/quality.json)
+
+METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
+table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
+	@python3 scripts/table.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --methods $(METHODS) \
+	  $(if $(SPLIT),--split $(SPLIT)) $(if $(RAYS),--rays $(RAYS)) --kernel $(firstword $(KERNEL)) --out $(or $(OUT),out/table.md)
 
 REFERENCES ?= 1
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE

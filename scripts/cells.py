@@ -44,10 +44,15 @@ def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: l
         command += ["-i", f"weights={weights}"]
     command += [word for setting in settings for word in ("-p", setting)]
     print("==", *settings, flush=True)
+    call(command)
+    return [figures(row) for row in json.loads((page / target / "results.json").read_text())]
+
+
+def call(command: list) -> None:
+    """Runs a command; if it fails, so does the script."""
     done = subprocess.run([str(word) for word in command])
     if done.returncode != 0:
         sys.exit(done.returncode)
-    return [figures(row) for row in json.loads((page / target / "results.json").read_text())]
 
 
 def figures(row: dict) -> dict:

@@ -2,7 +2,8 @@
 """Makes the golden files of `upsample`, from PyTorch's own layers: run by `make goldens`.
 
 The networks are built here from their papers' descriptions, small and with fixed random weights, and run in f64. A file has a network's
-weights, inputs (golden.input.N) and outputs (golden.output.N, at sizes that follow from them).
+weights, inputs (golden.input.N) and outputs (golden.output.N). Some weights are saved as their projects release them, too, for
+tests/checkpoint.rs.
 
 With NERF_SR_DATA (or ../shared/data) there, IMDN's released weights are run on ten test views, too, and the scores are kept.
 """
@@ -234,16 +235,28 @@ def golden(name, network, cases):
         with torch.no_grad():
             tensors[f"golden.output.{i}"] = network(x.double(), *more).float().contiguous()
     save_file(tensors, TO / f"{name}.safetensors")
+    return {key: value for key, value in tensors.items() if not key.startswith("golden")}
+
+
+def released(name, state):
+    torch.save(state, ROOT / f"tests/data/{name}.pth")
 
 
 TO.mkdir(parents=True, exist_ok=True)
-golden("imdn", Imdn(16, 2, 3), [(9, 7)])
-golden("liif", Liif(6, 2, [24, 16]), [(9, 7, 18, 14), (7, 10, round(7 * 3.3), 33), (5, 6, 20, 24), (6, 5, 13, 21)])
+imdn = golden("imdn", Imdn(16, 2, 3), [(9, 7)])
+liif = golden("liif", Liif(6, 2, [24, 16]), [(9, 7, 18, 14), (7, 10, round(7 * 3.3), 33), (5, 6, 20, 24), (6, 5, 13, 21)])
 golden("swinir_classical", SwinIr(12, [2, 3], 3, 4, "shuffled", 4), [(8, 12), (9, 13), (5, 7)])
 golden("swinir_classical_x3", SwinIr(8, [2], 2, 4, "shuffled", 3), [(7, 9)])
-golden("swinir_light", SwinIr(8, [2], 2, 4, "direct", 2), [(7, 9)])
+light = golden("swinir_light", SwinIr(8, [2], 2, 4, "direct", 2), [(7, 9)])
 golden("swinir_real", SwinIr(16, [2, 2], 2, 8, "repeated", 4, three=True), [(16, 8), (11, 21)])
 golden("swinir_real_x2", SwinIr(8, [2], 2, 4, "repeated", 2), [(10, 6)])
+
+released("imdn", {f"module.{key}": value for key, value in imdn.items()})
+shifts = {f"encoder.{side}_mean.{part}": torch.eye(3) for side in ("sub", "add") for part in ("weight", "bias")}
+released("liif", {"model": {"name": "liif", "args": {"cell_decode": True}, "sd": liif | shifts}, "epoch": 1000})
+first = "layers.0.residual_group.blocks"
+extra = {f"{first}.0.attn.relative_position_index": torch.zeros(16, 16, dtype=torch.long), f"{first}.1.attn_mask": torch.zeros(4, 16, 16)}
+released("swinir", {"params": light | extra})
 
 # IMDN as released, on ten test views at 200 px over white, LR by Pillow's bicubic filter.
 data = pathlib.Path(os.environ.get("NERF_SR_DATA", ROOT.parent / "shared/data"))

@@ -77,3 +77,36 @@ fn what_is_no_checkpoint_is_one_line() {
     fails(&hostile, &["hostile.pth", "system"]);
     assert!(!hostile.with_extension("pth.ran").exists());
 }
+
+/// Weights as their projects release them become files that hold the same tensors; those of another network, or of none, are refused.
+#[test]
+fn released_weights_become_what_upsample_reads() {
+    let project = Project::tiny();
+    let convert = |network: &str, from: &str, out: &Path| {
+        let script = here("scripts/convert-weights.py");
+        Finished::of(Command::new("python3").arg(script).arg(network).arg(here(from)).arg(out).output().unwrap())
+    };
+    for (network, golden) in [("imdn", "imdn"), ("liif", "liif"), ("swinir", "swinir_light")] {
+        let out = project.path(&format!("{network}.safetensors"));
+        let done = convert(network, &format!("tests/data/{network}.pth"), &out);
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        let expected = std::fs::read(here(&format!("stages/upsample/tests/data/{golden}.safetensors"))).unwrap();
+        let (found, expected) = (std::fs::read(&out).unwrap(), expected);
+        let [found, expected] = [&found, &expected].map(|bytes| safetensors::SafeTensors::deserialize(bytes).unwrap());
+        let names = || expected.names().into_iter().filter(|name| !name.starts_with("golden."));
+        assert_eq!(found.len(), names().count(), "{network}");
+        for name in names() {
+            let [a, b] = [&found, &expected].map(|file| file.tensor(name).unwrap());
+            assert!(a.shape() == b.shape() && a.data() == b.data(), "{network}: {name}");
+        }
+    }
+    let out = project.path("none.safetensors");
+    let fails = |network: &str, from: &str, words: &[&str]| {
+        let said = convert(network, from, &out);
+        said.fails(1, words);
+        assert!(said.stderr.lines().count() == 1 && !out.exists(), "{}", said.stderr);
+    };
+    fails("imdn", "tests/data/liif.pth", &["liif.pth", "fea_conv.weight is missing", "imdn"]);
+    fails("swinir", "tests/data/imdn.pth", &["conv_first.weight is missing"]);
+    fails("liif", "Cargo.toml", &["Cargo.toml", "not a checkpoint"]);
+}

@@ -202,7 +202,7 @@ fn contradictions_are_refused() {
     let out = project.path("out");
     let refused = |params: &str, words: &[&str]| stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
     refused(r#"{"degrade": "none", "lr": 16}"#, &["parameter lr", "leave lr out"]);
-    refused(r#"{"degrade": "none", "kernel": "avg"}"#, &["parameter kernel", "choose box"]);
+    refused(r#"{"degrade": "none", "kernel": "average"}"#, &["parameter kernel", "choose box"]);
     refused(r#"{"degrade": "box", "kernel": "lanczos"}"#, &["parameter kernel", "give one of them"]);
     refused(r#"{"degrade": "none", "hr": 16}"#, &["32", "larger than", "16"]);
 }

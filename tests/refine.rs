@@ -41,7 +41,7 @@ const REFINED: &str = "
     inputs: {views: refine-referenced, truth: prep/truth}
   referenced:
     run: report
-    inputs: {run: eval, refined: eval-refined, referenced: eval-referenced}
+    inputs: {run: eval, refined: eval-refined, anything: eval-referenced}
 ";
 
 fn project() -> Project {

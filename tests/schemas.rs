@@ -29,6 +29,7 @@ fn schemas_are_current() {
     parameters::<video::Video>(&mut all);
     parameters::<train_refine::TrainRefine>(&mut all);
     parameters::<refine::Refine>(&mut all);
+    parameters::<upsample::Upsample>(&mut all);
     for (name, schema) in [
         ("pipeline", of::<runner::Pipeline>()),
         ("describe", of::<artifact::Description>()),

@@ -4,7 +4,7 @@ use crate::sizes::Sizes;
 
 /// Extension of the LR files: 8-bit PNG, or EXR where nothing is rounded.
 pub(crate) fn extension(kernel: Kernel) -> &'static str {
-    if kernel == Kernel::Avg { "exr" } else { "png" }
+    if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
 /// How far, in LR pixels, an LR pixel reads to each side.
@@ -12,7 +12,7 @@ pub(crate) fn footprint(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos => 3,
         Kernel::Bicubic => 2,
-        Kernel::Box | Kernel::Avg => 1,
+        Kernel::Box | Kernel::Average => 1,
     }
 }
 
@@ -49,7 +49,7 @@ impl LowResolution {
 /// The HR picture by Lanczos from the photograph, and the LR picture from that 8-bit HR one: two steps, as the paper's code does.
 ///
 /// # Panics
-/// With [`Kernel::Avg`] when the sizes aren't whole multiples.
+/// With [`Kernel::Average`] when the sizes aren't whole multiples.
 pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResolution) {
     let size = |(w, h): (u32, u32)| (w as usize, h as usize);
     let (hr_size, lr_size) = (size(sizes.hr), size(sizes.lr));
@@ -58,9 +58,9 @@ pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResol
         Kernel::Lanczos | Kernel::Bicubic | Kernel::Box => {
             LowResolution::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
         }
-        Kernel::Avg => {
+        Kernel::Average => {
             let pooled = average_pool(&hr, hr_size.0 / lr_size.0, hr_size.1 / lr_size.1);
-            let mut picture = pooled.expect("avg is refused for sizes that don't divide");
+            let mut picture = pooled.expect("an average is refused for sizes that don't divide");
             // The mean of straight colours times the mean alpha: what the paper's code composites.
             for p in picture.data.chunks_exact_mut(4) {
                 (0..3).for_each(|c| p[c] *= p[3]);

@@ -105,7 +105,7 @@ pub enum Degrade {
     /// From HR images, by that kernel.
     Box,
     /// From HR images, by that kernel.
-    Avg,
+    Average,
 }
 
 impl Degrade {
@@ -116,7 +116,7 @@ impl Degrade {
             Self::Lanczos => Some(Kernel::Lanczos),
             Self::Bicubic => Some(Kernel::Bicubic),
             Self::Box => Some(Kernel::Box),
-            Self::Avg => Some(Kernel::Avg),
+            Self::Average => Some(Kernel::Average),
         }
     }
 }
@@ -222,10 +222,11 @@ impl Stage for Prep {
         let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
         let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
         notes.iter().for_each(|note| context.say(note));
-        if making.kernel == Kernel::Avg {
+        if making.kernel == Kernel::Average {
             let all = split.train.iter().chain(&split.test).map(|&i| set.frames[i].pinhole().map(|k| job.sizes_of(&k)));
             if let Some(odd) = all.collect::<Result<Vec<_>, _>>().bad_input("dataset")?.iter().find(|s| !s.is_integer()) {
-                let message = format!("parameter kernel: avg needs a whole scale, not {:?} → {:?}; choose box", odd.hr, odd.lr);
+                let message =
+                    format!("parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box", odd.hr, odd.lr);
                 return Err(Failure::Usage(message).into());
             }
         }
@@ -283,8 +284,8 @@ impl Making {
         if !has_truth && params.lr.is_some() {
             return Err("parameter lr: without degradation the photographs' own size is the LR size; leave lr out".to_owned());
         }
-        if !has_truth && params.kernel == Some(Kernel::Avg) {
-            return Err("parameter kernel: avg makes LR images and can't be assumed; choose box".to_owned());
+        if !has_truth && params.kernel == Some(Kernel::Average) {
+            return Err("parameter kernel: average makes LR images and can't be assumed; choose box".to_owned());
         }
         let default = if has_truth { Kernel::Lanczos } else { Kernel::Box };
         Ok(Self { has_truth, kernel: by_degrade.or(params.kernel).unwrap_or(default) })
@@ -469,7 +470,7 @@ impl Job<'_> {
         let views = train.views.par_iter().zip(pictures).map(make).collect::<anyhow::Result<Vec<_>>>()?;
         self.context.write_json(&format!("rehearsal/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
         // LR pictures that weren't rounded are shrunk by the box: the same, and for any size.
-        let kernel = if kernel == Kernel::Avg { Kernel::Box } else { kernel };
+        let kernel = if kernel == Kernel::Average { Kernel::Box } else { kernel };
         self.context.write_json(&format!("rehearsal/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
     }
 

@@ -2,10 +2,12 @@
 //!
 //! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it shows times and hashes.
 //!
+//! * `compare`: where several blocks score, what each made of a crop of one view, beside its error map.
 //! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes and times.
 //! * `pictures`: views and depth as embedded PNG data.
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 
+mod compare;
 mod page;
 mod pictures;
 mod results;
@@ -23,11 +25,15 @@ pub struct Params {
     /// Views to show, spread evenly over the test views.
     #[schemars(range(min = 1, max = 100))]
     pub views: u32,
+    /// The view to show of every method side by side, by name; without it: the first.
+    pub compare: Option<String>,
+    /// The square of it to show: x, y and side, in pixels; without it: the one with most detail.
+    pub crop: Option<[u32; 3]>,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { views: 4 }
+        Self { views: 4, compare: None, crop: None }
     }
 }
 
@@ -41,11 +47,13 @@ impl Stage for Report {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![
-            ("run", Input::required(&["run"], "folder with run.json, the record of a run")),
-            ("refined", Input::optional(&["run"], "in pipeline.yaml: scores to show beside those of `run`")),
-            ("referenced", Input::optional(&["run"], "in pipeline.yaml: further scores to show beside those")),
-        ]
+        vec![(
+            "run",
+            Input::required(
+                &["run"],
+                "folder with run.json, the record of a run; in pipeline.yaml: scores, and more under any name",
+            ),
+        )]
     }
 
     fn output() -> Output {
@@ -55,7 +63,7 @@ impl Stage for Report {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
-        let html = page::page(&run, params.views as usize)?;
+        let html = page::page(&run, params)?;
         std::fs::write(context.output_path("index.html")?, html.into_string())?;
         context.write_json("results.json", &results::results(&run)?)
     }

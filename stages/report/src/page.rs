@@ -5,6 +5,8 @@ use maud::{DOCTYPE, Markup, PreEscaped, html};
 use scene::Views;
 use serde_json::Value;
 
+use crate::Params;
+use crate::compare::compare;
 use crate::pictures::{colour, data_uri, depth, uri_of};
 use crate::results::metrics;
 
@@ -15,22 +17,25 @@ table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .3rem .7r
 td.n { text-align: right; font-variant-numeric: tabular-nums } th { font-weight: 600 } .best { font-weight: 700 }
 .row { display: flex; gap: 6px; flex-wrap: wrap; margin: .4rem 0 1.2rem } figure { margin: 0; flex: 1 1 180px; max-width: 300px }
 figure img { width: 100%; border: 1px solid #ddd; display: block } img.lr, img.px { image-rendering: pixelated }
+/* One column a method, the same in both rows. */
+.compare figure { flex: 1 1 0; min-width: 110px }
 figcaption { font-size: .82rem; color: #555 } code { font-size: .85em } details { margin: .3rem 0 } small { color: #666 }
 ";
 
 /// What a metrics node was scored on.
-struct Point<'a> {
-    node: &'a RunNode,
-    metrics: Value,
+pub(crate) struct Point<'a> {
+    pub(crate) node: &'a RunNode,
+    pub(crate) metrics: Value,
     index: usize,
 }
 
-pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
+pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
     let mut points = Vec::new();
     for (index, node) in run.nodes.iter().enumerate().filter(|(_, n)| n.kind == "metrics") {
         points.push(Point { node, metrics: metrics(node)?, index });
     }
-    let galleries = points.iter().map(|p| gallery(run, p, views)).collect::<anyhow::Result<Vec<_>>>()?;
+    let galleries = points.iter().map(|p| gallery(run, p, params.views as usize)).collect::<anyhow::Result<Vec<_>>>()?;
+    let compared = compare(run, &points, params)?;
     Ok(html! {
         (DOCTYPE)
         html lang="en" {
@@ -43,6 +48,7 @@ pub(crate) fn page(run: &RunRecord, views: usize) -> anyhow::Result<Markup> {
             body {
                 h1 { "nerf-sr report" }
                 (scores(run, &points))
+                (compared)
                 @for (point, gallery) in points.iter().zip(&galleries) {
                     h2 { "Views" @if points.len() > 1 { " · " (label(&points, point)) } }
                     (gallery)
@@ -101,7 +107,7 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
 }
 
 /// What tells a point from the others: its values in the sweep and, where several blocks score, whose scores they are.
-fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
+pub(crate) fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
     let (stage, values) = (point.node.stage.as_str(), point.node.point.as_str());
     match (points.iter().any(|p| p.node.stage != stage), values) {
         (false, "") => "default".to_owned(),

@@ -201,7 +201,9 @@ fn check(pipeline: &Pipeline, programs: &BTreeMap<String, Arc<StageProgram>>) ->
             return Err(pipeline.error(name, Some(&problems[0].name), problems[0].to_string()));
         }
         for (input, source) in &block.inputs {
-            let Some(port) = description.inputs.get(input) else {
+            // A sink gets one record of all that it is shown; what its inputs are called is the file's own affair.
+            let record = || description.inputs.get("run").filter(|_| description.sink);
+            let Some(port) = description.inputs.get(input).or_else(record) else {
                 let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
                 return Err(pipeline.error(name, Some(input), format!("it has no input {input:?}; known: {known}")));
             };

@@ -14,16 +14,16 @@ pub enum Kernel {
     /// Pillow's box: the mean of whole pixels, premultiplied.
     Box,
     /// The paper code's average: colour and alpha apart, never rounded. Needs a whole scale.
-    Avg,
+    Average,
 }
 
 impl Kernel {
-    /// The filter it resizes with; `Avg` isn't one, but a box is nearly the same.
+    /// The filter it resizes with; `Average` isn't one, but a box is nearly the same.
     pub fn filter(self) -> Filter {
         match self {
             Self::Lanczos => Filter::Lanczos,
             Self::Bicubic => Filter::Bicubic,
-            Self::Box | Self::Avg => Filter::Box,
+            Self::Box | Self::Average => Filter::Box,
         }
     }
 }

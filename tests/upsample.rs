@@ -1,0 +1,116 @@
+//! `upsample` in a pipeline, what it says to what it can't do, and `make table`, which puts every method side by side.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+
+use common::{Project, manifest, stage};
+use pixels::{Filter, Picture, read_exr, read_premultiplied, resize_pillow};
+
+/// A project whose LR views are enlarged.
+fn project() -> Project {
+    let project = Project::tiny();
+    let blocks = "
+  views-low:
+    like: render-depth
+    inputs: {field: train-ss, cameras: prep/cameras}
+    parameters: {size: 24}
+  upsample:
+    inputs: {views: views-low, cameras: prep/cameras}
+  eval-upsampled:
+    like: eval
+    inputs: {views: upsample, truth: prep/truth}
+";
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + blocks));
+    project
+}
+
+fn goldens() -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("stages/upsample/tests/data")
+}
+
+#[test]
+fn views_are_enlarged_and_scored() {
+    let project = project();
+    project.ok(&["run", "eval-upsampled"]);
+    let folder = |stage: &str| project.object(&project.output_of(stage, &["eval-upsampled"])[0]);
+    let (low, large) = (folder("views-low"), folder("upsample"));
+    for file in std::fs::read_dir(low.join("images")).unwrap() {
+        let name = file.unwrap().file_name();
+        let before = read_premultiplied(&low.join("images").join(&name)).unwrap().over(1.0);
+        let after = read_exr(&large.join("images").join(&name)).unwrap();
+        assert_eq!((after.width, after.height, after.channel("Z")), (48, 48, None));
+        // Pillow's own bicubic filter on 8 bits, but for half precision.
+        let expected = Picture::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
+        let worst = (0..4).flat_map(|c| {
+            let found = after.channel(["R", "G", "B", "A"][c]).unwrap();
+            expected.channel(c).into_iter().zip(found).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>()
+        });
+        assert!(worst.fold(0.0, f32::max) < 3e-4);
+    }
+    // A network of the same scale, and one of any: small ones with random weights.
+    let weights = project.path("weights");
+    std::fs::create_dir(&weights).unwrap();
+    std::fs::copy(goldens().join("swinir_light.safetensors"), weights.join("swinir_x2.safetensors")).unwrap();
+    std::fs::copy(goldens().join("liif.safetensors"), weights.join("liif.safetensors")).unwrap();
+    let run = project.ok(&["run", "eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir,liif"]);
+    assert!(run.contains("method=swinir") && run.contains("method=liif"), "{run}");
+    // At any thread count the same bytes.
+    let outputs = project.output_of("upsample", &["eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir"]);
+    let (views, cameras) = (low, folder("prep").join("cameras"));
+    for threads in ["1", "3"] {
+        let output = project.path(&format!("threads-{threads}"));
+        let inputs = [("views", views.as_path()), ("cameras", &cameras), ("weights", &weights)];
+        let done = stage("upsample", r#"{"method": "swinir"}"#, &inputs, &output, &["--threads", threads]);
+        assert_eq!(done.code, 0, "{}", done.stderr);
+        assert_eq!(manifest(&output), manifest(&project.object(&outputs[0])), "{threads} threads");
+    }
+
+    let fails = |params: &str, weights: Option<&Path>, code: i32, words: &[&str]| {
+        let output = project.path("none");
+        let mut inputs = vec![("views", views.as_path()), ("cameras", cameras.as_path())];
+        inputs.extend(weights.map(|weights| ("weights", weights)));
+        stage("upsample", params, &inputs, &output, &[]).fails(code, words);
+        assert!(!output.exists());
+    };
+    fails(r#"{"method": "imdn"}"#, None, 3, &["weights is missing", "imdn_x2.safetensors", "convert-weights.py"]);
+    fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["no file imdn_x2.safetensors"]);
+    fails(r#"{"method": "imdn", "file": "liif.safetensors"}"#, Some(&weights), 3, &["fea_conv", "the right network"]);
+    fails(r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#, Some(&weights), 2, &["no name of a file"]);
+    std::fs::copy(goldens().join("imdn.safetensors"), weights.join("imdn_x2.safetensors")).unwrap();
+    fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["enlarges 3 times", "48×48 of 24×24", "liif"]);
+}
+
+#[test]
+fn the_table_has_every_method_side_by_side() {
+    let project = Project::tiny();
+    project.demo_data();
+    let methods = ["nerf", "nerf-epochs", "bicubic", "swinir", "ss", "kernel", "hr"];
+    let arguments =
+        [&["--scenes", "demo", "--protocols", "24x2", "--rays", "40000", "--out", "out/table.md", "--methods"], &methods[..]];
+    let done = project.script("table.py", &arguments.concat());
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    let table = std::fs::read_to_string(project.path("out/table.md")).unwrap();
+    for words in
+        ["| NeRF-Swin | other pictures | weights not given: swinir_x2.safetensors |", "equal epochs", "conventions", "GiB"]
+    {
+        let there = table.contains(words) || words == "conventions" && table.contains("* psnr: -10 log10");
+        assert!(there, "no {words:?} in:\n{table}");
+    }
+    let rows: Vec<serde_json::Value> = serde_json::from_slice(&std::fs::read(project.path("out/table.json")).unwrap()).unwrap();
+    assert_eq!(rows.len(), methods.len());
+    let psnr = |method: &str| rows.iter().find(|r| r["method"] == method).unwrap()["psnr"].as_f64();
+    assert!(psnr("swinir").is_none());
+    assert!(psnr("hr").unwrap() > psnr("bicubic").unwrap(), "{rows:?}");
+    assert_ne!(psnr("ss"), psnr("nerf"));
+    let lines = std::fs::read_to_string(project.path("out/table.csv")).unwrap();
+    assert_eq!(lines.lines().count(), 1 + methods.len());
+    let page = std::fs::read_to_string(project.path("out/table/demo-24x2/table/index.html")).unwrap();
+    assert!(page.contains("Side by side") && page.contains("alt=\"eval-bicubic"), "the page compares nothing");
+    assert!(std::fs::read_to_string(project.path("out/table.html")).unwrap().contains("table/demo-24x2/table/index.html"));
+    // Again: all is there.
+    let again = project.script("table.py", &arguments.concat());
+    assert!(again.stdout.contains("nothing to run"), "{}", again.stdout);
+}
