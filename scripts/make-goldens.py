@@ -91,6 +91,97 @@ def ssim():
     out.write_text(json.dumps({"scikit-image": skimage.__version__, "torch": torch.__version__.split("+")[0], "cases": cases}, indent=1) + "\n")
 
 
+def draw(purpose, count):
+    """Numbers in [0, 1), as `radiance::uniform(7, purpose, 0..)` gives them."""
+
+    def scramble(x):
+        x = x + numpy.uint64(0x9E3779B97F4A7C15)
+        x = (x ^ (x >> numpy.uint64(30))) * numpy.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> numpy.uint64(27))) * numpy.uint64(0x94D049BB133111EB)
+        return x ^ (x >> numpy.uint64(31))
+
+    with numpy.errstate(over="ignore"):
+        start = scramble(numpy.uint64(7) ^ (numpy.uint64(purpose) * numpy.uint64(0xD1B54A32D192ED03)))
+        state = scramble(start ^ numpy.arange(count, dtype=numpy.uint64)) + numpy.uint64(0x9E3779B97F4A7C15)
+        return ((scramble(state) >> numpy.uint64(40)).astype(numpy.float64) / 2**24).astype(numpy.float32)
+
+
+def lpips():
+    """LPIPS by PyTorch's layers, with weights that are drawn: every network, one pair of pictures."""
+    import torch
+    from torch.nn import functional
+
+    fire = lambda i, inputs, squeezed, expanded: (i, inputs, squeezed, expanded)
+    # A number: a stage's end; P: a pooling (size, with the border); (index, inputs, outputs, size, stride, padding); or a fire.
+    networks = {
+        "squeeze": [(0, 3, 64, 3, 2, 0), 64, ("P", 3, True), fire(3, 64, 16, 64), fire(4, 128, 16, 64), 128, ("P", 3, True),
+                    fire(6, 128, 32, 128), fire(7, 256, 32, 128), 256, ("P", 3, True), fire(9, 256, 48, 192), 384,
+                    fire(10, 384, 48, 192), 384, fire(11, 384, 64, 256), 512, fire(12, 512, 64, 256), 512],
+        "alex": [(0, 3, 64, 11, 4, 2), 64, ("P", 3, False), (3, 64, 192, 5, 1, 2), 192, ("P", 3, False),
+                 (6, 192, 384, 3, 1, 1), 384, (8, 384, 256, 3, 1, 1), 256, (10, 256, 256, 3, 1, 1), 256],
+        "vgg": [(0, 3, 64, 3, 1, 1), (2, 64, 64, 3, 1, 1), 64, ("P", 2, False), (5, 64, 128, 3, 1, 1), (7, 128, 128, 3, 1, 1), 128,
+                ("P", 2, False), (10, 128, 256, 3, 1, 1), (12, 256, 256, 3, 1, 1), (14, 256, 256, 3, 1, 1), 256, ("P", 2, False),
+                (17, 256, 512, 3, 1, 1), (19, 512, 512, 3, 1, 1), (21, 512, 512, 3, 1, 1), 512, ("P", 2, False),
+                (24, 512, 512, 3, 1, 1), (26, 512, 512, 3, 1, 1), (28, 512, 512, 3, 1, 1), 512],
+    }
+    a = torch.from_numpy(pattern(45, 37, 3, 9).astype(numpy.float64) / 255)
+    b = 0.7 * a + 0.3 * torch.from_numpy(pattern(45, 37, 3, 109).astype(numpy.float64) / 255)
+    result = {}
+    for number, (name, layers) in enumerate(networks.items()):
+        first = purpose = 1000 * (number + 1)
+        weights, heads = [], []
+
+        def tensor(of, name, shape, scale, shift):
+            nonlocal purpose
+            of.append({"name": name, "shape": list(shape), "scale": scale, "shift": shift})
+            values = numpy.float32(scale) * draw(purpose, int(numpy.prod(shape))) + numpy.float32(shift)
+            purpose += 1
+            return torch.from_numpy(values.reshape(shape)).double()
+
+        def conv(name, outputs, inputs, size):
+            reach = (6 / (inputs * size * size)) ** 0.5
+            kernel = tensor(weights, f"{name}.weight", (outputs, inputs, size, size), 2 * reach, -reach)
+            return kernel, tensor(weights, f"{name}.bias", (outputs,), 0.2, -0.1)
+
+        read = []
+        for layer in layers:
+            if isinstance(layer, int) or layer[0] == "P":
+                read.append(layer)
+            elif len(layer) == 4:
+                index, inputs, squeezed, expanded = layer
+                at = f"features.{index}"
+                read.append([conv(f"{at}.squeeze", squeezed, inputs, 1), conv(f"{at}.expand1x1", expanded, squeezed, 1),
+                             conv(f"{at}.expand3x3", expanded, squeezed, 3)])
+            else:
+                index, inputs, outputs, size, stride, padding = layer
+                read.append((*conv(f"features.{index}", outputs, inputs, size), stride, padding))
+        stages = [layer for layer in layers if isinstance(layer, int)]
+        linear = [tensor(heads, f"lin{k}.model.1.weight", (1, channels, 1, 1), 1.0, 0.0) for k, channels in enumerate(stages)]
+
+        def features(x):
+            x = (2 * x - 1).permute(2, 0, 1)[None]
+            constant = lambda *v: torch.tensor(v, dtype=torch.float64).view(1, 3, 1, 1)
+            x, found = (x - constant(-0.030, -0.088, -0.188)) / constant(0.458, 0.448, 0.450), []
+            for layer in read:
+                if isinstance(layer, int):
+                    found.append(x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10))
+                elif layer[0] == "P":
+                    x = functional.max_pool2d(x, layer[1], 2, ceil_mode=layer[2])
+                elif isinstance(layer, list):
+                    squeeze, one, three = layer
+                    x = torch.relu(functional.conv2d(x, *squeeze))
+                    x = torch.cat([torch.relu(functional.conv2d(x, *one)), torch.relu(functional.conv2d(x, *three, padding=1))], 1)
+                else:
+                    x = torch.relu(functional.conv2d(x, layer[0], layer[1], stride=layer[2], padding=layer[3]))
+            return found
+
+        parts = zip(features(a), features(b), linear)
+        distance = sum((functional.conv2d((x - y).square(), head)).mean() for x, y, head in parts)
+        result[name] = {"purpose": first, "weights": weights, "heads": heads, "distance": distance.item()}
+    (ROOT / "stages/eval/tests/goldens/lpips.json").write_text(json.dumps(result, indent=1) + "\n")
+
+
 if __name__ == "__main__":
     pillow()
     ssim()
+    lpips()

@@ -54,6 +54,8 @@ PAPER = {
 }
 # Where the paper's values of single scenes are known: SS at 200x4.
 PAPER_SCENES = {("lego", "200x4"): 29.13, ("chair", "200x4"): 30.16}
+# LPIPS's networks; `--set eval.lpips=alex` chooses another.
+LPIPS = {"squeeze": "squeezenet1_1.safetensors", "alex": "alexnet.safetensors", "vgg": "vgg16.safetensors"}
 # Sub-rays of a pixel in our supersampling.
 SUB_RAYS = 4
 
@@ -171,7 +173,7 @@ def cell(scene: str, protocol: str) -> list[dict]:
     command = [options.nerf_sr, "run", "table", "-j", "1", "--pipeline", page / "pipeline.yaml", "--store", store, "--out", page]
     folder = cells.dataset(options.data, scene).resolve()
     command += ["-i", f"dataset={folder}"] + (["-i", f"prep-hr.dataset={folder}"] if "hr" in run else [])
-    if (weights / "squeezenet1_1.safetensors").is_file():
+    if (weights / LPIPS[chosen.get("eval.lpips", "squeeze")]).is_file():
         command += ["-i", f"eval.weights={weights.resolve()}"]
     command += [word for name, value in chosen.items() for word in ("-p", f"{OF[name]}.{name}={value}" if name in OF else f"{name}={value}")]
     print("==", scene, protocol, flush=True)

@@ -2,7 +2,7 @@
 //!
 //! * [`psnr`]: of the mean squared error over all samples; predictions clamped to [0, 1].
 //! * [`ssim`]: Gaussian window, reflected at the border or valid pixels only.
-//! * `lpips`: SqueezeNet, where its weights are given and the build has libtorch.
+//! * `lpips`: by SqueezeNet, AlexNet or VGG-16, where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
 //! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
 //! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
@@ -44,11 +44,45 @@ pub struct Params {
     /// The absolute error that error maps show in their brightest colour.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub error_range: f64,
+    /// The network behind LPIPS, where its weights are given.
+    pub lpips: LpipsNetwork,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { ssim_border: Border::Reflect, error_range: 0.25 }
+        Self { ssim_border: Border::Reflect, error_range: 0.25, lpips: LpipsNetwork::Squeeze }
+    }
+}
+
+/// Networks whose features LPIPS compares. Their distances differ: name the network beside the figure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum LpipsNetwork {
+    /// SqueezeNet 1.1.
+    Squeeze,
+    /// AlexNet, as torchvision has it; what most papers mean by LPIPS.
+    Alex,
+    /// VGG-16.
+    Vgg,
+}
+
+impl LpipsNetwork {
+    /// Names of the files with its weights (torchvision's names of tensors) and with the learned heads.
+    pub fn files(self) -> [&'static str; 2] {
+        match self {
+            Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
+            Self::Alex => ["alexnet.safetensors", "lpips_linear_alex_v0.1.safetensors"],
+            Self::Vgg => ["vgg16.safetensors", "lpips_linear_vgg_v0.1.safetensors"],
+        }
+    }
+
+    /// What it is called.
+    fn title(self) -> &'static str {
+        match self {
+            Self::Squeeze => "SqueezeNet 1.1",
+            Self::Alex => "AlexNet",
+            Self::Vgg => "VGG-16",
+        }
     }
 }
 
@@ -151,7 +185,7 @@ impl Stage for Eval {
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "folder with squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, for LPIPS",
+                    "folder with a network and its heads, for LPIPS: by default squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors",
                 ),
             ),
         ]
@@ -164,7 +198,7 @@ impl Stage for Eval {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let (views_in, truth_in) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
-        let perceptual = Perceptual::new(context.optional_input("weights"))?;
+        let perceptual = Perceptual::new(context.optional_input("weights"), params.lpips)?;
         let is_known = truth_in.path(DEGRADATION_FILE).exists();
         let made: Option<Degradation> = if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
         let filter = made.map_or(Filter::Box, |d| d.kernel.filter());
@@ -180,7 +214,7 @@ impl Stage for Eval {
         let mean = mean_of(&scored);
         let metrics = Metrics { conventions: conventions(params, truth.background, &perceptual, made), mean, views: scored };
         context.write_json("metrics.json", &metrics)?;
-        context.write_summary(&summary(&metrics, &perceptual))
+        context.write_summary(&summary(&metrics))
     }
 }
 
@@ -362,11 +396,11 @@ fn conventions(params: &Params, background: Background, perceptual: &Perceptual,
     }
 }
 
-fn summary(metrics: &Metrics, perceptual: &Perceptual) -> String {
+fn summary(metrics: &Metrics) -> String {
     let mean = &metrics.mean;
     let mut parts = Vec::new();
     if let (Some(psnr), Some(ssim)) = (mean.psnr, mean.ssim) {
-        let lpips = mean.lpips.map_or_else(|| perceptual.missing().to_owned(), |v| format!("{v:.4}"));
+        let lpips = mean.lpips.map_or_else(|| MISSING.to_owned(), |v| format!("{v:.4}"));
         parts.push(format!("PSNR {psnr:.2} dB · SSIM {ssim:.4} · LPIPS {lpips}"));
     }
     parts.extend(mean.depth.map(|d| format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)));
@@ -378,65 +412,77 @@ fn summary(metrics: &Metrics, perceptual: &Perceptual) -> String {
 }
 
 /// LPIPS, or the reason why there is none.
-enum Perceptual {
-    /// Networks that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
+struct Perceptual {
+    network: LpipsNetwork,
     #[cfg(feature = "torch")]
-    Given {
-        folder: std::path::PathBuf,
-        free: std::sync::Mutex<Vec<Lpips>>,
-    },
-    Missing,
+    given: Option<Given>,
 }
 
+/// Networks that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
+#[cfg(feature = "torch")]
+struct Given {
+    folder: std::path::PathBuf,
+    free: std::sync::Mutex<Vec<Lpips>>,
+}
+
+#[cfg(feature = "torch")]
 impl Perceptual {
-    #[cfg(feature = "torch")]
-    fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
-        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self::Missing) };
-        let first = Lpips::read(folder).bad_input("weights")?;
-        Ok(Self::Given { folder: folder.to_path_buf(), free: std::sync::Mutex::new(vec![first]) })
+    fn new(weights: Option<&GivenInput>, network: LpipsNetwork) -> anyhow::Result<Self> {
+        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self { network, given: None }) };
+        let first = Lpips::read(folder, network).bad_input("weights")?;
+        let given = Given { folder: folder.to_path_buf(), free: std::sync::Mutex::new(vec![first]) };
+        Ok(Self { network, given: Some(given) })
     }
 
-    #[cfg(not(feature = "torch"))]
-    fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
-        if weights.is_some() {
-            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
-            return Err(Failure::Usage(message.to_owned()).into());
-        }
-        Ok(Self::Missing)
-    }
-
-    #[cfg(feature = "torch")]
     fn distance(&self, found: &Picture, expected: &Picture) -> anyhow::Result<Option<f64>> {
-        let Self::Given { folder, free } = self else { return Ok(None) };
+        let Some(Given { folder, free }) = &self.given else { return Ok(None) };
         let pool = || free.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let waiting = pool().pop();
         let lpips = match waiting {
             Some(lpips) => lpips,
-            None => Lpips::read(folder).bad_input("weights")?,
+            None => Lpips::read(folder, self.network).bad_input("weights")?,
         };
         let distance = lpips.distance(found, expected)?;
         pool().push(lpips);
         Ok(Some(distance))
     }
 
-    #[cfg(not(feature = "torch"))]
-    #[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
+    fn is_given(&self) -> bool {
+        self.given.is_some()
+    }
+}
+
+#[cfg(not(feature = "torch"))]
+#[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
+impl Perceptual {
+    fn new(weights: Option<&GivenInput>, network: LpipsNetwork) -> anyhow::Result<Self> {
+        if weights.is_some() {
+            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
+            return Err(Failure::Usage(message.to_owned()).into());
+        }
+        Ok(Self { network })
+    }
+
     fn distance(&self, _: &Picture, _: &Picture) -> anyhow::Result<Option<f64>> {
         Ok(None)
     }
 
-    fn missing(&self) -> &'static str {
-        "weights not given"
+    fn is_given(&self) -> bool {
+        false
     }
+}
 
+/// What stands where LPIPS would.
+const MISSING: &str = "weights not given";
+
+impl Perceptual {
     fn convention(&self) -> String {
-        match self {
-            #[cfg(feature = "torch")]
-            Self::Given { .. } => "v0.1, SqueezeNet 1.1, inputs in [-1, 1]".to_owned(),
-            Self::Missing => format!(
-                "{}: -i eval.weights=FOLDER with squeezenet1_1.safetensors (torchvision) and lpips_linear_squeeze_v0.1.safetensors (richzhang/PerceptualSimilarity)",
-                self.missing()
-            ),
+        let [net, heads] = self.network.files();
+        if self.is_given() {
+            return format!("v0.1, {}, inputs in [-1, 1]", self.network.title());
         }
+        format!(
+            "{MISSING}: -i eval.weights=FOLDER with {net} (torchvision's names) and {heads} (richzhang/PerceptualSimilarity); `lpips` has the network"
+        )
     }
 }

@@ -1,5 +1,4 @@
-//! LPIPS v0.1 with SqueezeNet 1.1 (Zhang et al. 2018): distances of normalised features after seven stages, weighted by
-//! learned heads.
+//! LPIPS v0.1 (Zhang et al. 2018): distances of a network's normalised features after each of its stages, weighted by learned heads.
 
 use std::path::Path;
 
@@ -8,103 +7,173 @@ use nets::{Conv, Weights, WeightsError};
 use pixels::Picture;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-/// The network and its heads.
+use crate::LpipsNetwork;
+
+/// A network and its heads.
 pub struct Lpips {
-    first: Conv,
-    fires: Vec<Fire>,
+    layers: Vec<Layer>,
     heads: Vec<Tensor>,
+    /// Pixels along a side that its poolings need.
+    least: usize,
 }
 
-/// Squeeze to few channels, expand by 1×1 and 3×3 side by side.
-struct Fire {
-    squeeze: Conv,
-    expand1: Conv,
-    expand3: Conv,
+enum Layer {
+    /// A convolution and a ReLU.
+    Conv { conv: Conv, stride: i64, padding: i64 },
+    /// SqueezeNet's: squeezed to few channels, expanded by 1×1 and 3×3 side by side; a ReLU after each.
+    Fire { squeeze: Conv, expand1: Conv, expand3: Conv },
+    /// The largest of a square; at the border of what is left of one, or of whole ones alone.
+    Pool { size: i64, border: bool },
+    /// The end of a stage: features are compared here.
+    Stage,
 }
 
-/// (index in torchvision's `features`, inputs, squeezed, expanded each way)
-const FIRES: [(usize, i64, i64, i64); 8] = [
-    (3, 64, 16, 64),
-    (4, 128, 16, 64),
-    (6, 128, 32, 128),
-    (7, 256, 32, 128),
-    (9, 256, 48, 192),
-    (10, 384, 48, 192),
-    (11, 384, 64, 256),
-    (12, 512, 64, 256),
-];
-/// Channels after each of the seven stages.
-const STAGES: [i64; 7] = [64, 128, 256, 384, 384, 512, 512];
+/// Reads a network's layers in order, and knows how many channels the next one takes.
+struct Reader<'a> {
+    weights: &'a Weights,
+    layers: Vec<Layer>,
+    channels: i64,
+    /// Channels at the end of each stage.
+    stages: Vec<i64>,
+}
+
+impl Reader<'_> {
+    /// A convolution with torchvision's index in `features`.
+    fn conv(&mut self, index: usize, outputs: i64, size: i64, stride: i64, padding: i64) -> Result<(), WeightsError> {
+        let conv = Conv::read(self.weights, &format!("features.{index}"), [outputs, self.channels, size, size])?;
+        self.layers.push(Layer::Conv { conv, stride, padding });
+        self.channels = outputs;
+        Ok(())
+    }
+
+    fn fire(&mut self, index: usize, squeezed: i64, expanded: i64) -> Result<(), WeightsError> {
+        let conv = |part: &str, shape| Conv::read(self.weights, &format!("features.{index}.{part}"), shape);
+        self.layers.push(Layer::Fire {
+            squeeze: conv("squeeze", [squeezed, self.channels, 1, 1])?,
+            expand1: conv("expand1x1", [expanded, squeezed, 1, 1])?,
+            expand3: conv("expand3x3", [expanded, squeezed, 3, 3])?,
+        });
+        self.channels = 2 * expanded;
+        Ok(())
+    }
+
+    fn pool(&mut self, size: i64, border: bool) {
+        self.layers.push(Layer::Pool { size, border });
+    }
+
+    fn stage(&mut self) {
+        self.layers.push(Layer::Stage);
+        self.stages.push(self.channels);
+    }
+
+    /// SqueezeNet 1.1.
+    fn squeeze(&mut self) -> Result<(), WeightsError> {
+        self.conv(0, 64, 3, 2, 0)?;
+        self.stage();
+        for (fires, squeezed, expanded) in [([3, 4], 16, 64), ([6, 7], 32, 128)] {
+            self.pool(3, true);
+            fires.into_iter().try_for_each(|index| self.fire(index, squeezed, expanded))?;
+            self.stage();
+        }
+        self.pool(3, true);
+        for (index, squeezed, expanded) in [(9, 48, 192), (10, 48, 192), (11, 64, 256), (12, 64, 256)] {
+            self.fire(index, squeezed, expanded)?;
+            self.stage();
+        }
+        Ok(())
+    }
+
+    /// AlexNet, as torchvision has it.
+    fn alex(&mut self) -> Result<(), WeightsError> {
+        self.conv(0, 64, 11, 4, 2)?;
+        self.stage();
+        self.pool(3, false);
+        self.conv(3, 192, 5, 1, 2)?;
+        self.stage();
+        self.pool(3, false);
+        for (index, outputs) in [(6, 384), (8, 256), (10, 256)] {
+            self.conv(index, outputs, 3, 1, 1)?;
+            self.stage();
+        }
+        Ok(())
+    }
+
+    /// VGG-16.
+    fn vgg(&mut self) -> Result<(), WeightsError> {
+        let blocks: [(i64, &[usize]); 5] =
+            [(64, &[0, 2]), (128, &[5, 7]), (256, &[10, 12, 14]), (512, &[17, 19, 21]), (512, &[24, 26, 28])];
+        for (block, (outputs, convs)) in blocks.into_iter().enumerate() {
+            if block > 0 {
+                self.pool(2, false);
+            }
+            convs.iter().try_for_each(|&index| self.conv(index, outputs, 3, 1, 1))?;
+            self.stage();
+        }
+        Ok(())
+    }
+}
 
 fn relu(conv: &Conv, x: &Tensor, stride: i64, padding: i64) -> Result<Tensor, TchError> {
     conv.forward(x, stride, padding)?.f_relu()
 }
 
-impl Fire {
+impl Layer {
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        let squeezed = relu(&self.squeeze, x, 1, 0)?;
-        Tensor::f_cat(&[relu(&self.expand1, &squeezed, 1, 0)?, relu(&self.expand3, &squeezed, 1, 1)?], 1)
+        match self {
+            Self::Conv { conv, stride, padding } => relu(conv, x, *stride, *padding),
+            Self::Fire { squeeze, expand1, expand3 } => {
+                let squeezed = relu(squeeze, x, 1, 0)?;
+                Tensor::f_cat(&[relu(expand1, &squeezed, 1, 0)?, relu(expand3, &squeezed, 1, 1)?], 1)
+            }
+            Self::Pool { size, border } => x.f_max_pool2d([*size; 2], [2, 2], [0, 0], [1, 1], *border),
+            Self::Stage => Ok(x.shallow_clone()),
+        }
     }
 }
 
-fn pool(x: &Tensor) -> Result<Tensor, TchError> {
-    x.f_max_pool2d([3, 3], [2, 2], [0, 0], [1, 1], true)
-}
-
 impl Lpips {
-    /// Reads `squeezenet1_1.safetensors` and `lpips_linear_squeeze_v0.1.safetensors` from a folder.
-    pub fn read(folder: &Path) -> Result<Self, WeightsError> {
+    /// Reads a network and its heads from a folder; [`LpipsNetwork::files`] has their names.
+    pub fn read(folder: &Path, network: LpipsNetwork) -> Result<Self, WeightsError> {
         nets::deterministic();
-        let net = Weights::read(&folder.join("squeezenet1_1.safetensors"))?;
-        let linear = Weights::read(&folder.join("lpips_linear_squeeze_v0.1.safetensors"))?;
-        let fire = |&(index, inputs, squeezed, expanded): &(usize, i64, i64, i64)| {
-            let name = |part: &str| format!("features.{index}.{part}");
-            Ok(Fire {
-                squeeze: Conv::read(&net, &name("squeeze"), [squeezed, inputs, 1, 1])?,
-                expand1: Conv::read(&net, &name("expand1x1"), [expanded, squeezed, 1, 1])?,
-                expand3: Conv::read(&net, &name("expand3x3"), [expanded, squeezed, 3, 3])?,
-            })
-        };
+        let [net, linear] = network.files();
+        let (net, linear) = (Weights::read(&folder.join(net))?, Weights::read(&folder.join(linear))?);
+        let mut reader = Reader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
+        let least = match network {
+            LpipsNetwork::Squeeze => reader.squeeze().map(|()| 17),
+            LpipsNetwork::Alex => reader.alex().map(|()| 31),
+            LpipsNetwork::Vgg => reader.vgg().map(|()| 16),
+        }?;
         let head = |(k, &channels): (usize, &i64)| linear.tensor(&format!("lin{k}.model.1.weight"), &[1, channels, 1, 1]);
-        Ok(Self {
-            first: Conv::read(&net, "features.0", [64, 3, 3, 3])?,
-            fires: FIRES.iter().map(fire).collect::<Result<_, _>>()?,
-            heads: STAGES.iter().enumerate().map(head).collect::<Result<_, _>>()?,
-        })
+        let heads = reader.stages.iter().enumerate().map(head).collect::<Result<_, _>>()?;
+        Ok(Self { layers: reader.layers, heads, least })
     }
 
     /// Distance of two RGB pictures in [0, 1].
     pub fn distance(&self, a: &Picture, b: &Picture) -> anyhow::Result<f64> {
-        // Three poolings by 2 need this much.
+        let least = self.least;
         anyhow::ensure!(
-            a.width >= 17 && a.height >= 17,
-            "LPIPS needs pictures of at least 17×17 pixels, not {}×{}",
+            a.width >= least && a.height >= least,
+            "LPIPS needs pictures of at least {least}×{least} pixels, not {}×{}",
             a.width,
             a.height
         );
-        let distance = no_grad(|| -> Result<f64, TchError> {
-            let (a, b) = (self.features(&input(a)?)?, self.features(&input(b)?)?);
-            let mut sum = 0.0;
-            for ((a, b), head) in a.iter().zip(&b).zip(&self.heads) {
-                let difference = normalised(a)?.f_sub(&normalised(b)?)?.f_square()?;
+        no_grad(|| self.sum_over_stages(a, b)).context("LPIPS")
+    }
+
+    fn sum_over_stages(&self, a: &Picture, b: &Picture) -> Result<f64, TchError> {
+        let (mut a, mut b, mut sum) = (input(a)?, input(b)?, 0.0);
+        let mut heads = self.heads.iter();
+        for layer in &self.layers {
+            (a, b) = (layer.forward(&a)?, layer.forward(&b)?);
+            if let Layer::Stage = layer
+                && let Some(head) = heads.next()
+            {
+                let difference = normalised(&a)?.f_sub(&normalised(&b)?)?.f_square()?;
                 let weighted = difference.f_conv2d::<Tensor>(head, None, [1, 1], [0, 0], [1, 1], 1)?;
                 sum += weighted.f_mean(Kind::Float)?.f_double_value(&[])?;
             }
-            Ok(sum)
-        });
-        distance.context("LPIPS")
-    }
-
-    fn features(&self, x: &Tensor) -> Result<[Tensor; 7], TchError> {
-        let f = &self.fires;
-        let one = relu(&self.first, x, 2, 0)?;
-        let two = f[1].forward(&f[0].forward(&pool(&one)?)?)?;
-        let three = f[3].forward(&f[2].forward(&pool(&two)?)?)?;
-        let four = f[4].forward(&pool(&three)?)?;
-        let five = f[5].forward(&four)?;
-        let six = f[6].forward(&five)?;
-        let seven = f[7].forward(&six)?;
-        Ok([one, two, three, four, five, six, seven])
+        }
+        Ok(sum)
     }
 }
 

@@ -50,7 +50,7 @@ fn lpips_gives_the_published_distances() {
         eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", weights.display());
         return;
     }
-    let lpips = eval::Lpips::read(&weights).unwrap();
+    let lpips = eval::Lpips::read(&weights, eval::LpipsNetwork::Squeeze).unwrap();
     let read = |name: &str| pixels::read_premultiplied(&weights.join(name)).unwrap().over(1.0);
     let reference = read("ex_ref.png");
     for (name, expected) in [("ex_p0.png", 0.7112), ("ex_p1.png", 0.1479)] {
@@ -58,4 +58,34 @@ fn lpips_gives_the_published_distances() {
         assert!((distance - expected).abs() < 0.002, "{name}: {distance}");
     }
     assert!(lpips.distance(&reference, &reference).unwrap().abs() < 1e-6);
+}
+
+/// Every network with fixed random weights, against PyTorch's layers (`scripts/make-goldens.py`).
+#[cfg(feature = "torch")]
+#[test]
+fn lpips_is_that_of_pytorch_with_every_network() {
+    use eval::LpipsNetwork::{Alex, Squeeze, Vgg};
+    let list: serde_json::Value = serde_json::from_str(include_str!("goldens/lpips.json")).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    for (name, network) in [("squeeze", Squeeze), ("alex", Alex), ("vgg", Vgg)] {
+        let case = &list[name];
+        let mut purpose = case["purpose"].as_u64().unwrap();
+        for (part, file) in ["weights", "heads"].iter().zip(network.files()) {
+            let tensors = case[part].as_array().unwrap().iter().map(|entry| {
+                let shape: Vec<i64> = serde_json::from_value(entry["shape"].clone()).unwrap();
+                let (scale, shift) = (entry["scale"].as_f64().unwrap() as f32, entry["shift"].as_f64().unwrap() as f32);
+                let count = shape.iter().product::<i64>() as u64;
+                let values: Vec<f32> = (0..count).map(|i| scale * radiance::uniform(7, purpose, i) + shift).collect();
+                purpose += 1;
+                (entry["name"].as_str().unwrap().to_owned(), tch::Tensor::from_slice(&values).reshape(&shape))
+            });
+            nets::write(&folder.path().join(file), &tensors.collect::<Vec<_>>()).unwrap();
+        }
+        let lpips = eval::Lpips::read(folder.path(), network).unwrap();
+        let (a, b) = pictures(45, 37, 9);
+        let (found, expected) = (lpips.distance(&a, &b).unwrap(), case["distance"].as_f64().unwrap());
+        assert!((found / expected - 1.0).abs() < 1e-4, "{name}: {found} where PyTorch has {expected}");
+        let (a, b) = pictures(15, 15, 9);
+        assert!(lpips.distance(&a, &b).unwrap_err().to_string().contains("at least"));
+    }
 }
