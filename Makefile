@@ -106,7 +106,7 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) cargo bench --quiet -p train-ss --bench bench
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
-	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py
+	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py && .venv/bin/python scripts/make-goldens-refiner.py
 
 clean: ## Remove what was built and run (not .libtorch)
 	rm -rf target .nerf-sr out

@@ -42,6 +42,16 @@ const REFINED: &str = "
   referenced:
     run: report
     inputs: {run: eval, refined: eval-refined, anything: eval-referenced}
+  train-paper:
+    like: train-refine
+    inputs: {views: reference-views, truth: prep/references}
+    parameters: {net: paper, steps: 3, batch: 2, square: 16, channels: 4}
+  refine-paper:
+    like: refine
+    inputs: {views: render-depth, refiner: train-paper, references: prep/references, reference-views: reference-views}
+  eval-paper:
+    like: eval
+    inputs: {views: refine-paper, truth: prep/truth}
 ";
 
 fn project() -> Project {
@@ -243,4 +253,34 @@ fn wrong_views_are_refused_in_a_line() {
     train("{}", &views, &truth.with_file_name("rehearsal")).fails(3, &["24×24 pixels where its picture has 12×12"]);
     train("{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has a picture, by name and pose, in input truth"]);
+}
+
+/// The published network goes through the same stages; what it can't do is said.
+#[test]
+fn the_paper_s_network_refines_by_references() {
+    let project = project();
+    project.replace("parameters: {size: 48,", "parameters: {size: 72,");
+    project.replace("{lr: 24, scale: 2}", "{lr: 36, scale: 2}");
+    project.ok(&["run", "eval-paper"]);
+    let folder = |stage: &str| project.object(&project.output_of(stage, &["eval-paper"])[0]);
+    let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
+    assert!(summary.contains("3 views by 1 references"), "{summary}");
+    let (views, refiner) = (folder("render-depth"), folder("train-paper"));
+    let file: serde_json::Value = serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
+    assert_eq!(file["network"]["paper"]["width"], 4);
+    // Without references, patches are given themselves.
+    let none = project.path("none");
+    let done = stage("refine", "{}", &[("views", &views), ("refiner", &refiner)], &none, &[]);
+    assert_eq!(done.code, 0, "{}", done.stderr);
+    // Weights of no network, and patches that fit nowhere.
+    let (scene, own) = (folder("prep").join("references"), folder("reference-views"));
+    let fails = |params: &str, weights: Option<&Path>, code: i32, words: &[&str]| {
+        let output = project.path("failed");
+        let mut inputs = vec![("views", own.as_path()), ("truth", scene.as_path())];
+        inputs.extend(weights.map(|folder| ("weights", folder)));
+        stage("train-refine", params, &inputs, &output, &[]).fails(code, words);
+    };
+    fails(r#"{"net": "paper", "steps": 1}"#, Some(&scene), 3, &["input weights", "vgg19.safetensors"]);
+    fails(r#"{"net": "paper", "square": 96}"#, None, 3, &["smaller than a patch of 96×96"]);
+    fails(r#"{"net": "paper", "square": 20}"#, None, 3, &["multiple of 8"]);
 }

@@ -3,6 +3,8 @@
 //! A network that was trained with references takes them from the inputs `references` (true pictures at HR) and `reference-views` (the
 //! same views as rendered, for what the field sees where).
 //!
+//! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches instead of adding to the view.
+//!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
 //! as it takes to agree with that.
 //!
@@ -13,10 +15,11 @@ mod agreement;
 use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use paper_refiner::PaperRefiner;
 use pixels::{
     Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
 };
-use refinement::{KnownView, REFINER_FILE, Refiner, RefinerFile, Rendered, WEIGHTS_FILE, guided};
+use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -32,7 +35,7 @@ pub struct Params {
     pub strength: Option<f64>,
     /// At most so many of the references given, the first. Without it: all.
     pub references: Option<u32>,
-    /// Ways to turn and mirror a view in which the network sees it; the mean of what it adds is taken. Time grows with them.
+    /// Ways to turn and mirror a view in which our network sees it; the mean of what it adds is taken. Time grows with them.
     #[schemars(range(min = 1, max = 8))]
     pub turns: u32,
 }
@@ -72,11 +75,11 @@ impl Stage for Refine {
         nets::deterministic();
         let refiner = context.input("refiner")?;
         let file: RefinerFile = refiner.read_json(REFINER_FILE)?;
-        let network = Refiner::read(&refiner.path(WEIGHTS_FILE), file.architecture).bad_input("input refiner")?;
+        let network = AnyRefiner::read(refiner, &file)?;
         let strength = params.strength.unwrap_or(file.strength) as f32;
         let input = context.input("views")?;
         let mut views = Views::read(input)?;
-        let mut references = references(context, &file, views.background)?;
+        let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(Photographs::read).transpose()?;
         let job = Job {
@@ -107,16 +110,16 @@ impl Stage for Refine {
 }
 
 /// The references that a guided network asks for; what another is given is said and left out.
-fn references(context: &Context, file: &RefinerFile, background: Background) -> anyhow::Result<Vec<KnownView>> {
+fn references(context: &Context, wanted: bool, background: Background) -> anyhow::Result<Vec<KnownView>> {
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
     let Some((pictures, rendered)) = given else {
-        if file.architecture.guided {
+        if wanted {
             context
                 .say("the network knows how to use references, but there are none: give inputs references and reference-views");
         }
         return Ok(Vec::new());
     };
-    if !file.architecture.guided {
+    if !wanted {
         context
             .say("the network was trained without references: those given are left out; set train-refine's parameter references");
         return Ok(Vec::new());
@@ -144,12 +147,55 @@ fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Ren
     Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
 }
 
+/// Either network.
+enum AnyRefiner {
+    Compact(Refiner),
+    Paper(PaperRefiner),
+}
+
+/// Reference patches that a patch gets, as published.
+const PATCHES: usize = 8;
+
+impl AnyRefiner {
+    fn read(input: &GivenInput, file: &RefinerFile) -> anyhow::Result<Self> {
+        let path = input.path(WEIGHTS_FILE);
+        match file.network {
+            Network::Compact(architecture) => Refiner::read(&path, architecture).map(Self::Compact),
+            Network::Paper { width } => PaperRefiner::read(&path, width).map(Self::Paper),
+        }
+        .bad_input("input refiner")
+    }
+
+    fn takes_references(&self) -> bool {
+        match self {
+            Self::Compact(network) => network.architecture().guided,
+            Self::Paper(_) => true,
+        }
+    }
+
+    /// A view refined: colours in 0..1.
+    fn refine(&self, rendered: &Rendered, references: &[&KnownView], strength: f32, turns: u32) -> anyhow::Result<Picture> {
+        let network = match self {
+            Self::Compact(network) if network.architecture().guided => {
+                return Ok(network.refine_by(&guided(rendered, references), strength, turns)?);
+            }
+            Self::Compact(network) => return Ok(network.refine_by(&rendered.view, strength, turns)?),
+            Self::Paper(network) => network,
+        };
+        let mut drawn = network.refine(rendered, references, PATCHES).bad_input("input views")?;
+        for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
+            (0..3).for_each(|c| to[c] = (from[c] + strength * (to[c] - from[c])).clamp(0.0, 1.0));
+        }
+        Ok(drawn)
+    }
+}
+
 /// What all views share.
 struct Job<'a> {
     context: &'a Context,
     input: &'a GivenInput,
     background: f32,
-    network: Refiner,
+    network: AnyRefiner,
     strength: f32,
     turns: u32,
     references: Vec<KnownView>,
@@ -161,12 +207,8 @@ impl Job<'_> {
     fn refine(&self, view: &mut View) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
         let (rendered, image) = read(self.input, view, self.background)?;
-        let refined = if self.network.architecture().guided {
-            let references: Vec<&KnownView> = self.references.iter().collect();
-            self.network.refine_by(&guided(&rendered, &references), self.strength, self.turns)?
-        } else {
-            self.network.refine_by(&rendered.view, self.strength, self.turns)?
-        };
+        let references: Vec<&KnownView> = self.references.iter().collect();
+        let refined = self.network.refine(&rendered, &references, self.strength, self.turns)?;
         let agreed = match &self.photographs {
             Some(photographs) => photographs.of(&view.camera)?.map(|own| photographs.agree(&refined, &own)),
             None => None,

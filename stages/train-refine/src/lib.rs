@@ -7,6 +7,11 @@
 //! its true picture.
 //!
 //! Every eighth view is left out of training; what the network brings there is measured and kept with it.
+//!
+//! `net: paper` trains the published network instead, on the rendered views of references beside the references (block `train-paper`): that is
+//! for comparison, and takes days.
+
+mod paper;
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -15,8 +20,8 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr, read_premultiplied};
 use refinement::{
-    Architecture, KnownView, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining, Rendered,
-    WEIGHTS_FILE,
+    Architecture, KnownView, Network, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining,
+    Rendered, Training, WEIGHTS_FILE,
 };
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -26,41 +31,69 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Steps of training.
+    /// Which network: ours, or the paper's own (days on a CPU; with the published settings unless told otherwise).
+    pub net: Net,
+    /// Steps of training. Without it: 4,000 for `compact`, 46,875 for `paper`.
     #[schemars(range(min = 1))]
-    pub steps: u64,
-    /// Squares of a view in a step.
+    pub steps: Option<u64>,
+    /// Squares of a view in a step. Without it: 8 for `compact`, 32 for `paper`.
     #[schemars(range(min = 1, max = 4096))]
-    pub batch: u32,
-    /// Pixels along a square's side; an even number.
+    pub batch: Option<u32>,
+    /// Pixels along a square's side; a multiple of 2 for `compact`, of 8 for `paper`.
     #[schemars(range(min = 8, max = 1024))]
     pub square: u32,
-    /// Highest learning rate.
+    /// Highest learning rate. Without it: 0.001 for `compact`, 0.0005 for `paper`.
     #[schemars(range(min = 0.0, max = 1.0))]
-    pub rate: f64,
-    /// Features of the network's hidden layers.
+    pub rate: Option<f64>,
+    /// Features of the network's hidden layers; of the first for `paper`. Without it: 32 for `compact`, 128 for `paper`.
     #[schemars(range(min = 1, max = 512))]
-    pub channels: u32,
-    /// Its residual blocks, of two layers each.
+    pub channels: Option<u32>,
+    /// `compact`: residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64))]
     pub blocks: u32,
-    /// References that each view will have when it is refined; 0 trains a network that does without.
+    /// `compact`: references that each view will have when it is refined; 0 trains a network that does without.
     #[schemars(range(min = 0, max = 64))]
     pub references: u32,
+    /// `paper`: reference patches that a patch gets.
+    #[schemars(range(min = 1, max = 64))]
+    pub patches: u32,
     /// Seed of everything that is drawn.
     pub seed: u64,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { steps: 4000, batch: 8, square: 64, rate: 1e-3, channels: 32, blocks: 4, references: 0, seed: 0 }
+        Self {
+            net: Net::Compact,
+            steps: None,
+            batch: None,
+            square: 64,
+            rate: None,
+            channels: None,
+            blocks: 4,
+            references: 0,
+            patches: 8,
+            seed: 0,
+        }
     }
+}
+
+/// The networks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Net {
+    /// Ours: small, taught by a rehearsal one size down, sees references where there are some.
+    Compact,
+    /// NeRF-SR's: 30 million weights, patches, taught on HR references.
+    Paper,
 }
 
 /// One view in so many is left out of training.
 const LEFT_OUT: usize = 8;
 /// Steps between two looks at how the training goes.
 const NOTE: u64 = 50;
+/// Longest without one.
+const QUIET: Duration = Duration::from_secs(10);
 
 /// The stage.
 pub struct TrainRefine;
@@ -73,7 +106,11 @@ impl Stage for TrainRefine {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
-            ("truth", Input::required(&["scene/train", "scene/truth"], "what they should look like")),
+            ("truth", Input::required(&["scene/train", "scene/truth", "scene/references"], "what they should look like")),
+            (
+                "weights",
+                Input::optional(&["weights"], "net: paper: folder with VGG-19, for the perceptual loss; without it L1 alone"),
+            ),
         ]
     }
 
@@ -82,45 +119,58 @@ impl Stage for TrainRefine {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        nets::deterministic();
+        if params.net == Net::Paper {
+            return paper::run(context, params);
+        }
         if params.square % 2 == 1 {
             return Err(Failure::Usage(format!("parameter square: {} is odd; an even number is expected", params.square)).into());
         }
-        nets::deterministic();
         let (training, left_out) = examples(context.input("views")?, context.input("truth")?)?;
         if params.references > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
-        let architecture = Architecture { channels: params.channels, blocks: params.blocks, guided: params.references > 0 };
+        let architecture =
+            Architecture { channels: params.channels.unwrap_or(32), blocks: params.blocks, guided: params.references > 0 };
         let options = RefinerTraining {
-            steps: params.steps,
-            batch: params.batch as usize,
+            steps: params.steps.unwrap_or(4000),
+            batch: params.batch.unwrap_or(8) as usize,
             square: params.square as usize,
             references: params.references as usize,
-            rate: params.rate,
+            rate: params.rate.unwrap_or(1e-3),
             seed: params.seed,
         };
         let mut trainer = RefinerTrainer::new(Refiner::new(architecture, params.seed)?, options)?;
-        train(context, params, &mut trainer, &training)?;
+        train(context, options.steps, &mut trainer, &training, |error| format!("{:.2} dB", psnr_of(error)))?;
         let scores = trainer.score(&left_out, &training)?;
         trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
         let file = RefinerFile {
-            architecture,
+            network: Network::Compact(architecture),
             strength: scores.strength,
             rendered_psnr: scores.rendered_psnr,
             refined_psnr: scores.refined_psnr,
         };
         context.write_json(REFINER_FILE, &file)?;
-        let summary = format!(
-            "views it hasn't seen: {:.2} dB rendered, {:.2} dB refined (strength {:.2})",
-            file.rendered_psnr, file.refined_psnr, file.strength
-        );
-        context.say(&summary);
-        context.write_summary(&summary)
+        say(context, "views it hasn't seen", &file)
     }
 }
 
-/// Takes all steps that an earlier run hasn't.
-fn train(context: &Context, params: &Params, trainer: &mut RefinerTrainer, examples: &[KnownView]) -> anyhow::Result<()> {
+/// What training brought to some views.
+fn say(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
+    let RefinerFile { rendered_psnr, refined_psnr, strength, .. } = file;
+    let summary = format!("{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (strength {strength:.2})");
+    context.say(&summary);
+    context.write_summary(&summary)
+}
+
+/// Takes all steps that an earlier run hasn't; `note` says in words how large errors are.
+fn train(
+    context: &Context,
+    steps: u64,
+    trainer: &mut impl Training,
+    examples: &[KnownView],
+    note: impl Fn(f64) -> String,
+) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
         match trainer.resume(path) {
@@ -128,9 +178,9 @@ fn train(context: &Context, params: &Params, trainer: &mut RefinerTrainer, examp
             Err(error) => context.say(format!("{error}; starting over")),
         }
     }
-    let progress = context.progress("training", params.steps);
+    let progress = context.progress("training", steps);
     let (mut written, mut took) = (Instant::now(), Duration::from_millis(20));
-    let (mut sum, mut since) = (0.0, 0);
+    let (mut sum, mut since, mut noted) = (0.0, 0u64, Instant::now());
     loop {
         // A checkpoint costs at most a fiftieth of the time.
         if let Some(path) = checkpoint.as_deref().filter(|_| context.interrupted() || written.elapsed() > 50 * took) {
@@ -145,14 +195,14 @@ fn train(context: &Context, params: &Params, trainer: &mut RefinerTrainer, examp
         })?;
         let Some(loss) = loss else { return Ok(()) };
         (sum, since) = (sum + loss, since + 1);
-        if since == NOTE {
-            progress.set(trainer.steps(), &format!("{:.2} dB", psnr_of(sum / since as f64)));
-            (sum, since) = (0.0, 0);
+        if since == NOTE || noted.elapsed() > QUIET {
+            progress.set(trainer.steps(), &note(sum / since as f64));
+            (sum, since, noted) = (0.0, 0u64, Instant::now());
         }
     }
 }
 
-fn write_checkpoint(trainer: &RefinerTrainer, path: &Path) -> anyhow::Result<()> {
+fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> {
     let partial = path.with_extension("partial");
     trainer.write_checkpoint(&partial)?;
     Ok(std::fs::rename(partial, path)?)

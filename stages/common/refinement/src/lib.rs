@@ -9,7 +9,7 @@
 //!
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes.
-//! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples.
+//! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
 //!
 //! Colours are display-encoded sRGB, composited on the background that is shown.
@@ -35,8 +35,8 @@ mod trainer;
 mod view;
 
 pub use guide::guided;
-pub use refiner::{Architecture, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
-pub use trainer::{RefinerTrainer, RefinerTraining, Scores};
+pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
+pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
 pub use view::{KnownView, Rendered};
 
 /// A refiner that can't be read, written, used or trained.

@@ -29,9 +29,22 @@ impl Architecture {
     }
 }
 
+/// Which network a refiner is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase", deny_unknown_fields)]
+pub enum Network {
+    /// Ours: [`Refiner`].
+    Compact(Architecture),
+    /// The paper's (crate `paper-refiner`).
+    Paper {
+        /// Features of its first layer; 128 are published.
+        width: u32,
+    },
+}
+
 /// Name of the file that describes a refiner.
 pub const REFINER_FILE: &str = "refiner.json";
-/// Name of the file with its weights: safetensors, kernels as outputs × rows × columns × inputs.
+/// Name of the file with its weights: safetensors; ours has kernels as outputs × rows × columns × inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
 /// `refiner.json`: what a folder with a refiner says of it.
@@ -39,7 +52,7 @@ pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 #[serde(deny_unknown_fields)]
 pub struct RefinerFile {
     /// The network.
-    pub architecture: Architecture,
+    pub network: Network,
     /// Share of what it predicts that is added: what was best for the views that training left out, from 0 to 1.
     pub strength: f64,
     /// Mean PSNR of those views as they were rendered, in dB.

@@ -13,6 +13,21 @@ use crate::guide::{guide, guided};
 use crate::refiner::{OUTPUTS, Refiner};
 use crate::view::KnownView;
 
+/// A training, step by step, that can be interrupted.
+pub trait Training {
+    /// Steps taken.
+    fn steps(&self) -> u64;
+
+    /// Takes a step on some of the examples, of which there is at least one; the error before it, `None` once all steps are taken.
+    fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError>;
+
+    /// Writes all that a resumed training needs. The caller makes it atomic.
+    fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError>;
+
+    /// Goes on from a checkpoint of a training that began with the same network and options.
+    fn resume(&mut self, path: &Path) -> Result<(), RefinementError>;
+}
+
 /// How to train a [`Refiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RefinerTraining {
@@ -31,7 +46,7 @@ pub struct RefinerTraining {
 }
 
 /// Trains a [`Refiner`] by Adam on the squared error of squares of examples, each turned, mirrored and with its colours changed: what is
-/// learnt are edges, not the scene's own colours, and so it holds at another size, too.
+/// learnt are edges, not the scene's own colours, and so it holds at another size, too. Its error is the mean squared one.
 pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
@@ -77,42 +92,6 @@ impl RefinerTrainer {
         &self.refiner
     }
 
-    /// Steps taken.
-    pub fn steps(&self) -> u64 {
-        self.step
-    }
-
-    /// Takes a step on some of the examples, of which there is at least one; the mean squared error before it, `None` once all steps are
-    /// taken.
-    pub fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
-        let RefinerTraining { steps, batch, rate, .. } = self.options;
-        if self.step >= steps {
-            return Ok(None);
-        }
-        let shards: Vec<(Refiner, Range<usize>)> =
-            (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
-        let (step, options) = (self.step, self.options);
-        let parts: Vec<(f64, Vec<Tensor>)> = shards
-            .into_par_iter()
-            .filter(|(_, range)| !range.is_empty())
-            .map(|(refiner, range)| shard(&refiner, &options, step, range, examples))
-            .collect::<Result<_, _>>()?;
-        let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>();
-        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
-        let mut gradients = parts.next().unwrap_or_default();
-        for part in parts {
-            no_grad(|| gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop)))?;
-        }
-        if !loss.is_finite() || !nets::all_finite(&gradients)? {
-            return Err(RefinementError::NotFinite { step });
-        }
-        let warm = ((step + 1) as f64 / WARM_UP as f64).min(1.0);
-        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
-        self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
-        self.step += 1;
-        Ok(Some(loss))
-    }
-
     /// Scores examples that training left out, with references drawn from those that it had, and finds the share of the prediction that
     /// serves them best.
     pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
@@ -148,9 +127,43 @@ impl RefinerTrainer {
         let count = examples.len().max(1) as f64;
         Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength })
     }
+}
 
-    /// Writes all that a resumed training needs. The caller makes it atomic.
-    pub fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
+impl Training for RefinerTrainer {
+    fn steps(&self) -> u64 {
+        self.step
+    }
+
+    fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
+        let RefinerTraining { steps, batch, rate, .. } = self.options;
+        if self.step >= steps {
+            return Ok(None);
+        }
+        let shards: Vec<(Refiner, Range<usize>)> =
+            (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
+        let (step, options) = (self.step, self.options);
+        let parts: Vec<(f64, Vec<Tensor>)> = shards
+            .into_par_iter()
+            .filter(|(_, range)| !range.is_empty())
+            .map(|(refiner, range)| shard(&refiner, &options, step, range, examples))
+            .collect::<Result<_, _>>()?;
+        let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>();
+        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
+        let mut gradients = parts.next().unwrap_or_default();
+        for part in parts {
+            no_grad(|| gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop)))?;
+        }
+        if !loss.is_finite() || !nets::all_finite(&gradients)? {
+            return Err(RefinementError::NotFinite { step });
+        }
+        let warm = ((step + 1) as f64 / WARM_UP as f64).min(1.0);
+        let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
+        self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
+        self.step += 1;
+        Ok(Some(loss))
+    }
+
+    fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
         let mut tensors = self.refiner.named();
         let names: Vec<String> = tensors.iter().map(|(name, _)| name.clone()).collect();
         tensors.extend(self.adam.named(&names));
@@ -158,8 +171,7 @@ impl RefinerTrainer {
         Ok(nets::write(path, &tensors)?)
     }
 
-    /// Goes on from a checkpoint of a trainer made with the same refiner and options.
-    pub fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
+    fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
         let weights = Weights::read(path)?;
         let step = weights.integers(COUNTERS, 1)?[0] as u64;
         let shapes = self.refiner.shapes();

@@ -1,0 +1,238 @@
+use std::path::Path;
+
+use nets::{Adam, Weights};
+use radiance::Draws;
+use refinement::{KnownView, RefinementError, Training};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use crate::network::{COARSEST, COLOURS};
+use crate::perspective::Perspective;
+use crate::{PaperRefiner, Perceptual};
+
+/// How to train a [`PaperRefiner`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PaperTraining {
+    /// Steps in all; 46,875 are published.
+    pub steps: u64,
+    /// Patches in a step; 32 are published.
+    pub batch: usize,
+    /// Pixels along a patch's side, a multiple of 8; 64 are published.
+    pub patch: usize,
+    /// Reference patches that each gets; 8 are published.
+    pub references: usize,
+    /// Learning rate; 5e-4 is published.
+    pub rate: f64,
+    /// Seed of what is drawn.
+    pub seed: u64,
+}
+
+/// Trains a [`PaperRefiner`] on rendered views of references beside the references themselves: a patch of both, warped by one of 200 random
+/// perspectives, with reference patches that lie within a fixed window around it in the picture that isn't warped. Its error is
+/// the mean absolute one, of -1..1.
+pub struct PaperTrainer {
+    network: PaperRefiner,
+    options: PaperTraining,
+    perceptual: Option<Perceptual>,
+    adam: Adam,
+    step: u64,
+}
+
+/// Perspectives of a picture, the one that changes nothing among them.
+const PERSPECTIVES: u64 = 200;
+/// Pixels that a reference patch lies away at most.
+const WINDOW: usize = 64;
+/// Purposes of draws.
+const WARPS: u64 = 321;
+const PATCHES: u64 = 322;
+/// Name of a checkpoint's counters.
+const COUNTERS: &str = "counters";
+
+impl PaperTrainer {
+    /// Starts from a network.
+    pub fn new(network: PaperRefiner, options: PaperTraining, perceptual: Option<Perceptual>) -> Result<Self, RefinementError> {
+        let adam = Adam::new(network.parameters())?;
+        Ok(Self { network, options, perceptual, adam, step: 0 })
+    }
+
+    /// The network as it is now.
+    pub fn network(&self) -> &PaperRefiner {
+        &self.network
+    }
+}
+
+impl Training for PaperTrainer {
+    fn steps(&self) -> u64 {
+        self.step
+    }
+
+    fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
+        let PaperTraining { steps, batch, patch, references, rate, seed } = self.options;
+        if self.step >= steps {
+            return Ok(None);
+        }
+        let (mut rendered, mut truth, mut others) = (Vec::new(), Vec::new(), Vec::new());
+        for i in 0..batch {
+            let mut draws = Draws::new(seed, PATCHES, self.step * batch as u64 + i as u64);
+            let number = draws.below(examples.len() as u64);
+            let drawn = Drawn::new(&examples[number as usize], number, &self.options, &mut draws);
+            drawn.append(&mut rendered, &mut truth, &mut others);
+        }
+        let side = patch as i64;
+        let tensor = |samples: &[f32], count: usize| {
+            Tensor::f_from_slice(samples)?.f_reshape([count as i64, side, side, COLOURS])?.f_permute([0, 3, 1, 2])?.f_contiguous()
+        };
+        let (rendered, truth) = (tensor(&rendered, batch)?, tensor(&truth, batch)?);
+        let found = self.network.forward(&rendered, &tensor(&others, batch * references)?, true)?;
+        let (loss, error) = loss(&found, &truth, self.perceptual.as_ref())?;
+        let parameters: Vec<Tensor> = self.network.parameters().collect();
+        let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
+        if !error.is_finite() || !nets::all_finite(&gradients)? {
+            return Err(RefinementError::NotFinite { step: self.step });
+        }
+        self.adam.step(self.network.parameters(), &gradients, rate)?;
+        self.step += 1;
+        Ok(Some(error))
+    }
+
+    fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
+        let mut tensors = self.network.named();
+        let names: Vec<String> = self.network.shapes().into_iter().map(|(name, _)| name).collect();
+        tensors.extend(self.adam.named(&names));
+        tensors.push((COUNTERS.to_owned(), Tensor::f_from_slice(&[self.step as i64])?));
+        Ok(nets::write(path, &tensors)?)
+    }
+
+    fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
+        let weights = Weights::read(path)?;
+        let step = weights.integers(COUNTERS, 1)?[0] as u64;
+        let adam = Adam::read(&weights, &self.network.shapes(), step, Device::Cpu)?;
+        let all = self.network.named();
+        let saved = all.iter().map(|(name, tensor)| weights.tensor(name, &tensor.size())).collect::<Result<Vec<_>, _>>()?;
+        no_grad(|| all.into_iter().zip(&saved).try_for_each(|((_, mut to), from)| to.f_copy_(from).map(drop)))?;
+        (self.adam, self.step) = (adam, step);
+        Ok(())
+    }
+}
+
+/// L1 of pictures in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
+pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&Perceptual>) -> Result<(Tensor, f64), TchError> {
+    let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
+    let error = first.f_double_value(&[])?;
+    Ok((perceptual.map_or_else(|| Ok(first.shallow_clone()), |p| p.distance(found, truth)?.f_add(&first))?, error))
+}
+
+/// A patch to learn from.
+struct Drawn<'a> {
+    example: &'a KnownView,
+    warp: Perspective,
+    patch: usize,
+    corner: (usize, usize),
+    /// Corners in the picture that isn't warped.
+    references: Vec<(usize, usize)>,
+}
+
+impl<'a> Drawn<'a> {
+    fn new(example: &'a KnownView, number: u64, options: &PaperTraining, draws: &mut Draws) -> Self {
+        let (width, height) = (example.truth.width, example.truth.height);
+        let which = draws.below(PERSPECTIVES);
+        // The same 200 throughout.
+        let mut shape = Draws::new(options.seed, WARPS, number * PERSPECTIVES + which);
+        let warp = if which == 0 { Perspective::identity(width, height) } else { Perspective::draw(width, height, &mut shape) };
+        let [left, top, right, bottom] = warp.filled;
+        let within = |low: usize, high: usize, draws: &mut Draws| low + draws.below((high.max(low) - low + 1) as u64) as usize;
+        let last = |end: usize| end.saturating_sub(options.patch);
+        let corner = (within(left.min(last(right)), last(right), draws), within(top.min(last(bottom)), last(bottom), draws));
+        let near = |at: usize, size: usize, draws: &mut Draws| {
+            within(at.saturating_sub(WINDOW).min(last(size)), (at + WINDOW).min(last(size)), draws)
+        };
+        let references = (0..options.references).map(|_| (near(corner.0, width, draws), near(corner.1, height, draws))).collect();
+        Self { example, warp, patch: options.patch, corner, references }
+    }
+
+    /// Appends the patch as rendered, as it should be, and its references, in -1..1.
+    fn append(&self, rendered: &mut Vec<f32>, truth: &mut Vec<f32>, others: &mut Vec<f32>) {
+        let signed = |colour: [f32; 3]| colour.map(|v| 2.0 * v - 1.0);
+        let places = |(x, y): (usize, usize)| {
+            (y..y + self.patch).flat_map(move |row| (x..x + self.patch).map(move |column| (column, row)))
+        };
+        for (x, y) in places(self.corner) {
+            rendered.extend(signed(self.warp.colour(&self.example.rendered.view, x, y)));
+            truth.extend(signed(self.warp.colour(&self.example.truth, x, y)));
+        }
+        let whole = Perspective::identity(self.example.truth.width, self.example.truth.height);
+        for &corner in &self.references {
+            others.extend(places(corner).flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))));
+        }
+    }
+}
+
+impl PaperTraining {
+    /// Checks that patches have a side that the network can halve, and fit into every example.
+    pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
+        let too_small = |e: &&KnownView| e.truth.width < self.patch || e.truth.height < self.patch;
+        let (name, reason) = match examples.iter().find(too_small) {
+            Some(small) => (small.rendered.camera.name.clone(), format!("smaller than a patch of {0}×{0} pixels", self.patch)),
+            None if self.patch == 0 || !self.patch.is_multiple_of(COARSEST) => {
+                ("any".to_owned(), format!("patches of {} pixels: a multiple of {COARSEST} is expected", self.patch))
+            }
+            None => return Ok(()),
+        };
+        Err(RefinementError::View { name, reason })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use pixels::Picture;
+    use refinement::Rendered;
+    use scene::{Camera, Intrinsics};
+
+    use super::*;
+
+    /// Stripes beside the same with less contrast.
+    fn example() -> KnownView {
+        let level = |i: usize| if (i % 48 / 6).is_multiple_of(2) { 0.2f32 } else { 0.8 };
+        let view = (0..48 * 40).flat_map(|i| [0.5 * level(i) + 0.25; 3].into_iter().chain([1.0])).collect();
+        let truth = (0..48 * 40).flat_map(|i| [level(i); 3]).collect();
+        let camera = Camera {
+            name: "stripes".into(),
+            intrinsics: Intrinsics { width: 48, height: 40, fx: 48.0, fy: 48.0, cx: 24.0, cy: 20.0 },
+            camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+        };
+        let view = Picture::new(48, 40, 4, view);
+        let rendered = Rendered { camera, view, depth: vec![2.0; 48 * 40], opacity: vec![1.0; 48 * 40] };
+        KnownView { rendered, truth: Picture::new(48, 40, 3, truth) }
+    }
+
+    const OPTIONS: PaperTraining = PaperTraining { steps: 60, batch: 4, patch: 16, references: 2, rate: 3e-3, seed: 5 };
+
+    #[test]
+    fn training_learns_and_goes_on_where_it_was() {
+        nets::deterministic();
+        let examples = [example()];
+        OPTIONS.check(&examples).unwrap();
+        let start = || PaperTrainer::new(PaperRefiner::new(4, 2).unwrap(), OPTIONS, None).unwrap();
+        let mut trainer = start();
+        let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
+        let mut errors = Vec::new();
+        while let Some(error) = trainer.step(&examples).unwrap() {
+            errors.push(error);
+            if trainer.steps() == 30 {
+                trainer.write_checkpoint(&path).unwrap();
+            }
+        }
+        let mean = |part: &[f64]| part.iter().sum::<f64>() / part.len() as f64;
+        assert!(mean(&errors[50..]) < 0.6 * mean(&errors[..5]), "{errors:?}");
+        let mut again = start();
+        again.resume(&path).unwrap();
+        while again.step(&examples).unwrap().is_some() {}
+        let same = trainer.network().named().iter().zip(again.network().named()).all(|((_, a), (_, b))| *a == b);
+        assert!(same, "a resumed training ends elsewhere");
+    }
+
+    #[test]
+    fn patches_must_fit() {
+        let said = |patch| PaperTraining { patch, ..OPTIONS }.check(&[example()]).unwrap_err().to_string();
+        assert!(said(64).contains("64×64") && said(20).contains("multiple of 8"));
+    }
+}
