@@ -88,7 +88,7 @@ refine-table: build ## Rendered and refined views: make refine-table SCENES=fern
 	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
-	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/ablation.json)
+	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) --out $(or $(OUT),out/ablation.json)
 
 tradeoff: build ## PSNR against training time, on withheld training views
 	@python3 scripts/ablation.py tradeoff --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/tradeoff.json)

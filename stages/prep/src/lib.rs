@@ -13,6 +13,7 @@
 mod bounds;
 mod degrade;
 mod hull;
+mod references;
 mod sizes;
 
 use std::path::Path;
@@ -68,7 +69,8 @@ pub struct Params {
     /// At most so many test views, spread evenly; without it: all.
     #[schemars(range(min = 1))]
     pub test_views: Option<u32>,
-    /// The first so many training views are kept at HR, as references for refinement.
+    /// So many training views are kept at HR, as references for refinement: the first, then each time the one whose camera stands farthest from
+    /// those.
     pub references: u32,
 }
 
@@ -256,8 +258,9 @@ fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
-            // References are the first training views.
-            split.test.drain(..(params.references as usize).min(count.saturating_sub(1)));
+            let most = (params.references as usize).min(count.saturating_sub(1));
+            let chosen = references::choose(set.frames.iter().map(|f| f.camera(f.lens.intrinsics).centre()), most);
+            split.test.retain(|i| !chosen.contains(i));
             Ok(split)
         }
     }
@@ -368,7 +371,8 @@ impl Job<'_> {
         notes.push(space_note(&bounds, background));
         self.context.say(space_note(&bounds, background));
 
-        let references = if self.making.has_truth { (self.params.references as usize).min(train.len()) } else { 0 };
+        let count = if self.making.has_truth { self.params.references as usize } else { 0 };
+        let references = references::choose(train_cameras.iter().map(Camera::centre), count);
         let train_pictures = train
             .par_iter()
             .enumerate()
@@ -376,7 +380,7 @@ impl Job<'_> {
                 self.context.check_interrupt()?;
                 let (hr, lr) = self.pictures(frame)?;
                 self.write_low("train/images", &frame.name, &lr)?;
-                if let Some(hr) = hr.filter(|_| i < references) {
+                if let Some(hr) = hr.filter(|_| references.contains(&i)) {
                     self.write_high("references", &frame.name, &hr)?;
                 }
                 progress.add(1);
@@ -414,11 +418,12 @@ impl Job<'_> {
         }
 
         let high = |c: &Camera| self.resized(c, |s| s.hr);
-        let reference_views = train_cameras[..references]
+        let reference_views = references
             .iter()
+            .map(|&i| &train_cameras[i])
             .map(|c| View { image: Some(format!("images/{}.png", c.name)), ..View::camera_only(high(c)) })
             .collect();
-        if references > 0 {
+        if !references.is_empty() {
             let views = Views::new(background, bounds, reference_views);
             self.context.write_json(&format!("references/{VIEWS_FILE}"), &views)?;
         }
