@@ -10,29 +10,18 @@ import collections
 import math
 import pathlib
 
-import numpy
 import torch
 from safetensors.torch import save_file
 
+import draws
+
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SEED = 11
-MASK = numpy.uint64(0xFFFFFFFFFFFFFFFF)
-
-
-def scramble(x):
-    x = x + numpy.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> numpy.uint64(30))) * numpy.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> numpy.uint64(27))) * numpy.uint64(0x94D049BB133111EB)
-    return x ^ (x >> numpy.uint64(31))
 
 
 def draw(purpose, *shape):
     """Numbers in [0, 1), as `radiance::uniform(SEED, purpose, 0..)` gives them."""
-    with numpy.errstate(over="ignore"):
-        counter = numpy.arange(math.prod(shape), dtype=numpy.uint64)
-        start = scramble(numpy.uint64(SEED) ^ (numpy.uint64(purpose) * numpy.uint64(0xD1B54A32D192ED03)))
-        state = scramble(start ^ counter) + numpy.uint64(0x9E3779B97F4A7C15)
-        return torch.from_numpy((scramble(state) >> numpy.uint64(40)).astype(numpy.float64) / 2**24).reshape(shape)
+    return torch.from_numpy(draws.uniform(SEED, purpose, math.prod(shape))).reshape(shape)
 
 
 def encode(x, octaves):

@@ -14,6 +14,8 @@ import numpy
 import PIL
 from PIL import Image
 
+import draws
+
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 
 
@@ -91,21 +93,6 @@ def ssim():
     out.write_text(json.dumps({"scikit-image": skimage.__version__, "torch": torch.__version__.split("+")[0], "cases": cases}, indent=1) + "\n")
 
 
-def draw(purpose, count):
-    """Numbers in [0, 1), as `radiance::uniform(7, purpose, 0..)` gives them."""
-
-    def scramble(x):
-        x = x + numpy.uint64(0x9E3779B97F4A7C15)
-        x = (x ^ (x >> numpy.uint64(30))) * numpy.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> numpy.uint64(27))) * numpy.uint64(0x94D049BB133111EB)
-        return x ^ (x >> numpy.uint64(31))
-
-    with numpy.errstate(over="ignore"):
-        start = scramble(numpy.uint64(7) ^ (numpy.uint64(purpose) * numpy.uint64(0xD1B54A32D192ED03)))
-        state = scramble(start ^ numpy.arange(count, dtype=numpy.uint64)) + numpy.uint64(0x9E3779B97F4A7C15)
-        return ((scramble(state) >> numpy.uint64(40)).astype(numpy.float64) / 2**24).astype(numpy.float32)
-
-
 def lpips():
     """LPIPS by PyTorch's layers, with weights that are drawn: every network, one pair of pictures."""
     import torch
@@ -134,7 +121,7 @@ def lpips():
         def tensor(of, name, shape, scale, shift):
             nonlocal purpose
             of.append({"name": name, "shape": list(shape), "scale": scale, "shift": shift})
-            values = numpy.float32(scale) * draw(purpose, int(numpy.prod(shape))) + numpy.float32(shift)
+            values = numpy.float32(scale) * draws.uniform(7, purpose, int(numpy.prod(shape))).astype(numpy.float32) + numpy.float32(shift)
             purpose += 1
             return torch.from_numpy(values.reshape(shape)).double()
 
