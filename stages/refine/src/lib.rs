@@ -134,9 +134,19 @@ fn references(context: &Context, wanted: bool, background: Background) -> anyhow
                 Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
             })?;
             let truth = read_premultiplied(&pictures.path(file)).bad_input(format!("reference {name}"))?.over(shown);
-            KnownView::new(read(rendered, view, shown)?.0, truth).bad_input("input reference-views")
+            let known = KnownView::new(read(rendered, view, shown)?.0, truth).bad_input("input reference-views")?;
+            Ok(same_exposure(context, known))
         })
         .collect()
+}
+
+/// A reference as it would look with the exposure of the pictures that the field learnt from.
+fn same_exposure(context: &Context, reference: KnownView) -> KnownView {
+    let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_none()) else { return reference };
+    let [r, g, b] = exposure.gain;
+    let name = &reference.rendered.camera.name;
+    context.say(format!("reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"));
+    reference.without(&exposure)
 }
 
 /// A rendered view, and its file's channels.

@@ -63,3 +63,143 @@ impl KnownView {
         Ok(Self { rendered, truth })
     }
 }
+
+/// How another exposure made a picture from what it should be, channel by channel: v ↦ gain · v + offset.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Exposure {
+    /// Factors of red, green and blue.
+    pub gain: [f32; 3],
+    /// What is added to each.
+    pub offset: [f32; 3],
+}
+
+impl Exposure {
+    /// Less than what other cameras' noise makes: factors within 5 % and offsets within 0.03 are none.
+    pub fn is_none(&self) -> bool {
+        self.gain.iter().all(|g| (g - 1.0).abs() <= 0.05) && self.offset.iter().all(|o| o.abs() <= 0.03)
+    }
+}
+
+/// Samples beyond these are clipped, and say nothing of an exposure.
+const CLIPPED: [f32; 2] = [0.02, 0.98];
+/// Pixels along a block's side.
+const BLOCK: usize = 8;
+/// Fewer blocks say too little.
+const LEAST_BLOCKS: f64 = 12.0;
+/// Factors beyond these are no exposure: what is rendered shows something else.
+const POSSIBLE: [f32; 2] = [0.1, 10.0];
+
+impl KnownView {
+    /// The exposure of the true picture against the rendered view, which has the exposure of the pictures that the field learnt from: the line
+    /// through both by least squares. Means of blocks are compared, where what the field lacks in detail evens out, of what is clipped in neither.
+    /// None where too little is left, or no line fits.
+    pub fn exposure(&self) -> Option<Exposure> {
+        let mut exposure = Exposure { gain: [1.0; 3], offset: [0.0; 3] };
+        for c in 0..3 {
+            let (mut n, mut x, mut y, mut xx, mut xy) = (0.0f64, 0.0, 0.0, 0.0, 0.0);
+            for [r, t] in self.block_means(c) {
+                (n, x, y, xx, xy) = (n + 1.0, x + r, y + t, xx + r * r, xy + r * t);
+            }
+            let (spread, together) = (n * xx - x * x, n * xy - x * y);
+            if n < LEAST_BLOCKS || spread <= 1e-5 * n * n {
+                return None;
+            }
+            let gain = together / spread;
+            if !(POSSIBLE[0]..=POSSIBLE[1]).contains(&(gain as f32)) {
+                return None;
+            }
+            (exposure.gain[c], exposure.offset[c]) = (gain as f32, ((y - gain * x) / n) as f32);
+        }
+        Some(exposure)
+    }
+
+    /// Means of the rendered and the true picture's channel over blocks, of those blocks of which at least half is clipped in neither.
+    fn block_means(&self, channel: usize) -> Vec<[f64; 2]> {
+        let (width, height) = (self.truth.width, self.truth.height);
+        let is_seen = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
+        let starts = |size: usize| (0..size).step_by(BLOCK);
+        let mean = |(x, y): (usize, usize)| {
+            let (mut n, mut sum) = (0usize, [0.0f64; 2]);
+            for row in y..(y + BLOCK).min(height) {
+                for column in x..(x + BLOCK).min(width) {
+                    let at = row * width + column;
+                    let pair = [self.rendered.view.data[at * 4 + channel], self.truth.data[at * 3 + channel]];
+                    if pair.into_iter().all(is_seen) {
+                        n += 1;
+                        (0..2).for_each(|i| sum[i] += f64::from(pair[i]));
+                    }
+                }
+            }
+            (2 * n >= BLOCK * BLOCK).then(|| sum.map(|s| s / n as f64))
+        };
+        starts(height).flat_map(|y| starts(width).map(move |x| (x, y))).filter_map(mean).collect()
+    }
+
+    /// The same view with a true picture as the rendered one's exposure would have made it.
+    #[must_use]
+    pub fn without(mut self, exposure: &Exposure) -> Self {
+        for pixel in self.truth.data.chunks_exact_mut(3) {
+            for c in 0..3 {
+                pixel[c] = ((pixel[c] - exposure.offset[c]) / exposure.gain[c]).clamp(0.0, 1.0);
+            }
+        }
+        self
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::Draws;
+    use scene::Intrinsics;
+
+    use super::*;
+
+    /// A view of coarse patches, and a picture that differs from it by fine detail and an exposure.
+    fn view(gain: f32, offset: f32) -> KnownView {
+        let (width, height) = (96, 64);
+        let camera = Camera {
+            name: "patches".into(),
+            intrinsics: Intrinsics { width: 96, height: 64, fx: 96.0, fy: 96.0, cx: 48.0, cy: 32.0 },
+            camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+        };
+        let mut draws = Draws::new(1, 2, 3);
+        let (mut view, mut truth) = (Vec::new(), Vec::new());
+        for i in 0..width * height {
+            let patch = (i % width / 12 + i / width / 12 * 8) as u64;
+            let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * radiance::uniform(5, c, patch));
+            view.extend(colour);
+            view.push(1.0);
+            truth.extend(colour.map(|v| (gain * (v + 0.2 * (draws.uniform() - 0.5)) + offset).clamp(0.0, 1.0)));
+        }
+        let count = width * height;
+        let view = Picture::new(width, height, 4, view);
+        let rendered = Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
+        KnownView { rendered, truth: Picture::new(width, height, 3, truth) }
+    }
+
+    #[test]
+    fn another_exposure_is_found_and_taken_away() {
+        assert!(view(1.0, 0.0).exposure().unwrap().is_none());
+        for (gain, offset) in [(0.6, 0.0), (0.8, 0.1), (1.2, -0.05)] {
+            let dark = view(gain, offset);
+            let exposure = dark.exposure().unwrap();
+            assert!(!exposure.is_none() && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05), "{exposure:?}");
+            let offsets = exposure.offset.map(|o| (o - offset).abs());
+            assert!(offsets.iter().all(|o| *o < 0.02), "{exposure:?}");
+            let (same, again) = (view(1.0, 0.0), dark.without(&exposure));
+            let pairs = || same.truth.data.iter().zip(&again.truth.data);
+            let mean = pairs().map(|(a, b)| (a - b).abs()).sum::<f32>() / pairs().count() as f32;
+            assert!(mean < 0.02, "{mean}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_exposure_is_none() {
+        let mut flat = view(1.0, 0.0);
+        flat.truth.data.fill(1.0);
+        assert_eq!(flat.exposure(), None);
+        let mut negative = view(1.0, 0.0);
+        negative.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
+        assert_eq!(negative.exposure(), None);
+    }
+}
