@@ -67,8 +67,11 @@ SCALE ?= 2
 LR ?= 100
 comma := ,
 list = $(subst $() $(),$(comma),$(strip $(1)))
-sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos box" SCALE="2" LR="50 100"
-	@$(NERF_SR) run --out out/sweep -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr=$(call list,$(LR))
+# The demo scene is made as large as the sweep needs.
+DEMO_SIZE = $(shell python3 -c 'print(round(max(map(float, "$(LR)".split())) * max(map(float, "$(SCALE)".split()))))')
+sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE="2 4" LR="100 200" DATASET=DIR (default: the demo scene)
+	@$(NERF_SR) run --out out/sweep $(if $(DATASET),-i dataset=$(DATASET),-p demo-scene.size=$(DEMO_SIZE)) \
+	  -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr=$(call list,$(LR))
 
 SCENES ?= lego chair
 PROTOCOLS ?= 100x2 100x4 200x2 200x4

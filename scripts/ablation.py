@@ -46,7 +46,7 @@ PARTS = [
     ("alpha hull", ["hull=alpha"]),
 ]
 # Rays of the curve's points: about 15 seconds to 20 minutes on two cores.
-CURVE = [750_000, 1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 48_000_000, 96_000_000]
+CURVE = [750_000, 1_500_000, 3_000_000, 6_000_000, 12_000_000, 24_000_000, 96_000_000]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("table", choices=["ablation", "tradeoff", "seeds"])

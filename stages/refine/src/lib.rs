@@ -160,18 +160,16 @@ fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Ren
 /// Either network.
 enum AnyRefiner {
     Compact(Refiner),
-    Paper(PaperRefiner),
+    /// The paper's, and how many reference patches each patch gets.
+    Paper(PaperRefiner, usize),
 }
-
-/// Reference patches that a patch gets, as published.
-const PATCHES: usize = 8;
 
 impl AnyRefiner {
     fn read(input: &GivenInput, file: &RefinerFile) -> anyhow::Result<Self> {
         let path = input.path(WEIGHTS_FILE);
         match file.network {
             Network::Compact(architecture) => Refiner::read(&path, architecture).map(Self::Compact),
-            Network::Paper { width } => PaperRefiner::read(&path, width).map(Self::Paper),
+            Network::Paper { width, patches } => PaperRefiner::read(&path, width).map(|n| Self::Paper(n, patches as usize)),
         }
         .bad_input("input refiner")
     }
@@ -179,20 +177,20 @@ impl AnyRefiner {
     fn takes_references(&self) -> bool {
         match self {
             Self::Compact(network) => network.architecture().guided,
-            Self::Paper(_) => true,
+            Self::Paper(..) => true,
         }
     }
 
     /// A view refined: colours in 0..1.
     fn refine(&self, rendered: &Rendered, references: &[&KnownView], strength: f32, turns: u32) -> anyhow::Result<Picture> {
-        let network = match self {
+        let (network, patches) = match self {
             Self::Compact(network) if network.architecture().guided => {
                 return Ok(network.refine_by(&guided(rendered, references), strength, turns)?);
             }
             Self::Compact(network) => return Ok(network.refine_by(&rendered.view, strength, turns)?),
-            Self::Paper(network) => network,
+            Self::Paper(network, patches) => (network, *patches),
         };
-        let mut drawn = network.refine(rendered, references, PATCHES).bad_input("input views")?;
+        let mut drawn = network.refine(rendered, references, patches).bad_input("input views")?;
         for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
             (0..3).for_each(|c| to[c] = (from[c] + strength * (to[c] - from[c])).clamp(0.0, 1.0));
         }

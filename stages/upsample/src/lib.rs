@@ -115,6 +115,9 @@ trait Network: Send {
     fn enlarge(&self, picture: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
 }
 
+/// How a network is made of its weights.
+type Read = fn(&Weights) -> Result<Box<dyn Network>, nets::WeightsError>;
+
 /// A view and its HR camera.
 fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a Camera)> {
     let camera = cameras.taken_by(&view.camera).map(|v| &v.camera);
@@ -124,27 +127,18 @@ fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a
 
 /// A network for each thread, none for what needs none.
 fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
-    if params.method == Method::Bicubic {
-        return Ok((0..context.threads).map(|_| None).collect());
-    }
     let widths = pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
     let (low, high) = widths.unwrap_or((1, 1));
     let scale = (f64::from(high) / f64::from(low)).round();
-    let default = match params.method {
-        Method::Imdn => format!("imdn_x{scale}.safetensors"),
-        Method::Swinir => format!("swinir_x{scale}.safetensors"),
-        Method::Liif | Method::Bicubic => "liif.safetensors".to_owned(),
+    let (default, read): (String, Read) = match params.method {
+        Method::Bicubic => return Ok((0..context.threads).map(|_| None).collect()),
+        Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| Ok(Box::new(imdn::Imdn::read(weights)?))),
+        Method::Swinir => (format!("swinir_x{scale}.safetensors"), |weights| Ok(Box::new(swinir::SwinIr::read(weights)?))),
+        Method::Liif => ("liif.safetensors".to_owned(), |weights| Ok(Box::new(liif::Liif::read(weights)?))),
     };
     let file = params.file.as_ref().unwrap_or(&default);
     let weights = open(context.optional_input("weights"), file)?;
-    let read = || -> Result<Box<dyn Network>, nets::WeightsError> {
-        Ok(match params.method {
-            Method::Imdn => Box::new(imdn::Imdn::read(&weights)?),
-            Method::Swinir => Box::new(swinir::SwinIr::read(&weights)?),
-            Method::Liif | Method::Bicubic => Box::new(liif::Liif::read(&weights)?),
-        })
-    };
-    let networks = (0..context.threads).map(|_| read().map(Some)).collect::<Result<Vec<_>, _>>();
+    let networks = (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
     let scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {

@@ -39,6 +39,8 @@ pub enum Network {
     Paper {
         /// Features of its first layer; 128 are published.
         width: u32,
+        /// Reference patches that each patch gets; 8 are published.
+        patches: u32,
     },
 }
 
