@@ -91,13 +91,14 @@ refine-table: build ## Rendered and refined views: make refine-table SCENES=fern
 	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
-	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) --out $(or $(OUT),out/ablation.json)
+	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) \
+	  $(if $(VARIANTS),--variants $(VARIANTS)) --out $(or $(OUT),out/ablation.json)
 
 tradeoff: build ## PSNR against training time, on withheld training views
 	@python3 scripts/ablation.py tradeoff --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/tradeoff.json)
 
 seeds: build ## Ten seeds on the demo scene: the spread of the PSNR
-	@python3 scripts/ablation.py seeds --rays 6000000 --out $(or $(OUT),out/seeds.json)
+	@python3 scripts/ablation.py seeds --rays $(or $(RAYS),6000000) --out $(or $(OUT),out/seeds.json)
 
 BENCH_SCENE := out/bench/scene
 bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)

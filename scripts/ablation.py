@@ -15,21 +15,22 @@ import sys
 
 import cells
 
-# A part, and the parameters that take it away or put something else in its place.
+# A part, and the parameters that take it away or put something else in its place; those that matter most first.
 PARTS = [
     ("as it is", []),
     ("supervision: average", ["supervision=average"]),
-    ("supervision: refiltered", ["supervision=refiltered"]),
     ("all pixels drawn alike", ["detail=1"]),
-    ("detail drawn 30 times as often", ["detail=30"]),
-    ("two fields, half the rays each", ["members=2"]),
     ("no supersampling", ["supersample=1"]),
-    ("3×3 sub-rays", ["supersample=3"]),
     ("all sub-rays from the start", ["coarse=0"]),
-    ("jittered sub-rays", ["jitter=true"]),
+    ("no weight averaging", ["averaging=0"]),
     ("one ray a rendered pixel", ["sub_rays=1"]),
-    ("3×3 rays a rendered pixel", ["sub_rays=3"]),
+    ("jittered sub-rays", ["jitter=true"]),
     ("networks 32 wide", ["hidden=32"]),
+    ("two fields, half the rays each", ["members=2"]),
+    ("supervision: refiltered", ["supervision=refiltered"]),
+    ("detail drawn 30 times as often", ["detail=30"]),
+    ("3×3 sub-rays", ["supersample=3"]),
+    ("3×3 rays a rendered pixel", ["sub_rays=3"]),
     ("tables of 2^15", ["log2_entries=15"]),
     ("tables of 2^19", ["log2_entries=19"]),
     ("finest level 512", ["finest=512"]),
@@ -38,7 +39,6 @@ PARTS = [
     ("32,768 samples a step", ["train-ss.samples=32768"]),
     ("131,072 samples a step", ["train-ss.samples=131072", "batch=8192"]),
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
-    ("no weight averaging", ["averaging=0"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
     ("distortion loss 0.01", ["distortion=0.01"]),
     ("grid decay 1e-6", ["grid_decay=0.000001"]),
