@@ -78,7 +78,8 @@ PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --out $(or $(OUT),out/quality.json)
+	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) $(if $(RAYS),--set rays=$(RAYS)) \
+	  --out $(or $(OUT),out/quality.json)
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
 table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
