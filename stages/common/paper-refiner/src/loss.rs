@@ -39,12 +39,11 @@ impl Perceptual {
         let caffe = weights.has("conv1_1.weight");
         let (mut blocks, mut inputs, mut index) = (Vec::new(), 3, 0);
         for (block, (outputs, (_, count))) in widths.into_iter().zip(BLOCKS).enumerate() {
-            let mut names = (0..count).map(|i| {
-                let torchvision = format!("features.{}", index + 2 * i);
-                if caffe { format!("conv{}_{}", block + 1, i + 1) } else { torchvision }
-            });
+            let name = |i: usize| {
+                if caffe { format!("conv{}_{}", block + 1, i + 1) } else { format!("features.{}", index + 2 * i) }
+            };
+            let names: Vec<String> = (0..count).map(name).collect();
             // The second one's features are compared.
-            let names: Vec<String> = names.by_ref().collect();
             if block > 0 && !names[..2].iter().all(|name| weights.has(&format!("{name}.weight"))) {
                 break;
             }
