@@ -116,7 +116,7 @@ if options.table == "tradeoff":
     points = [(means(name)["train_s"], means(name)["psnr"]) for name, _ in variants]
     low, high = math.floor(min(p for _, p in points)), math.ceil(max(p for _, p in points))
     left, right = math.log2(min(t for t, _ in points)), math.log2(max(t for t, _ in points))
-    x = lambda t: 60 + 560 * (math.log2(t) - left) / max(right - left, 1e-9)
+    x = lambda t: 90 + 510 * (math.log2(t) - left) / max(right - left, 1e-9)
     y = lambda p: 330 - 300 * (p - low) / max(high - low, 1e-9)
     parts = ['<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 660 390" font-family="sans-serif" font-size="13">']
     parts.append('<rect width="660" height="390" fill="white"/>')
