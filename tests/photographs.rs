@@ -216,8 +216,13 @@ fn the_papers_split_leaves_references_out() {
     let made = stage("prep", r#"{"split": "paper", "references": 3}"#, &[("dataset", &folder)], &scene, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
-    let name = |subtree: &str, i: usize| views(&scene.join(subtree))[i]["camera"]["name"].clone();
-    assert_eq!((name("truth", 0), name("references", 2)), (json!("r_11"), json!("r_10")));
+    let names =
+        |subtree: &str| -> Vec<Value> { views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect() };
+    let (references, tested) = (names("references"), names("truth"));
+    // The first view, and others far from it, of which none is tested.
+    assert_eq!((references.len(), &references[0]), (3, &json!("r_0")));
+    assert!(references.iter().all(|name| !tested.contains(name)), "{references:?} of {tested:?}");
+    assert_ne!(references[1], json!("r_1"));
 }
 
 /// A world without end, seen from the front and from all around: trained in NDC and in a contraction. Depth is the camera's z, whatever
