@@ -9,7 +9,7 @@
 //! Every eighth view is left out of training; what the network brings there is measured and kept with it.
 //!
 //! `net: paper` trains the published network instead, on the rendered views of references beside the references (block `train-paper`): that is
-//! for comparison, and takes days.
+//! for comparison, and takes weeks on a CPU.
 
 mod paper;
 
@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Which network: ours, or the paper's own (days on a CPU; with the published settings unless told otherwise).
+    /// Which network: ours, or the paper's own (weeks on a CPU; with the published settings unless told otherwise).
     pub net: Net,
     /// Steps of training. Without it: 4,000 for `compact`, 46,875 for `paper`.
     #[schemars(range(min = 1))]
