@@ -247,7 +247,7 @@ parts.append(("Training / rendering", grid(["method", *options.protocols], [[tit
 
 disk = sum(file.stat().st_size for folder in used for file in pathlib.Path(folder).rglob("*") if file.is_file())
 notes = [
-    "PSNR in dB / SSIM / LPIPS. In bold: the best of the rows that have seen the same.",
+    "PSNR in dB / SSIM / LPIPS. In bold: the best PSNR of the rows that have seen the same.",
     *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "lpips", "background") if name in conventions),
     f"LR pictures by {options.kernel}. Views to test: {options.split or 'as the data say'}.",
     "The paper's figures are means over all eight scenes of its data sets, its LPIPS network and SSIM window unknown: compare gains rather than "

@@ -40,7 +40,7 @@ enum Head {
     /// Pixels shuffled one or several times, by so many; the classical models.
     Shuffled { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
     /// Shuffled at once; the lightweight models.
-    Direct { up: Conv },
+    Direct { up: Conv, by: i64 },
     /// Pixels repeated and filtered; the real-world models.
     Repeated { before: Conv, steps: Vec<Conv>, high: Conv, last: Conv },
 }
@@ -175,7 +175,7 @@ impl Head {
         let conv = |name: &str, outputs: i64, inputs: i64| Conv::read(weights, name, [outputs, inputs, 3, 3]);
         if !weights.has("conv_before_upsample.0.weight") {
             let scale = root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
-            return Ok((Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)? }, scale));
+            return Ok((Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)?, by: scale }, scale));
         }
         let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
         let (before, last) = (conv("conv_before_upsample.0", middle, width)?, conv("conv_last", 3, middle)?);
@@ -197,7 +197,7 @@ impl Head {
 
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self {
-            Self::Direct { up } => up.forward(x, 1, 1)?.f_pixel_shuffle(root(up.outputs() / 3)),
+            Self::Direct { up, by } => up.forward(x, 1, 1)?.f_pixel_shuffle(*by),
             Self::Shuffled { before, steps, last } => {
                 let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
                 for (conv, by) in steps {

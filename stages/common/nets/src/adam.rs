@@ -1,3 +1,5 @@
+use std::path::Path;
+
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::{Weights, WeightsError};
@@ -62,6 +64,33 @@ impl Adam {
         };
         Ok(Self { first: read("first")?, second: read("second")?, updates })
     }
+
+    /// Writes a network's tensors by name and, of those that are learnt, the moments: all that a training needs to go on whose steps are the
+    /// optimiser's. The caller makes it atomic.
+    pub fn write_checkpoint(&self, path: &Path, network: Vec<(String, Tensor)>) -> Result<(), WeightsError> {
+        let learnt: Vec<String> = learnt(&network).map(|(name, _)| name).collect();
+        let updates = (UPDATES.to_owned(), Tensor::from_slice(&[self.updates as i64]));
+        let all: Vec<_> = network.into_iter().chain(self.named(&learnt)).chain([updates]).collect();
+        crate::write(path, &all)
+    }
+
+    /// Goes on from such a checkpoint: the network's tensors get its values. Nothing changes where one can't be had.
+    pub fn resume(path: &Path, network: &[(String, Tensor)]) -> Result<Self, WeightsError> {
+        let weights = Weights::read(path)?;
+        let updates = weights.integers(UPDATES, 1)?[0] as u64;
+        let adam = Self::read(&weights, &learnt(network).collect::<Vec<_>>(), updates, Device::Cpu)?;
+        let saved = network.iter().map(|(name, tensor)| weights.tensor(name, &tensor.size())).collect::<Result<Vec<_>, _>>()?;
+        no_grad(|| network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from)));
+        Ok(adam)
+    }
+}
+
+/// Name of the number of steps in a checkpoint.
+const UPDATES: &str = "updates";
+
+/// Names and shapes of the tensors that are learnt.
+fn learnt(network: &[(String, Tensor)]) -> impl Iterator<Item = (String, Vec<i64>)> {
+    network.iter().filter(|(_, tensor)| tensor.requires_grad()).map(|(name, tensor)| (name.clone(), tensor.size()))
 }
 
 /// Whether all numbers of all tensors are finite.

@@ -23,9 +23,4 @@ impl Conv {
     pub fn forward(&self, x: &Tensor, stride: i64, padding: i64) -> Result<Tensor, TchError> {
         x.f_conv2d(&self.kernel, Some(&self.bias), [stride; 2], [padding; 2], [1, 1], 1)
     }
-
-    /// Channels that come out.
-    pub fn outputs(&self) -> i64 {
-        self.bias.size()[0]
-    }
 }

@@ -169,12 +169,6 @@ impl PaperRefiner {
         self.encoder.iter().chain(&self.decoder).flat_map(Layer::tensors).filter(|(part, _)| part.is_learnt()).map(|(_, t)| t)
     }
 
-    /// Names and shapes of what is learnt.
-    pub(crate) fn shapes(&self) -> Vec<(String, Vec<i64>)> {
-        let is_learnt = |(_, tensor): &(String, Tensor)| tensor.requires_grad();
-        self.named().into_iter().filter(is_learnt).map(|(name, tensor)| (name, tensor.size())).collect()
-    }
-
     /// Another handle on the same tensors, for another thread.
     pub(crate) fn share(&self) -> Self {
         let of = |layers: &[Layer]| layers.iter().map(Layer::share).collect();

@@ -1,9 +1,9 @@
 use std::path::Path;
 
-use nets::{Adam, Weights};
+use nets::Adam;
 use radiance::Draws;
 use refinement::{KnownView, RefinementError, Training};
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor};
 
 use crate::network::{COARSEST, COLOURS};
 use crate::perspective::Perspective;
@@ -34,7 +34,6 @@ pub struct PaperTrainer {
     options: PaperTraining,
     perceptual: Option<Perceptual>,
     adam: Adam,
-    step: u64,
 }
 
 /// Perspectives of a picture, the one that changes nothing among them.
@@ -44,14 +43,12 @@ const WINDOW: usize = 64;
 /// Purposes of draws.
 const WARPS: u64 = 321;
 const PATCHES: u64 = 322;
-/// Name of a checkpoint's counters.
-const COUNTERS: &str = "counters";
 
 impl PaperTrainer {
     /// Starts from a network.
     pub fn new(network: PaperRefiner, options: PaperTraining, perceptual: Option<Perceptual>) -> Result<Self, RefinementError> {
         let adam = Adam::new(network.parameters())?;
-        Ok(Self { network, options, perceptual, adam, step: 0 })
+        Ok(Self { network, options, perceptual, adam })
     }
 
     /// The network as it is now.
@@ -62,17 +59,17 @@ impl PaperTrainer {
 
 impl Training for PaperTrainer {
     fn steps(&self) -> u64 {
-        self.step
+        self.adam.updates()
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let PaperTraining { steps, batch, patch, references, rate, seed } = self.options;
-        if self.step >= steps {
+        if self.steps() >= steps {
             return Ok(None);
         }
         let (mut rendered, mut truth, mut others) = (Vec::new(), Vec::new(), Vec::new());
         for i in 0..batch {
-            let mut draws = Draws::new(seed, PATCHES, self.step * batch as u64 + i as u64);
+            let mut draws = Draws::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
             let number = draws.below(examples.len() as u64);
             let drawn = Drawn::new(&examples[number as usize], number, &self.options, &mut draws);
             drawn.append(&mut rendered, &mut truth, &mut others);
@@ -87,29 +84,18 @@ impl Training for PaperTrainer {
         let parameters: Vec<Tensor> = self.network.parameters().collect();
         let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
         if !error.is_finite() || !nets::all_finite(&gradients)? {
-            return Err(RefinementError::NotFinite { step: self.step });
+            return Err(RefinementError::NotFinite { step: self.steps() });
         }
         self.adam.step(self.network.parameters(), &gradients, rate)?;
-        self.step += 1;
         Ok(Some(error))
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        let mut tensors = self.network.named();
-        let names: Vec<String> = self.network.shapes().into_iter().map(|(name, _)| name).collect();
-        tensors.extend(self.adam.named(&names));
-        tensors.push((COUNTERS.to_owned(), Tensor::f_from_slice(&[self.step as i64])?));
-        Ok(nets::write(path, &tensors)?)
+        Ok(self.adam.write_checkpoint(path, self.network.named())?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        let weights = Weights::read(path)?;
-        let step = weights.integers(COUNTERS, 1)?[0] as u64;
-        let adam = Adam::read(&weights, &self.network.shapes(), step, Device::Cpu)?;
-        let all = self.network.named();
-        let saved = all.iter().map(|(name, tensor)| weights.tensor(name, &tensor.size())).collect::<Result<Vec<_>, _>>()?;
-        no_grad(|| all.into_iter().zip(&saved).try_for_each(|((_, mut to), from)| to.f_copy_(from).map(drop)))?;
-        (self.adam, self.step) = (adam, step);
+        self.adam = Adam::resume(path, &self.network.named())?;
         Ok(())
     }
 }

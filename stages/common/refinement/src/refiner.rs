@@ -134,11 +134,6 @@ impl Refiner {
         self.parameters.iter().map(Tensor::shallow_clone)
     }
 
-    /// Their names and shapes.
-    pub(crate) fn shapes(&self) -> Vec<(String, Vec<i64>)> {
-        shapes(self.architecture)
-    }
-
     /// Another handle on the same parameters, for another thread.
     pub(crate) fn share(&self) -> Self {
         Self { architecture: self.architecture, parameters: self.parameters().collect() }

@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use nets::{Adam, Weights};
+use nets::Adam;
 use pixels::{Picture, psnr_of};
 use radiance::Draws;
 use rayon::prelude::*;
@@ -51,7 +51,6 @@ pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
     adam: Adam,
-    step: u64,
 }
 
 /// Shards of a step: fixed, so that sums have one order at any thread count.
@@ -66,8 +65,6 @@ const ALONE: u64 = 8;
 /// Purposes of draws.
 const SQUARES: u64 = 301;
 const SCORES: u64 = 302;
-/// Name of a checkpoint's counters.
-const COUNTERS: &str = "counters";
 
 /// How well views are rendered and refined.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -84,7 +81,7 @@ impl RefinerTrainer {
     /// Starts from a refiner.
     pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
         let adam = Adam::new(refiner.parameters())?;
-        Ok(Self { refiner, options, adam, step: 0 })
+        Ok(Self { refiner, options, adam })
     }
 
     /// The refiner as it is now.
@@ -131,17 +128,17 @@ impl RefinerTrainer {
 
 impl Training for RefinerTrainer {
     fn steps(&self) -> u64 {
-        self.step
+        self.adam.updates()
     }
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let RefinerTraining { steps, batch, rate, .. } = self.options;
-        if self.step >= steps {
+        if self.steps() >= steps {
             return Ok(None);
         }
         let shards: Vec<(Refiner, Range<usize>)> =
             (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
-        let (step, options) = (self.step, self.options);
+        let (step, options) = (self.steps(), self.options);
         let parts: Vec<(f64, Vec<Tensor>)> = shards
             .into_par_iter()
             .filter(|(_, range)| !range.is_empty())
@@ -159,26 +156,15 @@ impl Training for RefinerTrainer {
         let warm = ((step + 1) as f64 / WARM_UP as f64).min(1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
         self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
-        self.step += 1;
         Ok(Some(loss))
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        let mut tensors = self.refiner.named();
-        let names: Vec<String> = tensors.iter().map(|(name, _)| name.clone()).collect();
-        tensors.extend(self.adam.named(&names));
-        tensors.push((COUNTERS.to_owned(), Tensor::f_from_slice(&[self.step as i64])?));
-        Ok(nets::write(path, &tensors)?)
+        Ok(self.adam.write_checkpoint(path, self.refiner.named())?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        let weights = Weights::read(path)?;
-        let step = weights.integers(COUNTERS, 1)?[0] as u64;
-        let shapes = self.refiner.shapes();
-        let adam = Adam::read(&weights, &shapes, step, tch::Device::Cpu)?;
-        let parameters = shapes.iter().map(|(name, shape)| weights.tensor(name, shape)).collect::<Result<Vec<_>, _>>()?;
-        no_grad(|| self.refiner.parameters().zip(&parameters).try_for_each(|(mut to, from)| to.f_copy_(from).map(drop)))?;
-        (self.adam, self.step) = (adam, step);
+        self.adam = Adam::resume(path, &self.refiner.named())?;
         Ok(())
     }
 }
