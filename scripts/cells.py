@@ -41,7 +41,7 @@ def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: l
     if scene:
         command += ["-i", f"dataset={scene}"]
     if weights and weights.is_dir():
-        command += ["-i", f"weights={weights}"]
+        command += ["-i", f"eval.weights={weights}"]  # refiners may take weights, too
     command += [word for setting in settings for word in ("-p", setting)]
     print("==", *settings, flush=True)
     call(command)
