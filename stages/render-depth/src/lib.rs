@@ -56,6 +56,8 @@ impl Stage for RenderDepth {
     type Params = Params;
     const NAME: &'static str = "render-depth";
     const SUMMARY: &'static str = "Renders colour, opacity and depth of a field for a list of cameras.";
+    #[cfg(feature = "torch")]
+    const ENVIRONMENT: &'static [&'static str] = &[nets::TF32_VARIABLE];
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras = ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
@@ -96,12 +98,8 @@ fn read_members(file: &FieldFile, input: &GivenInput, device: &str) -> anyhow::R
     let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
     match file.field {
         FieldModel::Grid(architecture) => {
-            if device != "cpu" {
-                let message = format!("--device {device}: the grid is rendered on the CPU; leave --device away");
-                return Err(Failure::Usage(message).into());
-            }
             let read = |path: PathBuf| Field::read(&path, architecture, file.bounds).bad_input("field");
-            paths.map(|path| Ok(Box::new(read(path)?) as Box<dyn RayField>)).collect()
+            paths.map(|path| grid_on(device, read(path)?)).collect()
         }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
@@ -116,6 +114,27 @@ fn read_members(file: &FieldFile, input: &GivenInput, device: &str) -> anyhow::R
             Err(Failure::Usage(message.to_owned()).into())
         }
     }
+}
+
+/// A grid: on the CPU as it is, elsewhere through libtorch.
+#[cfg(feature = "torch")]
+fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
+    if device == "cpu" {
+        return Ok(Box::new(field));
+    }
+    let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+    nets::deterministic();
+    Ok(Box::new(torch_field::TorchGrid::new(&field, device)?))
+}
+
+#[cfg(not(feature = "torch"))]
+fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
+    if device == "cpu" {
+        return Ok(Box::new(field));
+    }
+    let message =
+        format!("--device {device}: it needs libtorch, and render-depth was built without it; build with --features torch");
+    Err(Failure::Usage(message).into())
 }
 
 fn resize(camera: &Camera, width: Option<u32>) -> Camera {

@@ -2,7 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::Failure;
-use radiance::{Field, FieldModel, StepReport, Trainer, TrainingError};
+use radiance::{Field, FieldModel, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
 use crate::{Params, Supersampling};
@@ -49,11 +49,11 @@ pub(crate) fn start(
     let rays = params.rays(epoch);
     match model {
         FieldModel::Grid(architecture) => {
+            let field = Field::new(architecture, bounds, params.seed);
             if device != "cpu" {
-                let message = format!("--device {device}: the grid is trained on the CPU; leave --device away");
-                return Err(Failure::Usage(message).into());
+                return start_grid_on(device, &field, params.grid_training(rays), hull);
             }
-            let mut trainer = Trainer::new(Field::new(architecture, bounds, params.seed), params.grid_training(rays));
+            let mut trainer = Trainer::new(field, params.grid_training(rays));
             if let Some(hull) = hull {
                 trainer.limit_to_hull(&hull);
             }
@@ -78,7 +78,30 @@ pub(crate) fn start(
     }
 }
 
-/// What both trainers have by the same names.
+/// The same grid and the same training through libtorch.
+#[cfg(feature = "torch")]
+fn start_grid_on(
+    device: &str,
+    field: &Field,
+    options: TrainingOptions,
+    hull: Option<Vec<u8>>,
+) -> anyhow::Result<Box<dyn FieldTrainer>> {
+    let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+    nets::deterministic();
+    let mut trainer = torch_field::GridTrainer::new(field, options, device)?;
+    if let Some(hull) = hull {
+        trainer.limit_to_hull(&hull)?;
+    }
+    Ok(Box::new(trainer))
+}
+
+#[cfg(not(feature = "torch"))]
+fn start_grid_on(device: &str, _: &Field, _: TrainingOptions, _: Option<Vec<u8>>) -> anyhow::Result<Box<dyn FieldTrainer>> {
+    let message = format!("--device {device}: it needs libtorch, and train-ss was built without it; build with --features torch");
+    Err(Failure::Usage(message).into())
+}
+
+/// What all trainers have by the same names.
 macro_rules! forwarded {
     () => {
         fn steps(&self) -> u64 {
@@ -114,22 +137,44 @@ impl FieldTrainer for Trainer {
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
         let steps = Self::steps(&self);
-        let field = Self::finish(*self);
-        if !field.is_finite() {
-            return Err(Failure::Numerical(format!("step {steps}: a parameter is not finite; lower the rate")).into());
-        }
-        field.write(weights).context("cannot write the field")
+        write_grid(&Self::finish(*self), steps, weights)
+    }
+}
+
+fn write_grid(field: &Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
+    if !field.is_finite() {
+        return Err(Failure::Numerical(format!("step {steps}: a parameter is not finite; lower the rate")).into());
+    }
+    field.write(weights).context("cannot write the field")
+}
+
+#[cfg(feature = "torch")]
+impl FieldTrainer for torch_field::GridTrainer {
+    fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
+        Self::step(self, supervision).map_err(numerical)
+    }
+
+    forwarded!();
+
+    fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
+        write_grid(&self.field()?, Self::steps(&self), weights)
+    }
+}
+
+/// What libtorch's trainings end with.
+#[cfg(feature = "torch")]
+fn numerical(error: torch_field::TorchFieldError) -> anyhow::Error {
+    match error {
+        torch_field::TorchFieldError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
+        torch_field::TorchFieldError::Collapsed { .. } => Collapsed(error.to_string()).into(),
+        _ => error.into(),
     }
 }
 
 #[cfg(feature = "torch")]
 impl FieldTrainer for torch_field::MlpTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
-        Self::step(self, supervision).map_err(|e| match e {
-            torch_field::TorchFieldError::NotFinite { .. } => Failure::Numerical(e.to_string()).into(),
-            torch_field::TorchFieldError::Collapsed { .. } => Collapsed(e.to_string()).into(),
-            _ => e.into(),
-        })
+        Self::step(self, supervision).map_err(numerical)
     }
 
     forwarded!();

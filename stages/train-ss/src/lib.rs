@@ -81,6 +81,8 @@ impl Stage for TrainSs {
     type Params = Params;
     const NAME: &'static str = "train-ss";
     const SUMMARY: &'static str = "Trains a radiance field from LR images by supersampling.";
+    #[cfg(feature = "torch")]
+    const ENVIRONMENT: &'static [&'static str] = &[nets::TF32_VARIABLE];
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![("scene", Input::required(&["scene/train"], "LR images with cameras and bounds"))]

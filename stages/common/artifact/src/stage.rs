@@ -32,6 +32,8 @@ pub trait Stage {
     const SUMMARY: &'static str;
     /// Whether it shows a run and is never cached.
     const SINK: bool = false;
+    /// Environment variables that change the result.
+    const ENVIRONMENT: &'static [&'static str] = &[];
 
     /// Inputs by name.
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -54,7 +56,7 @@ pub trait Stage {
             parameters: schemars::schema_for!(Self::Params).to_value(),
             inputs: Self::inputs().into_iter().map(|(name, input)| (name.to_owned(), input)).collect(),
             output: Self::output(),
-            environment: Vec::new(),
+            environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
         }
     }

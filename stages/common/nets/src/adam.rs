@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::{Weights, WeightsError};
 
@@ -43,54 +43,56 @@ impl Adam {
         })
     }
 
-    /// The moments by the parameters' names, for a checkpoint.
-    pub fn named<'a>(&'a self, names: &'a [String]) -> impl Iterator<Item = (String, Tensor)> + 'a {
-        [("first", &self.first), ("second", &self.second)].into_iter().flat_map(move |(kind, moments)| {
-            names.iter().zip(moments).map(move |(name, t)| (format!("{kind}.{name}"), t.shallow_clone()))
-        })
-    }
-
-    /// Goes on from a checkpoint that [`Adam::named`] went into; `parameters` are names and shapes.
-    pub fn read(
-        weights: &Weights,
-        parameters: &[(String, Vec<i64>)],
-        updates: u64,
-        device: Device,
-    ) -> Result<Self, WeightsError> {
-        let read = |kind: &str| -> Result<Vec<Tensor>, WeightsError> {
-            let moment =
-                |(name, shape): &(String, Vec<i64>)| Ok(weights.tensor(&format!("{kind}.{name}"), shape)?.to_device(device));
-            parameters.iter().map(moment).collect()
+    /// Writes all that a training needs to go on: a network's tensors by name, the moments of those that are learnt, and what the training
+    /// itself counts. The caller makes it atomic.
+    pub fn write_checkpoint(&self, path: &Path, network: Vec<(String, Tensor)>, counts: &[u64]) -> Result<(), WeightsError> {
+        let learnt = learnt(&network);
+        let moments = |kind: &'static str, of: &[Tensor]| {
+            let named = learnt.iter().zip(of).map(move |((name, _), t)| (format!("{kind}.{name}"), t.shallow_clone()));
+            named.collect::<Vec<_>>()
         };
-        Ok(Self { first: read("first")?, second: read("second")?, updates })
-    }
-
-    /// Writes a network's tensors by name and, of those that are learnt, the moments: all that a training needs to go on whose steps are the
-    /// optimiser's. The caller makes it atomic.
-    pub fn write_checkpoint(&self, path: &Path, network: Vec<(String, Tensor)>) -> Result<(), WeightsError> {
-        let learnt: Vec<String> = learnt(&network).map(|(name, _)| name).collect();
-        let updates = (UPDATES.to_owned(), Tensor::from_slice(&[self.updates as i64]));
-        let all: Vec<_> = network.into_iter().chain(self.named(&learnt)).chain([updates]).collect();
+        let (first, second) = (moments("first", &self.first), moments("second", &self.second));
+        let counts: Vec<i64> = counts.iter().chain([&self.updates]).map(|&c| c as i64).collect();
+        let all: Vec<_> =
+            network.into_iter().chain(first).chain(second).chain([(COUNTS.to_owned(), Tensor::from_slice(&counts))]).collect();
         crate::write(path, &all)
     }
 
-    /// Goes on from such a checkpoint: the network's tensors get its values. Nothing changes where one can't be had.
-    pub fn resume(path: &Path, network: &[(String, Tensor)]) -> Result<Self, WeightsError> {
+    /// Goes on from such a checkpoint: the network's tensors get its values; returned are the optimiser and what was counted. Nothing
+    /// changes where one of them can't be had.
+    pub fn resume<const N: usize>(path: &Path, network: &[(String, Tensor)]) -> Result<(Self, [u64; N]), WeightsError> {
         let weights = Weights::read(path)?;
-        let updates = weights.integers(UPDATES, 1)?[0] as u64;
-        let adam = Self::read(&weights, &learnt(network).collect::<Vec<_>>(), updates, Device::Cpu)?;
+        let (counts, updates) = counts(&weights)?;
+        let moments = |kind: &str| -> Result<Vec<Tensor>, WeightsError> {
+            let read = |(name, like): &(String, Tensor)| {
+                Ok(weights.tensor(&format!("{kind}.{name}"), &like.size())?.to_device(like.device()))
+            };
+            learnt(network).iter().map(read).collect()
+        };
+        let adam = Self { first: moments("first")?, second: moments("second")?, updates };
         let saved = network.iter().map(|(name, tensor)| weights.tensor(name, &tensor.size())).collect::<Result<Vec<_>, _>>()?;
         no_grad(|| network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from)));
-        Ok(adam)
+        Ok((adam, counts))
+    }
+
+    /// What a training had counted at a checkpoint.
+    pub fn counts_of_checkpoint<const N: usize>(path: &Path) -> Result<[u64; N], WeightsError> {
+        Ok(counts(&Weights::read(path)?)?.0)
     }
 }
 
-/// Name of the number of steps in a checkpoint.
-const UPDATES: &str = "updates";
+/// Name of what is counted, the optimiser's steps last.
+const COUNTS: &str = "counts";
 
-/// Names and shapes of the tensors that are learnt.
-fn learnt(network: &[(String, Tensor)]) -> impl Iterator<Item = (String, Vec<i64>)> {
-    network.iter().filter(|(_, tensor)| tensor.requires_grad()).map(|(name, tensor)| (name.clone(), tensor.size()))
+fn counts<const N: usize>(weights: &Weights) -> Result<([u64; N], u64), WeightsError> {
+    let all = weights.integers(COUNTS, N + 1)?;
+    Ok((std::array::from_fn(|i| all[i] as u64), all[N] as u64))
+}
+
+/// The tensors that are learnt.
+fn learnt(network: &[(String, Tensor)]) -> Vec<(String, Tensor)> {
+    let learnt = network.iter().filter(|(_, tensor)| tensor.requires_grad());
+    learnt.map(|(name, tensor)| (name.clone(), tensor.shallow_clone())).collect()
 }
 
 /// Whether all numbers of all tensors are finite.

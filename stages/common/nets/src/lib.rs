@@ -33,6 +33,9 @@ pub fn deterministic() {
     tch::set_num_threads(1);
 }
 
+/// Environment variable that lets CUDA's products use TensorFloat-32, with ten bits behind the point: libtorch's own, off unless it is 1.
+pub const TF32_VARIABLE: &str = "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE";
+
 /// A device that can't be used.
 #[derive(Debug, thiserror::Error)]
 #[error("--device {name}: {reason}")]
@@ -161,13 +164,17 @@ impl Weights {
     }
 }
 
-/// Writes tensors of f32 or i64, by name, as safetensors without metadata, so that bytes repeat.
+/// Writes tensors of f32, i64 or u8, by name, as safetensors without metadata, so that bytes repeat.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     let io = |source| WeightsError::Io { path: path.to_path_buf(), source };
     let refused = |e: TchError| io(std::io::Error::other(e.to_string()));
     let mut bytes = Vec::with_capacity(tensors.len());
     for (name, tensor) in tensors {
-        let dtype = if tensor.kind() == Kind::Int64 { Dtype::I64 } else { Dtype::F32 };
+        let dtype = match tensor.kind() {
+            Kind::Int64 => Dtype::I64,
+            Kind::Uint8 => Dtype::U8,
+            _ => Dtype::F32,
+        };
         let flat = tensor.f_detach().and_then(|t| t.f_to_device(Device::Cpu)?.f_contiguous()).map_err(refused)?;
         let mut data = vec![0u8; flat.numel() * flat.kind().elt_size_in_bytes()];
         flat.f_copy_data_u8(&mut data, flat.numel()).map_err(refused)?;

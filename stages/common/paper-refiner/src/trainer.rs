@@ -91,11 +91,11 @@ impl Training for PaperTrainer {
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(self.adam.write_checkpoint(path, self.network.named())?)
+        Ok(self.adam.write_checkpoint(path, self.network.named(), &[])?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        self.adam = Adam::resume(path, &self.network.named())?;
+        (self.adam, []) = Adam::resume(path, &self.network.named())?;
         Ok(())
     }
 }

@@ -10,7 +10,7 @@ use crate::chunk::Chunk;
 use crate::field_file::in_ranges;
 use crate::grid::{FEATURES, Level, levels};
 use crate::mlp::Layer;
-use crate::occupancy::{GRID, Occupancy};
+use crate::occupancy::{CELLS, Occupancy};
 use crate::random::Draws;
 use crate::ray::{Ray, clip};
 use crate::spherical::BASIS;
@@ -183,7 +183,7 @@ impl Field {
     }
 
     /// Distance between samples, in cube sides.
-    pub(crate) fn step(&self) -> f32 {
+    pub fn step(&self) -> f32 {
         3.0f32.sqrt() / self.architecture.steps as f32
     }
 
@@ -217,12 +217,23 @@ impl Field {
 
     /// Share of the cells that may hold something.
     pub fn occupied(&self) -> f64 {
-        self.occupancy.cells().count() as f64 / (GRID * GRID * GRID) as f64
+        self.occupancy.cells().count() as f64 / (CELLS) as f64
     }
 
     /// Numbers in the grid.
     pub fn grid_len(&self) -> usize {
         self.grid.len()
+    }
+
+    /// The grid's entries, level by level; the networks' weights, layer by layer, each input by input, filled up with 0 to whole vectors;
+    /// and where there may be something: for whoever renders or trains them elsewhere.
+    pub fn parts(&self) -> (&[f32], &[f32], &Occupancy) {
+        (&self.grid, &self.network, &self.occupancy)
+    }
+
+    /// The same, to be changed.
+    pub fn parts_mut(&mut self) -> (&mut [f32], &mut [f32], &mut Occupancy) {
+        (&mut self.grid, &mut self.network, &mut self.occupancy)
     }
 
     /// Multiplications of the networks for one sample, forward; backward takes twice as many.
@@ -256,7 +267,7 @@ impl Field {
         let mut field = Self::empty(architecture, bounds);
         read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
         read_f32(&tensors, "network", &mut field.network).map_err(format)?;
-        let occupancy = read_u8(&tensors, "occupancy", GRID * GRID * GRID).map_err(format)?;
+        let occupancy = read_u8(&tensors, "occupancy", CELLS).map_err(format)?;
         field.occupancy.set(|cell| occupancy[cell] != 0);
         if !field.is_finite() {
             return Err(format("a parameter is not finite".to_owned()));

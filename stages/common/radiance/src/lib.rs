@@ -38,12 +38,15 @@ mod ray;
 mod reference;
 mod simd;
 mod spherical;
+mod tally;
 mod trainer;
 
 pub use field::{Architecture, Field, FieldError, Pixel, RayField};
 pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
+pub use occupancy::{Look, Occupancy};
 pub use passes::Passes;
 pub use random::{Draws, uniform};
-pub use ray::Ray;
+pub use ray::{Course, Ray, UnitRay, clip};
 pub use simd::{Family, set_family};
-pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions};
+pub use tally::Tally;
+pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions, full_ray};

@@ -1,10 +1,16 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
+use rayon::prelude::*;
+use scene::Bounds;
+
+use crate::random::Draws;
 use crate::ray::{Course, FASTEST, UnitRay};
 use crate::simd::kernel;
 
 /// Cells along each axis.
 pub(crate) const GRID: usize = 128;
+/// Cells in all.
+pub(crate) const CELLS: usize = GRID * GRID * GRID;
 /// A word holds 4³ of what is below it: cells in a brick, bricks in a block.
 const SIDE: usize = 4;
 /// Bricks and blocks along each axis.
@@ -18,26 +24,106 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
     (word, x % SIDE + SIDE * (y % SIDE + SIDE * (z % SIDE)))
 }
 
-/// A slowly decaying maximum of the density seen in each cell, and the cells where it counts.
+/// Steps of a training between looks at the occupancy.
+const EVERY: u64 = 16;
+/// Until this step every cell is looked at; later those that are occupied, and of the others one in so many.
+const WARM_UP: u64 = 256;
+const TURNS: usize = 16;
+/// Share of a density that is left at the next look.
+const DECAY: f32 = 0.95;
+
+/// Which cell along each axis a number means.
+fn corner(cell: usize) -> [usize; 3] {
+    [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)]
+}
+
+/// A slowly decaying maximum of the density seen in each cell, and the cells where it counts: 128³ over the unit cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Occupancy {
-    pub(crate) density: Vec<f32>,
+pub struct Occupancy {
+    density: Vec<f32>,
+    /// Cells that may be occupied at all.
+    hull: Option<Vec<bool>>,
     /// A bit a cell, and a bit a brick that isn't empty.
     bricks: Vec<u64>,
     blocks: Vec<u64>,
 }
 
+/// A place of a cell that is looked at.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Look {
+    /// The cell's number.
+    pub cell: usize,
+    /// Somewhere in it, in the unit cube.
+    pub position: [f32; 3],
+}
+
 impl Occupancy {
     /// Everything may be occupied.
-    pub(crate) fn full() -> Self {
-        let mut full = Self { density: vec![0.0; GRID * GRID * GRID], bricks: Vec::new(), blocks: Vec::new() };
+    pub fn full() -> Self {
+        let mut full = Self { density: vec![0.0; CELLS], hull: None, bricks: Vec::new(), blocks: Vec::new() };
         full.set(|_| true);
         full
     }
 
-    /// Whether a cell may hold something. Cells are counted with x fastest.
+    /// Limits it to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
+    pub fn limit_to_hull(&mut self, bounds: &Bounds, hull: &[u8]) {
+        let side = bounds.longest_side();
+        // The occupancy covers the cube of the longest side, the hull the box.
+        let covered = |axis: usize, cell: usize| {
+            let scale = side / (bounds.max[axis] - bounds.min[axis]);
+            let low = (cell as f64 * scale) as usize;
+            let high = ((cell + 1) as f64 * scale).ceil() as usize;
+            low.min(GRID)..high.min(GRID)
+        };
+        let kept = |cell: usize| {
+            let [x, y, z] = corner(cell);
+            covered(2, z).any(|k| covered(1, y).any(|j| covered(0, x).any(|i| hull[i + GRID * (j + GRID * k)] != 0)))
+        };
+        let mask: Vec<bool> = (0..CELLS).into_par_iter().map(kept).collect();
+        self.set(|cell| mask[cell]);
+        self.hull = Some(mask);
+    }
+
+    /// Where to look at a step of a training: nowhere at most of them.
+    pub fn looks(&self, seed: u64, step: u64) -> Vec<Look> {
+        if step == 0 || !step.is_multiple_of(EVERY) {
+            return Vec::new();
+        }
+        let turn = (step / EVERY) as usize % TURNS;
+        let look = |cell: usize| {
+            let allowed = self.hull.as_ref().is_none_or(|h| h[cell]);
+            let [.., z] = corner(cell);
+            let wanted = step <= WARM_UP || self.is_occupied(cell) || (cell % (GRID * GRID) + z) % TURNS == turn;
+            (allowed && wanted).then(|| {
+                let mut draws = Draws::new(seed, 3, step * CELLS as u64 + cell as u64);
+                Look { cell, position: corner(cell).map(|c| (c as f32 + draws.uniform()) / GRID as f32) }
+            })
+        };
+        (0..CELLS).into_par_iter().filter_map(look).collect()
+    }
+
+    /// Takes the densities that were found there, and decides anew which cells may hold something, for rays with samples so far apart in
+    /// the cube.
+    pub fn learn(&mut self, looks: &[Look], densities: &[f32], step: f32) {
+        if looks.is_empty() {
+            return;
+        }
+        for (look, &found) in looks.iter().zip(densities) {
+            let density = &mut self.density[look.cell];
+            *density = (*density * DECAY).max(found);
+        }
+        let cells = self.hull.as_ref().map_or(CELLS, |h| h.iter().filter(|k| **k).count()).max(1);
+        let mean = (self.density.iter().map(|&d| f64::from(d)).sum::<f64>() / cells as f64) as f32;
+        // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
+        let threshold = mean.min(0.01 / step);
+        let allowed = |cell: usize| self.hull.as_ref().is_none_or(|h| h[cell]);
+        let occupied: Vec<bool> = self.density.iter().enumerate().map(|(i, &d)| d >= threshold && allowed(i)).collect();
+        self.set(|cell| occupied[cell]);
+    }
+
+    /// Whether a cell may hold something.
     pub(crate) fn is_occupied(&self, cell: usize) -> bool {
-        let (word, bit) = place([cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)], BRICKS);
+        let (word, bit) = place(corner(cell), BRICKS);
         self.bricks[word] >> bit & 1 == 1
     }
 
@@ -45,9 +131,9 @@ impl Occupancy {
     pub(crate) fn set(&mut self, occupied: impl Fn(usize) -> bool) {
         self.bricks = vec![0; BRICKS * BRICKS * BRICKS];
         self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
-        for cell in 0..GRID * GRID * GRID {
+        for cell in 0..CELLS {
             if occupied(cell) {
-                let at = [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)];
+                let at = corner(cell);
                 let (word, bit) = place(at, BRICKS);
                 self.bricks[word] |= 1 << bit;
                 let (word, bit) = place(at.map(|c| c / SIDE), BLOCKS);
@@ -58,12 +144,23 @@ impl Occupancy {
 
     /// Cells that are occupied, in order.
     pub(crate) fn cells(&self) -> impl Iterator<Item = usize> + '_ {
-        (0..GRID * GRID * GRID).filter(|&cell| self.is_occupied(cell))
+        (0..CELLS).filter(|&cell| self.is_occupied(cell))
+    }
+
+    /// The density of each cell.
+    pub fn density(&self) -> &[f32] {
+        &self.density
+    }
+
+    /// Goes on with the densities and the cells of a checkpoint.
+    pub fn restore(&mut self, density: Vec<f32>, occupied: &[u8]) {
+        self.density = density;
+        self.set(|cell| occupied[cell] != 0);
     }
 
     /// Cells as bytes, 1 where occupied, for a file.
-    pub(crate) fn to_bytes(&self) -> Vec<u8> {
-        (0..GRID * GRID * GRID).map(|cell| u8::from(self.is_occupied(cell))).collect()
+    pub fn to_bytes(&self) -> Vec<u8> {
+        (0..CELLS).map(|cell| u8::from(self.is_occupied(cell))).collect()
     }
 }
 

@@ -16,27 +16,45 @@ pub struct Ray {
 
 /// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in cube sides.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct UnitRay {
-    pub(crate) origin: [f32; 3],
-    pub(crate) direction: [f32; 3],
+pub struct UnitRay {
+    /// Where t is 0.
+    pub origin: [f32; 3],
+    /// Of its course.
+    pub direction: [f32; 3],
     /// Where it enters and leaves; nothing when `enter >= leave`.
-    pub(crate) enter: f32,
-    pub(crate) leave: f32,
-    pub(crate) course: Course,
+    pub enter: f32,
+    /// Where it leaves.
+    pub leave: f32,
+    /// How it runs in between.
+    pub course: Course,
     /// The direction in the world, unit length: what colours depend on, whatever the field's space.
-    pub(crate) view: [f32; 3],
+    pub view: [f32; 3],
 }
 
 /// How a ray runs through the unit cube, and its distance in scene units at t.
 #[derive(Clone, Copy, Debug)]
-pub(crate) enum Course {
+pub enum Course {
     /// Position origin + t·direction, distance start + t·scale / (1 - t·bend): a perspective map keeps lines straight and moves
     /// along them as a Möbius map does; a box has `bend` 0.
-    Straight { start: f32, scale: f32, bend: f32 },
+    Straight {
+        /// Distance where t is 0.
+        start: f32,
+        /// How fast it grows there.
+        scale: f32,
+        /// How fast that itself grows.
+        bend: f32,
+    },
     /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's radius; from there it is
     /// `reach`·sinh(4t) to the point, whose steps thereby grow as fast as the contraction shrinks them. The distance is
     /// start + scale·sinh(4t).
-    Contracted { start: f32, scale: f32, reach: f32 },
+    Contracted {
+        /// Distance of the point nearest to the centre.
+        start: f32,
+        /// Scene units for each sinh(4t).
+        scale: f32,
+        /// Ball radii for each sinh(4t).
+        reach: f32,
+    },
 }
 
 impl Default for Course {
@@ -58,7 +76,7 @@ fn sinh4(t: f32) -> f32 {
 impl UnitRay {
     /// The place in the unit cube at t.
     #[inline(always)]
-    pub(crate) fn position(&self, t: f32) -> [f32; 3] {
+    pub fn position(&self, t: f32) -> [f32; 3] {
         match self.course {
             Course::Straight { .. } => std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i])),
             Course::Contracted { reach, .. } => {
@@ -73,7 +91,7 @@ impl UnitRay {
 
     /// The distance in scene units at t.
     #[inline(always)]
-    pub(crate) fn distance(&self, t: f32) -> f32 {
+    pub fn distance(&self, t: f32) -> f32 {
         match self.course {
             Course::Straight { start, scale, bend } => t * scale / bend.mul_add(-t, 1.0) + start,
             Course::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
@@ -88,7 +106,7 @@ impl UnitRay {
 
 /// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64, so that scenes of 1e-6 and 1e6
 /// units lose nothing.
-pub(crate) fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
+pub fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
     // A NaN or a zero direction anywhere ends here.
     if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite()) {
         return UnitRay::miss(ray);

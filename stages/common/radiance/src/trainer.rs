@@ -6,13 +6,14 @@ use safetensors::SafeTensors;
 
 use crate::adam::{AdamStep, adam};
 use crate::chunk::{Chunk, FeatureGradients, densities};
-use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
+use crate::field::{Architecture, CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
-use crate::occupancy::GRID;
-use crate::random::{Draws, uniform};
-use crate::ray::{Ray, clip};
+use crate::occupancy::CELLS;
+use crate::random::uniform;
+use crate::ray::{Ray, UnitRay, clip};
 use crate::simd::LANES;
+use crate::tally::Tally;
 
 /// Where a trainer's rays come from and how their colours are judged. Rays come in groups that are judged together: the s×s
 /// sub-rays of an LR pixel.
@@ -61,6 +62,35 @@ pub struct TrainingOptions {
     pub seed: u64,
 }
 
+impl TrainingOptions {
+    /// Rays in a step, where a ray had so many samples in the one before.
+    pub fn rays_of_step(&self, samples_per_ray: f64) -> usize {
+        let wanted = (self.samples as f64 / samples_per_ray.max(0.1)) as usize;
+        wanted.clamp(256, self.batch.max(256))
+    }
+
+    /// What learning rates are multiplied with in a step: they rise at first, and fall exponentially.
+    pub fn schedule(&self, tally: &Tally) -> f64 {
+        let warm = ((tally.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
+        tally.rate_scale * warm * self.final_rate.powf(tally.done(self.rays))
+    }
+
+    /// Learning rate of a level, for a schedule.
+    pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
+        self.rate * schedule * self.level_rate.powi(level as i32)
+    }
+
+    /// Whether weights go into their average now.
+    pub fn averages(&self, tally: &Tally) -> bool {
+        self.averaging > 0.0 && tally.done(self.rays) > AVERAGE_FROM && tally.steps.is_multiple_of(AVERAGE_EVERY)
+    }
+}
+
+/// Samples of a ray through all of the cube, more or less: what a training expects before it has seen any.
+pub fn full_ray(architecture: &Architecture) -> f64 {
+    f64::from(architecture.steps) * 0.6
+}
+
 /// What a step did.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepReport {
@@ -89,11 +119,6 @@ pub enum TrainingError {
 
 /// Shards of a step: fixed, so that sums have one order at any thread count.
 const SHARDS: usize = 32;
-/// Steps between looks at the occupancy.
-const OCCUPANCY_EVERY: u64 = 16;
-/// Until this step every cell is looked at.
-const OCCUPANCY_WARM_UP: u64 = 256;
-
 /// Steps between those of the weights' average, and the share of the rays after which it begins.
 const AVERAGE_EVERY: u64 = 16;
 const AVERAGE_FROM: f64 = 0.7;
@@ -111,14 +136,8 @@ pub struct Trainer {
     touched: Vec<Vec<u8>>,
     touched_network: Vec<u8>,
     transposed: Vec<f32>,
-    /// Cells that may be occupied at all.
-    hull: Option<Vec<bool>>,
-    step: u64,
-    groups: u64,
-    rays: u64,
+    tally: Tally,
     samples_per_ray: f64,
-    rate_scale: f64,
-    last_fault: Option<u64>,
     shards: Vec<Shard>,
     workers: Mutex<Vec<Worker>>,
 }
@@ -145,7 +164,7 @@ struct Worker {
     chunk: Chunk,
     lanes: Vec<f32>,
     rays: Vec<Ray>,
-    clipped: Vec<crate::ray::UnitRay>,
+    clipped: Vec<UnitRay>,
     offsets: Vec<f32>,
     backgrounds: Vec<[f32; 3]>,
     colours: Vec<[f32; 3]>,
@@ -156,7 +175,6 @@ impl Trainer {
     /// Starts from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
         let zeros = || Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] };
-        let full = f64::from(field.architecture.steps) * 0.6;
         Self {
             first: zeros(),
             second: zeros(),
@@ -165,13 +183,8 @@ impl Trainer {
             touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
             touched_network: vec![0; field.network.len().div_ceil(LANES)],
             transposed: vec![0.0; field.network.len()],
-            hull: None,
-            step: 0,
-            groups: 0,
-            rays: 0,
-            samples_per_ray: full,
-            rate_scale: 1.0,
-            last_fault: None,
+            tally: Tally::default(),
+            samples_per_ray: full_ray(&field.architecture),
             shards: (0..SHARDS).map(|_| Shard::default()).collect(),
             workers: Mutex::new(Vec::new()),
             field,
@@ -181,22 +194,7 @@ impl Trainer {
 
     /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
     pub fn limit_to_hull(&mut self, hull: &[u8]) {
-        let bounds = self.field.bounds;
-        let side = bounds.longest_side();
-        // The occupancy grid covers the cube of the longest side, the hull the box.
-        let covered = |axis: usize, cell: usize| {
-            let scale = side / (bounds.max[axis] - bounds.min[axis]);
-            let low = (cell as f64 * scale) as usize;
-            let high = ((cell + 1) as f64 * scale).ceil() as usize;
-            low.min(GRID)..high.min(GRID)
-        };
-        let kept = |cell: usize| {
-            let (x, y, z) = (cell % GRID, cell / GRID % GRID, cell / (GRID * GRID));
-            covered(2, z).any(|k| covered(1, y).any(|j| covered(0, x).any(|i| hull[i + GRID * (j + GRID * k)] != 0)))
-        };
-        let mask: Vec<bool> = (0..GRID * GRID * GRID).into_par_iter().map(kept).collect();
-        self.field.occupancy.set(|cell| mask[cell]);
-        self.hull = Some(mask);
+        self.field.occupancy.limit_to_hull(&self.field.bounds, hull);
     }
 
     /// The trained field: with the average of its weights, where one was kept.
@@ -215,38 +213,27 @@ impl Trainer {
 
     /// Steps taken.
     pub fn steps(&self) -> u64 {
-        self.step
+        self.tally.steps
     }
 
     /// Rays cast so far.
     pub fn rays_done(&self) -> u64 {
-        self.rays
-    }
-
-    /// Share of all rays that were cast.
-    fn done(&self) -> f64 {
-        (self.rays as f64 / self.options.rays.max(1) as f64).min(1.0)
+        self.tally.rays
     }
 
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
-        supervision.begin(self.done());
+        supervision.begin(self.tally.done(self.options.rays));
         let group = supervision.rays_per_group();
-        let left = self.options.rays.saturating_sub(self.rays) as usize / group;
-        if left == 0 {
-            return Ok(None);
-        }
-        let wanted = (self.options.samples as f64 / self.samples_per_ray.max(0.1)) as usize;
-        let groups = (wanted.clamp(256, self.options.batch.max(256)) / group).max(1).min(left);
-        if self.step > 0 && self.step.is_multiple_of(OCCUPANCY_EVERY) {
-            self.update_occupancy();
-        }
+        let wanted = self.options.rays_of_step(self.samples_per_ray);
+        let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
+        self.update_occupancy();
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
         let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
-        let (first_group, first_ray) = (self.groups, self.rays);
+        let (first_group, first_ray) = (self.tally.groups, self.tally.rays);
         let judge = &*supervision;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
             let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
@@ -262,25 +249,21 @@ impl Trainer {
                 *sum += g;
             }
         }
-        self.groups += groups as u64;
-        self.rays += (groups * group) as u64;
+        self.tally.cast(groups, group);
         self.samples_per_ray = samples as f64 / (groups * group) as f64;
         let fault = self.fault(loss);
         if let Some(tensor) = fault {
             self.gradients.network.fill(0.0);
-            let again = self.last_fault.is_some_and(|before| self.step - before < 100);
-            if again {
-                return Err(TrainingError::NotFinite { step: self.step, tensor });
+            if !self.tally.forgives() {
+                return Err(TrainingError::NotFinite { step: self.tally.steps, tensor });
             }
-            self.last_fault = Some(self.step);
-            self.rate_scale *= 0.5;
         } else {
             self.apply();
             self.average();
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(group));
             (first_group..).zip(colours).for_each(|(group, colours)| supervision.remember(group, colours));
         }
-        self.step += 1;
+        self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays: groups * group, samples, skipped: fault.is_some() }))
     }
 
@@ -300,10 +283,8 @@ impl Trainer {
 
     fn apply(&mut self) {
         let options = &self.options;
-        let progress = self.done();
-        let warm = ((self.step + 1) as f64 / options.warm_up.max(1) as f64).min(1.0);
-        let schedule = self.rate_scale * warm * options.final_rate.powf(progress);
-        let network_step = AdamStep::new(self.step + 1, options.network_rate * schedule, options.network_decay);
+        let (schedule, step) = (options.schedule(&self.tally), self.tally.steps + 1);
+        let network_step = AdamStep::new(step, options.network_rate * schedule, options.network_decay);
         // All of a network is touched, always.
         self.touched_network.fill(1);
         adam(
@@ -315,7 +296,7 @@ impl Trainer {
             &mut self.second.network,
         );
 
-        let (shards, step) = (&self.shards, self.step + 1);
+        let shards = &self.shards;
         let mut work = Vec::with_capacity(self.field.levels.len());
         let mut grids =
             (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
@@ -335,15 +316,14 @@ impl Trainer {
                     scatter(level, g, touched, &shard.features.positions, gradients);
                 }
             }
-            let rate = options.rate * schedule * options.level_rate.powi(i as i32);
+            let rate = options.rate_of_level(i, schedule);
             adam(&AdamStep::new(step, rate, options.grid_decay), touched, w, g, m, v);
         });
     }
 
     /// Late in the training, takes the weights into their average (Polyak): what is left of the steps' noise evens out.
     fn average(&mut self) {
-        let late = self.done() > AVERAGE_FROM;
-        if self.options.averaging == 0.0 || !late || !self.step.is_multiple_of(AVERAGE_EVERY) {
+        if !self.options.averages(&self.tally) {
             return;
         }
         let field = &self.field;
@@ -355,62 +335,29 @@ impl Trainer {
         }
     }
 
-    /// Looks at the density of cells and decides anew which may hold something.
+    /// Looks at the density of cells where it is time to.
     fn update_occupancy(&mut self) {
-        const DECAY: f32 = 0.95;
-        let (field, seed, step) = (&self.field, self.options.seed, self.step);
-        let look_everywhere = step <= OCCUPANCY_WARM_UP;
-        let turn = (step / OCCUPANCY_EVERY) as usize % 16;
-        let occupancy = &field.occupancy;
-        let hull = self.hull.as_deref();
-        let mut density = occupancy.density.clone();
-        density.par_chunks_mut(GRID * GRID).enumerate().for_each(|(z, slab)| {
-            let mut chunk = Chunk::default();
-            let mut positions = vec![0.0; 3 * 1024];
-            let wanted: Vec<usize> = (0..GRID * GRID)
-                .filter(|i| {
-                    let cell = z * GRID * GRID + i;
-                    let allowed = hull.is_none_or(|h| h[cell]);
-                    allowed && (look_everywhere || occupancy.is_occupied(cell) || (i + z) % 16 == turn)
-                })
-                .collect();
-            for cells in wanted.chunks(1024) {
-                let n = cells.len().next_multiple_of(LANES);
-                for (k, &i) in cells.iter().enumerate() {
-                    let mut draws = Draws::new(seed, 3, step * (GRID * GRID * GRID) as u64 + (z * GRID * GRID + i) as u64);
-                    for (axis, corner) in [i % GRID, i / GRID, z].into_iter().enumerate() {
-                        positions[axis * n + k] = (corner as f32 + draws.uniform()) / GRID as f32;
-                    }
+        let field = &self.field;
+        let looks = field.occupancy.looks(self.options.seed, self.tally.steps);
+        let found = looks.par_chunks(1024).map_init(
+            || (Chunk::default(), vec![0.0; 3 * 1024]),
+            |(chunk, positions), looks| {
+                let n = looks.len().next_multiple_of(LANES);
+                for (k, look) in looks.iter().enumerate() {
+                    (0..3).for_each(|axis| positions[axis * n + k] = look.position[axis]);
                 }
-                let found = densities(&mut chunk, field, &positions[..3 * n], n);
-                for (&i, &d) in cells.iter().zip(found) {
-                    slab[i] = (slab[i] * DECAY).max(d);
-                }
-            }
-        });
-        let cells = self.hull.as_ref().map_or(density.len(), |h| h.iter().filter(|k| **k).count()).max(1);
-        let mean = (density.iter().map(|&d| f64::from(d)).sum::<f64>() / cells as f64) as f32;
-        // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
-        let threshold = mean.min(0.01 / self.field.step());
-        self.field.occupancy.density = density;
-        let occupied: Vec<bool> =
-            self.field.occupancy.density.iter().enumerate().map(|(i, &d)| d >= threshold && hull.is_none_or(|h| h[i])).collect();
-        self.field.occupancy.set(|cell| occupied[cell]);
+                densities(chunk, field, &positions[..3 * n], n)[..looks.len()].to_vec()
+            },
+        );
+        let found: Vec<f32> = found.flatten_iter().collect();
+        let step = field.step();
+        self.field.occupancy.learn(&looks, &found, step);
     }
 
     /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
-        let counters: Vec<u8> = [
-            self.step,
-            self.groups,
-            self.rays,
-            self.samples_per_ray.to_bits(),
-            self.rate_scale.to_bits(),
-            self.last_fault.map_or(u64::MAX, |s| s),
-        ]
-        .iter()
-        .flat_map(|v| v.to_le_bytes())
-        .collect();
+        let counters = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
+        let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
         let occupied = self.field.occupancy.to_bytes();
         let average = self.average.iter();
         let average =
@@ -418,7 +365,7 @@ impl Trainer {
         let tensors: Vec<_> = average
             .chain([
                 ("counters", Tensor::U8(&counters)),
-                ("density", Tensor::F32(&self.field.occupancy.density)),
+                ("density", Tensor::F32(self.field.occupancy.density())),
                 ("first.grid", Tensor::F32(&self.first.grid)),
                 ("first.network", Tensor::F32(&self.first.network)),
                 ("grid", Tensor::F32(&self.field.grid)),
@@ -448,7 +395,6 @@ impl Trainer {
                 read_f32(tensors, "average.network", &mut average.network)?;
             }
             for (name, into) in [
-                ("density", &mut field.occupancy.density),
                 ("first.grid", &mut self.first.grid),
                 ("first.network", &mut self.first.network),
                 ("grid", &mut field.grid),
@@ -458,25 +404,24 @@ impl Trainer {
             ] {
                 read_f32(tensors, name, into)?;
             }
-            let occupied = read_u8(tensors, "occupied", GRID * GRID * GRID)?;
-            field.occupancy.set(|cell| occupied[cell] != 0);
-            (self.step, self.groups) = (counters[0], counters[1]);
-            self.rays = counters[2];
-            (self.samples_per_ray, self.rate_scale) = (f64::from_bits(counters[3]), f64::from_bits(counters[4]));
-            self.last_fault = (counters[5] != u64::MAX).then_some(counters[5]);
+            let mut density = vec![0.0; CELLS];
+            read_f32(tensors, "density", &mut density)?;
+            field.occupancy.restore(density, &read_u8(tensors, "occupied", CELLS)?);
+            let [tally @ .., samples_per_ray] = counters;
+            self.tally = Tally::from_counters(tally);
+            self.samples_per_ray = f64::from_bits(samples_per_ray);
             Ok(())
         })
     }
 }
 
 /// Opens a checkpoint and reads its six counters.
-fn read_counters<T>(path: &Path, then: impl FnOnce(&SafeTensors<'_>, &[u64]) -> Result<T, String>) -> Result<T, FieldError> {
+fn read_counters<T>(path: &Path, then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>) -> Result<T, FieldError> {
     let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
     let read = || {
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
         let counters = read_u8(&tensors, "counters", 48)?;
-        let counters: Vec<u64> = counters.as_chunks::<8>().0.iter().map(|b| u64::from_le_bytes(*b)).collect();
-        then(&tensors, &counters)
+        then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
     };
     read().map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
 }

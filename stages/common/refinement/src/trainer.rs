@@ -160,11 +160,11 @@ impl Training for RefinerTrainer {
     }
 
     fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
-        Ok(self.adam.write_checkpoint(path, self.refiner.named())?)
+        Ok(self.adam.write_checkpoint(path, self.refiner.named(), &[])?)
     }
 
     fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
-        self.adam = Adam::resume(path, &self.refiner.named())?;
+        (self.adam, []) = Adam::resume(path, &self.refiner.named())?;
         Ok(())
     }
 }

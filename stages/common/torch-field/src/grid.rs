@@ -1,20 +1,19 @@
-use std::path::Path;
-
-use radiance::{Architecture, Pixel, Ray, RayField};
+use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField};
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
+use crate::course::{Courses, fused};
 use crate::mlp::host;
 
-/// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same description and the same file, that
+/// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same description and the same numbers, that
 /// judges the hand-written one, and its way to CUDA.
 #[derive(Debug)]
 pub struct TorchGrid {
     pub(crate) architecture: Architecture,
     pub(crate) bounds: Bounds,
     pub(crate) device: Device,
-    levels: Vec<Level>,
+    pub(crate) levels: Vec<Level>,
     /// Entries × 4, of all levels.
     pub(crate) table: Tensor,
     /// Five layers, each inputs × outputs.
@@ -25,10 +24,10 @@ pub struct TorchGrid {
 
 /// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
 #[derive(Clone, Copy, Debug)]
-struct Level {
+pub(crate) struct Level {
     resolution: i64,
-    first: i64,
-    entries: i64,
+    pub(crate) first: i64,
+    pub(crate) entries: i64,
     hashed: bool,
 }
 
@@ -48,11 +47,14 @@ pub(crate) struct GridSeen {
     pub(crate) premultiplied: Tensor,
     /// n: light that comes through.
     pub(crate) transmittance: Tensor,
-    /// n × steps: weights and distances in cube sides.
+    /// n × steps: weights, and t along the rays.
     pub(crate) weights: Tensor,
     pub(crate) t: Tensor,
-    /// n: where rays end, in cube sides; 0 where they miss the box.
-    pub(crate) leave: Tensor,
+    /// n × steps, bool: samples that count.
+    pub(crate) counted: Tensor,
+    /// Samples where there may be something.
+    pub(crate) samples: usize,
+    courses: Courses,
 }
 
 fn levels(architecture: &Architecture) -> Vec<Level> {
@@ -99,36 +101,58 @@ fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
 }
 
 impl TorchGrid {
-    /// Reads what [`radiance::Field::write`] wrote.
-    pub fn read(path: &Path, architecture: Architecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
-        let format = |reason: String| TorchFieldError::Format { path: path.to_path_buf(), reason };
-        architecture.check().map_err(format)?;
-        if bounds.space != scene::Space::Box {
-            return Err(format("through libtorch the grid lives in a box; this one has another space".to_owned()));
-        }
-        let weights = nets::Weights::read(path)?;
-        let levels = levels(&architecture);
+    /// A field's numbers on a device.
+    pub fn new(field: &Field, device: Device) -> Result<Self, TorchFieldError> {
+        let (grid, network, occupancy) = field.parts();
+        let levels = levels(&field.architecture);
         let entries: i64 = levels.iter().map(|l| l.entries).sum();
-        let own = |t: Tensor| -> Result<Tensor, TchError> { Ok(t.f_to_device(device)?.f_detach_copy()?.set_requires_grad(true)) };
-        let table = own(weights.tensor("grid", &[entries * FEATURES])?.f_reshape([entries, FEATURES])?)?;
-        let shapes = layer_shapes(&architecture);
-        let all = shapes.iter().map(|(i, o)| i * o).sum::<i64>();
-        // The file pads the networks to whole vectors.
-        let network = weights.tensor("network", &[(all + 15) / 16 * 16])?;
+        let own = |numbers: &[f32], shape: [i64; 2]| -> Result<Tensor, TchError> {
+            Ok(Tensor::f_from_slice(numbers)?.f_reshape(shape)?.f_to_device(device)?.set_requires_grad(true))
+        };
         let mut first = 0;
         let mut layers = Vec::with_capacity(5);
-        for (inputs, outputs) in shapes {
-            layers.push(own(network.f_narrow(0, first, inputs * outputs)?.f_reshape([inputs, outputs])?)?);
-            first += inputs * outputs;
+        for (inputs, outputs) in layer_shapes(&field.architecture) {
+            let numbers = (inputs * outputs) as usize;
+            layers.push(own(&network[first..first + numbers], [inputs, outputs])?);
+            first += numbers;
         }
-        let occupied = weights.bytes("occupancy", CELLS.pow(3))?.f_to_device(device)?.f_ne(0)?;
-        let layers = layers.try_into().expect("five layers");
-        Ok(Self { architecture, bounds, device, levels, table, layers, occupied })
+        let mut made = Self {
+            architecture: field.architecture,
+            bounds: field.bounds,
+            device,
+            levels,
+            table: own(grid, [entries, FEATURES])?,
+            layers: layers.try_into().expect("five layers"),
+            occupied: Tensor::new(),
+        };
+        made.occupy(occupancy)?;
+        Ok(made)
+    }
+
+    /// Takes over where there may be something.
+    pub(crate) fn occupy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
+        self.occupied = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?.f_ne(0)?;
+        Ok(())
+    }
+
+    /// The table and the five layers.
+    pub(crate) fn parameters(&self) -> Vec<Tensor> {
+        std::iter::once(&self.table).chain(&self.layers).map(Tensor::shallow_clone).collect()
     }
 
     /// Distance between samples, in cube sides.
-    fn step(&self) -> f64 {
+    pub(crate) fn step(&self) -> f64 {
         3f64.sqrt() / f64::from(self.architecture.steps)
+    }
+
+    /// Density for a cube side at positions in the unit cube (n × 3).
+    pub(crate) fn densities(&self, positions: &Tensor) -> Result<Tensor, TchError> {
+        no_grad(|| self.raw(positions)?.i((.., 0)).f_clamp_max(MOST_RAW)?.f_exp())
+    }
+
+    /// Raw density and what the colour network gets, at positions (n × 3): n × 16.
+    fn raw(&self, positions: &Tensor) -> Result<Tensor, TchError> {
+        self.encode(positions)?.f_matmul(&self.layers[0])?.f_relu()?.f_matmul(&self.layers[1])
     }
 
     /// Interpolated features of positions in the unit cube (n × 3): n × 4·levels.
@@ -177,59 +201,22 @@ impl TorchGrid {
     /// What rays see, with samples `offsets` (n) of a step along.
     pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
-        let side = self.bounds.longest_side();
-        let rows = |of: &dyn Fn(&Ray) -> [f64; 3]| {
-            let values: Vec<f64> = rays.iter().flat_map(of).collect();
-            Tensor::f_from_slice(&values)?.f_reshape([n, 3])
-        };
-        let min = self.bounds.min;
-        let origin = rows(&|r| std::array::from_fn(|i| (f64::from(r.origin[i]) - min[i]) / side))?;
-        let direction = rows(&|r| r.direction.map(f64::from))?;
-        let extent: [f64; 3] = std::array::from_fn(|i| (self.bounds.max[i] - min[i]) / side);
-        // Where rays are inside the box, in f64 and on the host: it is little, and must be exact. Parallel to two faces a ray is
-        // between them for ever, or never.
-        let a = origin.f_neg()?.f_div(&direction)?;
-        let b = Tensor::f_from_slice(&extent)?.f_sub(&origin)?.f_div(&direction)?;
-        let parallel = direction.f_eq(0.0)?;
-        let between = origin.f_ge(0.0)?.f_logical_and(&origin.f_le_tensor(&Tensor::f_from_slice(&extent)?)?)?;
-        let forever = a.f_full_like(f64::INFINITY)?;
-        let never = forever.f_neg()?;
-        let ends = |inner: Tensor, parallel_inside: &Tensor, parallel_outside: &Tensor| -> Result<Tensor, TchError> {
-            inner.f_where_self(&parallel.f_logical_not()?, &parallel_inside.f_where_self(&between, parallel_outside)?)
-        };
-        let enter =
-            ends(a.f_minimum(&b)?, &never, &forever)?.f_amax([1i64].as_slice(), false)?.f_clamp_min(self.bounds.near / side)?;
-        let leave =
-            ends(a.f_maximum(&b)?, &forever, &never)?.f_amin([1i64].as_slice(), false)?.f_clamp_max(self.bounds.far / side)?;
-        let finite = |r: &Ray| r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3];
-        let usable: Vec<bool> = rays.iter().map(finite).collect();
-        let usable = Tensor::f_from_slice(&usable)?.f_logical_and(&enter.f_lt_tensor(&leave)?)?;
-        let zero = enter.f_zeros_like()?;
-        let (enter, leave) = (enter.f_where_self(&usable, &zero)?, leave.f_where_self(&usable, &zero)?);
-        let float = |t: &Tensor| t.f_to_kind(Kind::Float)?.f_to_device(self.device);
-        let (origin, direction, enter, leave) = (float(&origin)?, float(&direction)?, float(&enter)?, float(&leave)?);
-
-        let longest = leave.f_sub(&enter)?.f_max()?.f_double_value(&[])?;
+        let courses = Courses::new(&self.bounds, rays, self.device)?;
+        let longest = courses.leave.f_sub(&courses.enter)?.f_max()?.f_double_value(&[])?;
         let count = ((longest / self.step()).ceil() as i64).max(1);
-        // As the hand-written field rounds: once, by fused multiply-adds, for which f64 stands here.
-        let fused = |a: &Tensor, b: &Tensor, c: &Tensor| -> Result<Tensor, TchError> {
-            let wide = |t: &Tensor| t.f_to_kind(Kind::Double);
-            wide(a)?.f_mul(&wide(b)?)?.f_add(&wide(c)?)?.f_to_kind(Kind::Float)
-        };
         let k = Tensor::f_arange(count, (Kind::Float, self.device))?.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let t = fused(&k, &k.f_full_like(self.step())?, &enter.f_unsqueeze(-1)?)?;
-        let positions = fused(&direction.f_unsqueeze(1)?, &t.f_unsqueeze(-1)?, &origin.f_unsqueeze(1)?)?;
+        let t = fused(&k, &k.f_full_like(self.step())?, &courses.enter)?;
+        let positions = courses.positions(&t)?;
         let cell =
             positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?.f_clamp(0.0, CELLS as f64 - 1.0)?;
         let cell = cell.f_to_kind(Kind::Int64)?;
         let [x, y, z] = [0, 1, 2].map(|i| cell.i((.., .., i)));
         let cell = z.f_mul_scalar(CELLS)?.f_add(&y)?.f_mul_scalar(CELLS)?.f_add(&x)?;
-        let inside = t.f_lt_tensor(&leave.f_unsqueeze(-1)?)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
+        let inside = t.f_lt_tensor(&courses.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = positions.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
 
-        let hidden = self.encode(&positions)?.f_matmul(&self.layers[0])?.f_relu()?;
-        let raw = hidden.f_matmul(&self.layers[1])?;
+        let raw = self.raw(&positions)?;
         let density = raw.i((.., 0)).f_clamp_max(MOST_RAW)?.f_exp()?.f_mul_scalar(self.step())?;
         let spread = |of: &Tensor, like: &Tensor| like.f_index_put(&[Some(&kept)], of, false)?.f_reshape([n, count]);
         let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
@@ -241,16 +228,16 @@ impl TorchGrid {
             Ok([through, transmittance, weights])
         };
         // What counts is found first; the rest gets no gradient.
-        let counts = no_grad(|| -> Result<Tensor, TchError> {
+        let counted = no_grad(|| -> Result<Tensor, TchError> {
             let [_, transmittance, weights] = optical(&density)?;
-            let counts = transmittance.f_gt(FAINT)?.f_logical_and(&weights.f_gt(FAINT)?)?;
-            counts.f_reshape([-1])?.f_index_select(0, &kept)
+            transmittance.f_gt(FAINT)?.f_logical_and(&weights.f_gt(FAINT)?)
         })?;
+        let counts = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
         let [through, _, weights] = optical(&density.f_where_self(&counts, &density.f_detach()?)?)?;
 
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
         let at = kept.f_index_select(0, &shaded)?;
-        let basis = harmonics(&direction)?.f_index_select(0, &at.f_div_scalar_mode(count, "floor")?)?;
+        let basis = harmonics(&courses.view)?.f_index_select(0, &at.f_div_scalar_mode(count, "floor")?)?;
         let input = Tensor::f_cat(&[&raw.f_index_select(0, &shaded)?.f_narrow(1, 1, RAW - 1)?, &basis], -1)?;
         let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let colour = hidden.f_matmul(&self.layers[4])?.f_sigmoid()?;
@@ -258,7 +245,7 @@ impl TorchGrid {
         let blank = Tensor::f_zeros([n, 3], (Kind::Float, self.device))?;
         let premultiplied = blank.f_index_add(0, &at.f_div_scalar_mode(count, "floor")?, &weight.f_mul(&colour)?)?;
         let transmittance = through.i((.., count - 1)).f_neg()?.f_exp()?;
-        Ok(GridSeen { premultiplied, transmittance, weights, t, leave })
+        Ok(GridSeen { premultiplied, transmittance, weights, t, counted, samples: kept.numel(), courses })
     }
 
     /// Colour, opacity and depth of each ray, in pieces as large as memory allows.
@@ -279,26 +266,26 @@ impl TorchGrid {
     fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
         let seen = self.see(rays, &offsets)?;
-        let counts = seen.weights.f_gt(FAINT)?;
-        let weights = seen.weights.f_mul(&counts)?;
+        let weights = seen.weights.f_mul(&seen.counted)?;
+        let distances = seen.courses.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
         let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
-        let (weight, distance) = (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&seen.t)?)?)?);
+        let (weight, distance) = (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
         let half = seen.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
         let before = half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
         let last = seen.t.size()[1] - 1;
         let is_half = host(&before.f_le(last)?)?;
-        let median = host(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?;
+        let median = host(&seen.courses.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
         let (premultiplied, transmittance) = (host(&seen.premultiplied)?, host(&seen.transmittance)?);
-        let (side, leave) = (self.bounds.longest_side() as f32, host(&seen.leave)?);
+        let (hits, leave) = (host(&seen.courses.hits()?)?, host(&seen.courses.distances(&seen.courses.leave)?)?);
         let pixel = |(i, ray): (usize, &Ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
-            let far = if leave[i] > 0.0 { leave[i] * side } else { self.bounds.far as f32 };
+            let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };
             Pixel {
                 colour: std::array::from_fn(|c| transmittance[i].mul_add(ray.background[c], own[c])),
                 premultiplied: own,
                 opacity: 1.0 - transmittance[i],
-                depth: if weight[i] > 1e-4 { distance[i] / weight[i] * side } else { far },
-                median_depth: if is_half[i] > 0.0 { median[i] * side } else { far },
+                depth: if weight[i] > 1e-4 { distance[i] / weight[i] } else { far },
+                median_depth: if is_half[i] > 0.0 { median[i] } else { far },
             }
         };
         Ok(rays.iter().enumerate().map(pixel).collect())
@@ -313,14 +300,9 @@ impl RayField for TorchGrid {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{Draws, Field, Passes};
+    use radiance::{Draws, Passes};
 
     use super::*;
-
-    /// The table and the five layers.
-    fn parameters(of: &TorchGrid) -> Vec<Tensor> {
-        std::iter::once(&of.table).chain(&of.layers).map(Tensor::shallow_clone).collect()
-    }
 
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
         let ray = |i| {
@@ -335,19 +317,11 @@ mod tests {
         (0..count).map(ray).collect()
     }
 
-    /// A field whose features spread so far, and its file.
-    fn example(architecture: Architecture, bounds: Bounds, spread: f32) -> (Field, std::path::PathBuf) {
-        let path = tempfile::tempdir().unwrap().keep().join("field.safetensors");
-        Field::new(architecture, bounds, 5).write(&path).unwrap();
-        let bytes = std::fs::read(&path).unwrap();
-        let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
-        let grow = |b: &[u8; 4]| (f32::from_le_bytes(*b) * spread / 1e-4).to_le_bytes();
-        let grid: Vec<u8> = file.tensor("grid").unwrap().data().as_chunks::<4>().0.iter().flat_map(grow).collect();
-        let shape = file.tensor("grid").unwrap().shape().to_vec();
-        let wide = safetensors::tensor::TensorView::new(safetensors::Dtype::F32, shape, &grid).unwrap();
-        let rest = ["network", "occupancy"].map(|name| (name, file.tensor(name).unwrap()));
-        std::fs::write(&path, safetensors::serialize([("grid", wide)].into_iter().chain(rest), None).unwrap()).unwrap();
-        (Field::read(&path, architecture, bounds).unwrap(), path)
+    /// A field whose features spread so far.
+    fn example(architecture: Architecture, bounds: Bounds, spread: f32) -> Field {
+        let mut field = Field::new(architecture, bounds, 5);
+        field.parts_mut().0.iter_mut().for_each(|x| *x *= spread / 1e-4);
+        field
     }
 
     fn error(ours: &[f32], judge: &[f32]) -> f64 {
@@ -365,7 +339,7 @@ mod tests {
         devices.extend(nets::device("cuda").ok());
         for (spread, log2_entries, hidden) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)] {
             let architecture = Architecture { finest: 96, log2_entries, hidden, steps: 256, ..Architecture::default() };
-            let (field, path) = example(architecture, bounds, spread);
+            let field = example(architecture, bounds, spread);
             let rays = rays(300, 1.0);
             let mut passes = Passes::new(&field);
             passes.run(&field, &rays, true);
@@ -374,12 +348,12 @@ mod tests {
             let network = passes.network_gradient(&field);
             let own = field.render(&rays);
             for &device in &devices {
-                let judge = TorchGrid::read(&path, architecture, bounds, device).unwrap();
+                let judge = TorchGrid::new(&field, device).unwrap();
                 let seen = judge.see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device))).unwrap();
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
                     &[(seen.premultiplied + background).sum(Kind::Float)],
-                    &parameters(&judge),
+                    &judge.parameters(),
                     false,
                     false,
                 );
@@ -409,8 +383,8 @@ mod tests {
     fn extreme_rays_are_finite_alike() {
         let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
         let architecture = Architecture { finest: 64, log2_entries: 12, hidden: 16, steps: 64, ..Architecture::default() };
-        let (field, path) = example(architecture, bounds, 1.0);
-        let judge = TorchGrid::read(&path, architecture, bounds, Device::Cpu).unwrap();
+        let field = example(architecture, bounds, 1.0);
+        let judge = TorchGrid::new(&field, Device::Cpu).unwrap();
         let rays: Vec<Ray> = [
             ([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]),
             ([0.0, 3.0, 4.0], [0.0, 0.0, -1.0]),

@@ -4,7 +4,7 @@
 //!   network of eight layers, stratified and importance sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
 //! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervision`] as the fast field's.
 //!
-//! * [`TorchGrid`]: the fast field of `radiance` on the same file: its judge, and its way to CUDA.
+//! * [`TorchGrid`], [`GridTrainer`]: the fast field of `radiance` and its training, on the same numbers: their judge, and their way to CUDA.
 //!
 //! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one thread, and their gradients are added in
 //! order: bytes don't depend on the number of threads. On CUDA results hold to a tolerance.
@@ -21,22 +21,26 @@
 //! ```
 
 mod composite;
+mod course;
 mod encoding;
 #[cfg(test)]
 mod goldens;
 mod grid;
+mod grid_trainer;
 mod mlp;
+mod mlp_trainer;
 mod network;
 mod sampling;
 mod schedule;
-mod trainer;
+mod step;
 
 use std::path::PathBuf;
 
 pub use grid::TorchGrid;
+pub use grid_trainer::GridTrainer;
 pub use mlp::Mlp;
+pub use mlp_trainer::{MlpTrainer, MlpTraining};
 pub use schedule::Schedule;
-pub use trainer::{MlpTrainer, MlpTraining};
 
 /// A field that can't be read, written, rendered or trained.
 #[derive(Debug, thiserror::Error)]

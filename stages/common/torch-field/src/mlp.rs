@@ -2,17 +2,19 @@ use std::path::Path;
 
 use radiance::{Draws, MlpArchitecture, Pixel, Ray, RayField};
 use rayon::prelude::*;
-use scene::Bounds;
+use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
 use crate::composite::{Composite, composite};
+use crate::course::Courses;
 use crate::encoding::encode;
 use crate::network::{Network, normal};
 use crate::sampling::{importance, middles, stratified};
 
-/// The paper's field: a coarse network that says where to look and a fine one that is looked at. Positions are scene units, as they
-/// come; rays run from `near` to `far` of the bounds.
+/// The paper's field: a coarse network that says where to look and a fine one that is looked at. In a box, positions are scene units, as
+/// they come, and rays run from `near` to `far` of the bounds; in NDC and in a contraction they are those of the unit cube stretched to
+/// -1..1, and rays run through it evenly, as the paper has it for forward-facing scenes. Directions are the world's.
 #[derive(Debug)]
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
@@ -39,14 +41,16 @@ pub(crate) struct Batch {
     pub(crate) origin: Tensor,
     pub(crate) direction: Tensor,
     pub(crate) background: Tensor,
+    /// How they run where the field's space isn't a box.
+    pub(crate) courses: Option<Courses>,
 }
 
-/// What both networks see, and where the fine one looked.
+/// What both networks see, and where the fine one looked: distances in scene units.
 #[derive(Debug)]
 pub(crate) struct Seen {
     pub(crate) coarse: Composite,
     pub(crate) fine: Composite,
-    pub(crate) t: Tensor,
+    pub(crate) distances: Tensor,
 }
 
 /// Purposes of draws.
@@ -78,12 +82,17 @@ impl SampleDraws {
 }
 
 impl Batch {
-    pub(crate) fn new(rays: &[Ray], device: Device) -> Result<Self, TchError> {
+    pub(crate) fn new(rays: &[Ray], bounds: &Bounds, device: Device) -> Result<Self, TchError> {
         let rows = |of: &dyn Fn(&Ray) -> [f32; 3]| {
             let values: Vec<f32> = rays.iter().flat_map(of).collect();
             Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, 3])?.f_to_device(device)
         };
-        Ok(Self { origin: rows(&|r| r.origin)?, direction: rows(&|r| r.direction)?, background: rows(&|r| r.background)? })
+        Ok(Self {
+            origin: rows(&|r| r.origin)?,
+            direction: rows(&|r| r.direction)?,
+            background: rows(&|r| r.background)?,
+            courses: (bounds.space != Space::Box).then(|| Courses::new(bounds, rays, device)).transpose()?,
+        })
     }
 }
 
@@ -147,7 +156,10 @@ impl Mlp {
     pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
         let n = batch.origin.size()[0];
         let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
-        let (near, far) = (like(self.bounds.near)?, like(self.bounds.far)?);
+        let (near, far) = match &batch.courses {
+            None => (like(self.bounds.near)?, like(self.bounds.far)?),
+            Some(courses) => (courses.enter.shallow_clone(), courses.leave.shallow_clone()),
+        };
         let count = i64::from(self.architecture.coarse_samples);
         let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
         let noise = |i: usize| draws.and_then(|d| d.noise.as_ref()).map(|n| &n[i]);
@@ -165,10 +177,14 @@ impl Mlp {
         let finer = importance(&middles(&t)?, &inner, &shares)?;
         let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
         let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
-        Ok(Seen { coarse, fine, t })
+        let distances = match &batch.courses {
+            None => t,
+            Some(courses) => courses.distances(&t)?,
+        };
+        Ok(Seen { coarse, fine, distances })
     }
 
-    /// What one network sees at distances t.
+    /// What one network sees at t.
     fn look(
         &self,
         network: &Network,
@@ -178,8 +194,11 @@ impl Mlp {
         noise: Option<&Tensor>,
     ) -> Result<Composite, TchError> {
         let (n, m) = (t.size()[0], t.size()[1]);
-        let along = t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?;
-        let positions = along.f_add(&batch.origin.f_unsqueeze(1)?)?.f_reshape([n * m, 3])?;
+        let positions = match &batch.courses {
+            None => t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?.f_add(&batch.origin.f_unsqueeze(1)?)?,
+            Some(courses) => courses.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
+        };
+        let positions = positions.f_reshape([n * m, 3])?;
         let code = encode(&positions, self.architecture.position_octaves)?;
         let width = direction.size()[1];
         let directions = direction.f_unsqueeze(1)?.f_expand([n, m, width], false)?.f_reshape([n * m, width])?;
@@ -217,14 +236,17 @@ impl Mlp {
         let usable = |r: &Ray| r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3];
         let tame: Vec<Ray> =
             rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
+        let batch = Batch::new(&tame, &self.bounds, self.device)?;
+        let hits = batch.courses.as_ref().map(|c| host(&c.hits()?)).transpose()?;
+        let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
-            let seen = self.see(&Batch::new(&tame, self.device)?, None)?;
-            Ok([host(&seen.fine.colour)?, host(&seen.fine.premultiplied)?, host(&seen.fine.weights)?, host(&seen.t)?])
+            let seen = self.see(&batch, None)?;
+            Ok([host(&seen.fine.colour)?, host(&seen.fine.premultiplied)?, host(&seen.fine.weights)?, host(&seen.distances)?])
         })?;
         let samples = weights.len() / rays.len().max(1);
         let far = self.bounds.far as f32;
         let pixel = |(i, ray): (usize, &Ray)| {
-            if !usable(ray) {
+            if !usable(i, ray) {
                 return Pixel { colour: ray.background, depth: far, median_depth: far, ..Pixel::default() };
             }
             let three = |of: &[f32]| std::array::from_fn(|c| of[3 * i + c]);
@@ -258,4 +280,42 @@ impl RayField for Mlp {
 pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
     let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_contiguous()?.f_view([-1])?;
     Vec::<f32>::try_from(flat)
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::clip;
+    use scene::Frustum;
+
+    use super::*;
+
+    /// In NDC and in a contraction rays are sampled from where they enter to where they leave, nearer things first and more of them; what
+    /// misses the space sees its background.
+    #[test]
+    fn rays_are_sampled_in_every_space() {
+        let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+        let frustum = Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
+        let architecture =
+            MlpArchitecture { depth: 5, width: 16, coarse_samples: 16, fine_samples: 8, ..MlpArchitecture::default() };
+        let ray = |origin, direction: [f32; 3]| Ray { origin, direction, background: [0.1, 0.2, 0.3] };
+        let rays = [ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]), ray([0.2, -0.1, 4.1], [0.28, 0.0, -0.96])];
+        for space in [Space::Ndc(frustum), Space::Contraction] {
+            let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space };
+            let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
+            let seen = no_grad(|| field.see(&Batch::new(&rays, &bounds, Device::Cpu).unwrap(), None)).unwrap();
+            for (i, distances) in host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
+                let course = clip(&bounds, &rays[i]);
+                let ends = [course.distance(course.enter), course.distance(course.leave)];
+                let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
+                assert!(close(distances[0], ends[0]) && close(distances[23], ends[1]), "{distances:?} {ends:?}");
+                assert!(distances.is_sorted() && distances[12] < 0.5 * (ends[0] + ends[1]), "{distances:?}");
+            }
+            let pixels = field.render(&rays).unwrap();
+            assert!(pixels.iter().all(|p| (0.5..91.0).contains(&p.depth) && p.colour.iter().all(|c| c.is_finite())));
+        }
+        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space: Space::Ndc(frustum) };
+        let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
+        let away = field.render(&[ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0])]).unwrap()[0];
+        assert_eq!((away.colour, away.opacity), ([0.1, 0.2, 0.3], 0.0));
+    }
 }

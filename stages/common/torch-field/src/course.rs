@@ -1,0 +1,87 @@
+use radiance::{Course, Ray, UnitRay, clip};
+use scene::{Bounds, Space};
+use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
+
+/// How rays run through the unit cube, as tensors: `radiance`'s [`UnitRay`]s, which it clips in f64 and on the host.
+#[derive(Debug)]
+pub(crate) struct Courses {
+    origin: Tensor,
+    direction: Tensor,
+    /// The direction in the world: n × 3.
+    pub(crate) view: Tensor,
+    /// Where they enter and leave, by their parameter t: n × 1. Equal where they meet nothing.
+    pub(crate) enter: Tensor,
+    pub(crate) leave: Tensor,
+    /// Distance where t is 0, its growth, and its bend or its reach: n × 1 each.
+    distance: [Tensor; 3],
+    contracted: bool,
+}
+
+impl Courses {
+    pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device) -> Result<Self, TchError> {
+        let rays: Vec<UnitRay> = rays.iter().map(|r| clip(bounds, r)).collect();
+        let columns = |width: i64, of: &dyn Fn(&UnitRay, &mut Vec<f32>)| {
+            let mut values = Vec::with_capacity(rays.len() * width as usize);
+            rays.iter().for_each(|r| of(r, &mut values));
+            Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, width])?.f_to_device(device)
+        };
+        let three = |of: fn(&UnitRay) -> [f32; 3]| columns(3, &|r, to| to.extend(of(r)));
+        let one = |of: &dyn Fn(&UnitRay) -> f32| columns(1, &|r, to| to.push(of(r)));
+        let of_course = |k: usize| {
+            one(&|r| match r.course {
+                Course::Straight { start, scale, bend } => [start, scale, bend][k],
+                Course::Contracted { start, scale, reach } => [start, scale, reach][k],
+            })
+        };
+        // What isn't finite meets nothing; its view must not spoil the others' sums.
+        let tame = |v: [f32; 3]| if v.iter().all(|x| x.is_finite()) { v } else { [0.0; 3] };
+        Ok(Self {
+            origin: three(|r| r.origin)?,
+            direction: three(|r| r.direction)?,
+            view: columns(3, &|r, to| to.extend(tame(r.view)))?,
+            enter: one(&|r| r.enter)?,
+            leave: one(&|r| r.leave.max(r.enter))?,
+            distance: [of_course(0)?, of_course(1)?, of_course(2)?],
+            contracted: bounds.space == Space::Contraction,
+        })
+    }
+
+    /// Places in the unit cube at t (n × m): n × m × 3.
+    pub(crate) fn positions(&self, t: &Tensor) -> Result<Tensor, TchError> {
+        let (origin, direction) = (self.origin.f_unsqueeze(1)?, self.direction.f_unsqueeze(1)?);
+        if !self.contracted {
+            return fused(&direction, &t.f_unsqueeze(-1)?, &origin);
+        }
+        let along = sinh4(t)?.f_mul(&self.distance[2])?;
+        let u = fused(&direction, &along.f_unsqueeze(-1)?, &origin)?;
+        let length = u.f_square()?.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?.f_sqrt()?.f_clamp_min(1.0)?;
+        // (2 - 1 / length) / length, which is 1 where the length is.
+        let factor = length.f_reciprocal()?.f_neg()?.f_add_scalar(2.0)?.f_div(&length)?;
+        u.f_mul(&factor)?.f_mul_scalar(0.25)?.f_add_scalar(0.5)
+    }
+
+    /// Distances in scene units at t (n × m).
+    pub(crate) fn distances(&self, t: &Tensor) -> Result<Tensor, TchError> {
+        let [start, scale, bend] = &self.distance;
+        if self.contracted {
+            return sinh4(t)?.f_mul(scale)?.f_add(start);
+        }
+        t.f_mul(scale)?.f_div(&t.f_mul(bend)?.f_neg()?.f_add_scalar(1.0)?)?.f_add(start)
+    }
+
+    /// Which rays meet the cube: n.
+    pub(crate) fn hits(&self) -> Result<Tensor, TchError> {
+        self.enter.i((.., 0)).f_lt_tensor(&self.leave.i((.., 0)))
+    }
+}
+
+/// a·b + c rounded once, as the hand-written field does it by fused multiply-adds, for which f64 stands here.
+pub(crate) fn fused(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
+    let wide = |t: &Tensor| t.f_to_kind(Kind::Double);
+    wide(a)?.f_mul(&wide(b)?)?.f_add(&wide(c)?)?.f_to_kind(Kind::Float)
+}
+
+/// sinh(4t).
+fn sinh4(t: &Tensor) -> Result<Tensor, TchError> {
+    t.f_mul_scalar(4.0)?.f_sinh()
+}

@@ -1,0 +1,461 @@
+use std::ops::Range;
+use std::path::Path;
+
+use radiance::{Field, Occupancy, StepReport, Supervision, Tally, TrainingOptions, full_ray, uniform};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use crate::TorchFieldError;
+use crate::grid::{GridSeen, TorchGrid};
+use crate::mlp::host;
+use crate::step::Step;
+
+/// Trains a [`radiance::Field`] as [`radiance::Trainer`] does, by libtorch's operations and autograd: the same draws, steps, rates and
+/// looks at the occupancy. On the CPU in one thread, to judge that trainer by; on CUDA to be fast.
+pub struct GridTrainer {
+    grid: TorchGrid,
+    options: TrainingOptions,
+    occupancy: Occupancy,
+    first: Vec<Tensor>,
+    second: Vec<Tensor>,
+    /// Running average of the parameters, once there is one.
+    average: Option<Vec<Tensor>>,
+    tally: Tally,
+    samples_per_ray: f64,
+}
+
+/// Adam's constants in `radiance`: for a grid whose entries are seen now and then, the second moment forgets sooner.
+const BETA: [f64; 2] = [0.9, 0.99];
+const EPSILON: f64 = 1e-15;
+/// Places that are looked at together.
+const LOOKS: usize = 1 << 18;
+
+/// What a piece of a step leaves.
+struct Piece {
+    gradients: Vec<Tensor>,
+    colours: Vec<[f32; 3]>,
+    loss: f64,
+    samples: usize,
+}
+
+impl GridTrainer {
+    /// Starts from a field.
+    pub fn new(field: &Field, options: TrainingOptions, device: Device) -> Result<Self, TorchFieldError> {
+        let grid = TorchGrid::new(field, device)?;
+        let zeros = || grid.parameters().iter().map(|p| p.f_detach()?.f_zeros_like()).collect::<Result<Vec<_>, TchError>>();
+        let (first, second) = (zeros()?, zeros()?);
+        Ok(Self {
+            occupancy: field.parts().2.clone(),
+            samples_per_ray: full_ray(&field.architecture),
+            grid,
+            options,
+            first,
+            second,
+            average: None,
+            tally: Tally::default(),
+        })
+    }
+
+    /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
+    pub fn limit_to_hull(&mut self, hull: &[u8]) -> Result<(), TorchFieldError> {
+        self.occupancy.limit_to_hull(&self.grid.bounds, hull);
+        Ok(self.grid.occupy(&self.occupancy)?)
+    }
+
+    /// Steps taken.
+    pub fn steps(&self) -> u64 {
+        self.tally.steps
+    }
+
+    /// Rays cast so far.
+    pub fn rays_done(&self) -> u64 {
+        self.tally.rays
+    }
+
+    /// The field: at the end of a training with the average of its weights, where one was kept.
+    pub fn field(&self) -> Result<Field, TorchFieldError> {
+        let mut field = Field::new(self.grid.architecture, self.grid.bounds, 0);
+        let (grid, network, occupancy) = field.parts_mut();
+        let parameters =
+            self.average.as_ref().map_or_else(|| self.grid.parameters(), |a| a.iter().map(Tensor::shallow_clone).collect());
+        grid.copy_from_slice(&host(&parameters[0])?);
+        let layers: Vec<f32> = parameters[1..].iter().map(host).collect::<Result<Vec<_>, _>>()?.concat();
+        network[..layers.len()].copy_from_slice(&layers);
+        *occupancy = self.occupancy.clone();
+        Ok(field)
+    }
+
+    /// Takes a step; `None` once all rays are spent.
+    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
+        supervision.begin(self.tally.done(self.options.rays));
+        let group = supervision.rays_per_group();
+        let wanted = self.options.rays_of_step(self.samples_per_ray);
+        let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
+        self.look()?;
+        let step = Step::new(&self.tally, groups, group);
+        let pieces = step.in_pieces(|range| self.run(&*supervision, step, range))?;
+        let rays = groups * group;
+        let samples = pieces.iter().map(|p| p.samples).sum::<usize>();
+        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
+        self.tally.cast(groups, group);
+        self.samples_per_ray = samples as f64 / rays as f64;
+        let (colours, gradients): (Vec<_>, Vec<_>) = pieces.into_iter().map(|p| (p.colours, p.gradients)).unzip();
+        let mut gradients = gradients.into_iter();
+        let mut sum = gradients.next().unwrap_or_default();
+        no_grad(|| {
+            gradients.flatten().enumerate().try_for_each(|(i, g)| {
+                let i = i % sum.len();
+                sum[i].f_add_(&g).map(drop)
+            })
+        })?;
+        let skipped = !loss.is_finite() || !nets::all_finite(&sum)?;
+        if skipped {
+            if !self.tally.forgives() {
+                return Err(TorchFieldError::NotFinite { step: self.tally.steps });
+            }
+        } else {
+            no_grad(|| self.apply(&sum))?;
+            step.remember(supervision, colours.iter().map(Vec::as_slice));
+        }
+        self.tally.steps += 1;
+        Ok(Some(StepReport { loss, rays, samples, skipped }))
+    }
+
+    /// Some groups forward and back.
+    fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
+        let rays = step.cast(supervision, &range);
+        let first = step.first_ray(&range);
+        let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| uniform(self.options.seed, 4, r)).collect();
+        let seen = self.grid.see(&rays, &Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?)?;
+        let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
+        let backgrounds = Tensor::f_from_slice(&backgrounds)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
+        let colour = seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
+        let judged = step.judge(supervision, &range, &colour)?;
+        let mut towards = judged.towards;
+        if self.options.distortion > 0.0 {
+            let share = f64::from(self.options.distortion) / (step.groups * step.group) as f64;
+            towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
+        }
+        let gradients = if towards.requires_grad() {
+            Tensor::f_run_backward(&[towards], &self.grid.parameters(), false, false)?
+        } else {
+            // No sample was met: nothing is learnt.
+            self.first.iter().map(Tensor::f_zeros_like).collect::<Result<_, _>>()?
+        };
+        Ok(Piece { gradients, colours: judged.colours, loss: judged.loss, samples: seen.samples })
+    }
+
+    /// Moves the parameters, and late in the training their average.
+    fn apply(&mut self, gradients: &[Tensor]) -> Result<(), TchError> {
+        let options = &self.options;
+        let schedule = options.schedule(&self.tally);
+        let t = self.tally.steps + 1;
+        let moments = |i: usize| (&gradients[i], &self.first[i], &self.second[i]);
+        for (i, level) in self.grid.levels.iter().enumerate() {
+            let part = |of: &Tensor| of.f_narrow(0, level.first, level.entries);
+            let (g, first, second) = moments(0);
+            let rate = options.rate_of_level(i, schedule);
+            let moments = [part(first)?, part(second)?];
+            lazy_adam(t, rate, options.grid_decay, part(&self.grid.table)?, &part(g)?, moments)?;
+        }
+        for (i, layer) in self.grid.layers.iter().enumerate() {
+            let (g, first, second) = moments(i + 1);
+            let moments = [first.shallow_clone(), second.shallow_clone()];
+            lazy_adam(t, options.network_rate * schedule, options.network_decay, layer.shallow_clone(), g, moments)?;
+        }
+        if options.averages(&self.tally) {
+            let now = self.grid.parameters();
+            match &mut self.average {
+                None => self.average = Some(now.iter().map(Tensor::f_detach_copy).collect::<Result<_, _>>()?),
+                Some(average) => {
+                    let new = 1.0 - f64::from(options.averaging);
+                    for (average, now) in average.iter_mut().zip(&now) {
+                        let _ = average.f_lerp_(now, new)?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Looks at the density of cells where it is time to.
+    fn look(&mut self) -> Result<(), TchError> {
+        let looks = self.occupancy.looks(self.options.seed, self.tally.steps);
+        if looks.is_empty() {
+            return Ok(());
+        }
+        let mut found = Vec::with_capacity(looks.len());
+        for looks in looks.chunks(LOOKS) {
+            let positions: Vec<f32> = looks.iter().flat_map(|l| l.position).collect();
+            let positions = Tensor::f_from_slice(&positions)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
+            found.extend(host(&self.grid.densities(&positions)?)?);
+        }
+        self.occupancy.learn(&looks, &found, self.grid.step() as f32);
+        self.grid.occupy(&self.occupancy)
+    }
+
+    /// Writes all that a resumed training needs. The caller makes it atomic.
+    pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
+        let named = |kind: &'static str, tensors: &[Tensor]| {
+            let name = move |(i, t): (usize, &Tensor)| (format!("{kind}.{i}"), t.shallow_clone());
+            tensors.iter().enumerate().map(name).collect::<Vec<_>>()
+        };
+        let mut all = named("parameter", &self.grid.parameters());
+        all.extend(named("first", &self.first));
+        all.extend(named("second", &self.second));
+        all.extend(self.average.iter().flat_map(|a| named("average", a)));
+        all.push((DENSITY.to_owned(), Tensor::f_from_slice(self.occupancy.density())?));
+        all.push((OCCUPIED.to_owned(), Tensor::f_from_slice(&self.occupancy.to_bytes())?));
+        let counts = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
+        all.push((COUNTS.to_owned(), Tensor::f_from_slice(&counts.map(|c| c as i64).collect::<Vec<_>>())?));
+        Ok(nets::write(path, &all)?)
+    }
+
+    /// The step a checkpoint was written at.
+    pub fn checkpoint_step(path: &Path) -> Result<u64, TorchFieldError> {
+        let [steps, ..] = counts(&nets::Weights::read(path)?)?;
+        Ok(steps)
+    }
+
+    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
+        let weights = nets::Weights::read(path)?;
+        let [tally @ .., samples_per_ray] = counts(&weights)?;
+        let now = self.grid.parameters();
+        let read = |kind: &str| -> Result<Vec<Tensor>, TorchFieldError> {
+            let one = |(i, like): (usize, &Tensor)| {
+                Ok(weights.tensor(&format!("{kind}.{i}"), &like.size())?.f_to_device(self.grid.device)?)
+            };
+            now.iter().enumerate().map(one).collect()
+        };
+        let (parameters, first, second) = (read("parameter")?, read("first")?, read("second")?);
+        let average = weights.has("average.0").then(|| read("average")).transpose()?;
+        let cells = self.occupancy.density().len() as i64;
+        let density = host(&weights.tensor(DENSITY, &[cells])?)?;
+        let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
+        no_grad(|| now.iter().zip(&parameters).try_for_each(|(to, from)| to.shallow_clone().f_copy_(from).map(drop)))?;
+        self.occupancy.restore(density, &occupied);
+        self.grid.occupy(&self.occupancy)?;
+        (self.first, self.second, self.average) = (first, second, average);
+        (self.tally, self.samples_per_ray) = (Tally::from_counters(tally), f64::from_bits(samples_per_ray));
+        Ok(())
+    }
+}
+
+/// Names in a checkpoint.
+const DENSITY: &str = "density";
+const OCCUPIED: &str = "occupied";
+const COUNTS: &str = "counts";
+
+fn counts(weights: &nets::Weights) -> Result<[u64; 6], nets::WeightsError> {
+    let counts = weights.integers(COUNTS, 6)?;
+    Ok(std::array::from_fn(|i| counts[i] as u64))
+}
+
+/// One lazy Adam step: what has no gradient keeps its value and its moments.
+fn lazy_adam(
+    t: u64,
+    rate: f64,
+    decay: f32,
+    mut parameter: Tensor,
+    gradient: &Tensor,
+    [mut first, mut second]: [Tensor; 2],
+) -> Result<(), TchError> {
+    let t = t.min(100_000) as i32;
+    let rate = rate * (1.0 - BETA[1].powi(t)).sqrt() / (1.0 - BETA[0].powi(t));
+    let touched = gradient.f_ne(0.0)?;
+    let gradient = parameter.f_mul_scalar(f64::from(decay))?.f_add(gradient)?;
+    let first1 = gradient.f_lerp(&first, BETA[0])?;
+    let second1 = gradient.f_square()?.f_lerp(&second, BETA[1])?;
+    let by = first1.f_div(&second1.f_sqrt()?.f_add_scalar(EPSILON)?)?.f_mul_scalar(rate)?;
+    let moved = parameter.f_sub(&by)?.f_where_self(&touched, &parameter)?;
+    let _ = parameter.f_copy_(&moved)?;
+    let kept = first1.f_where_self(&touched, &first)?;
+    let _ = first.f_copy_(&kept)?;
+    let kept = second1.f_where_self(&touched, &second)?;
+    let _ = second.f_copy_(&kept)?;
+    Ok(())
+}
+
+/// The distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
+fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
+    let weights = seen.weights.f_mul(&seen.counted)?;
+    let moments = weights.f_mul(&seen.t)?;
+    let before = |of: &Tensor| of.f_cumsum(1, None::<Kind>)?.f_sub(of);
+    let apart = seen.t.f_mul(&before(&weights)?)?.f_sub(&before(&moments)?)?;
+    let pairs = weights.f_mul(&apart)?.f_mul_scalar(2.0)?;
+    pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::{Architecture, Draws, Ray, Trainer};
+    use scene::{Bounds, Frustum, Space};
+
+    use super::*;
+
+    /// Groups of four rays through the middle, of which each should have a colour of its own: in the mean.
+    struct Painted {
+        seen: Vec<f32>,
+    }
+
+    impl Supervision for Painted {
+        fn rays_per_group(&self) -> usize {
+            4
+        }
+
+        fn cast(&self, group: u64, rays: &mut [Ray]) {
+            let mut draws = Draws::new(1, 2, group);
+            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
+            for ray in rays {
+                let (from, to) = (around(0.3), around(0.7));
+                let origin = [from[0], from[1], from[2] + 4.0];
+                let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
+                let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
+                *ray = Ray { origin, direction: d.map(|x| x / length), background: [1.0; 3] };
+            }
+        }
+
+        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+            let share = 1.0 / colours.len() as f32;
+            let mut loss = 0.0;
+            for c in 0..3 {
+                let mean = colours.iter().map(|x| x[c]).sum::<f32>() * share;
+                let off = mean - [0.2, 0.5, 0.8][(group as usize + c) % 3];
+                loss += f64::from(off * off);
+                gradients.iter_mut().for_each(|g| g[c] = 2.0 * off * share);
+            }
+            loss
+        }
+
+        fn remember(&mut self, _: u64, colours: &[[f32; 3]]) {
+            self.seen.push(colours[0][0]);
+        }
+    }
+
+    fn options() -> TrainingOptions {
+        TrainingOptions {
+            rays: 36 * 256,
+            batch: 256,
+            samples: 1 << 20,
+            rate: 1e-2,
+            level_rate: 0.8,
+            network_rate: 1e-2,
+            final_rate: 0.25,
+            warm_up: 5,
+            averaging: 0.9,
+            distortion: 0.02,
+            grid_decay: 1e-4,
+            network_decay: 1e-4,
+            seed: 9,
+        }
+    }
+
+    fn bounds(space: Space) -> Bounds {
+        let frustum = Frustum {
+            camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
+            min: [-0.5; 2],
+            max: [0.5; 2],
+            near: 2.0,
+            far: 40.0,
+        };
+        let space = if matches!(space, Space::Ndc(_)) { Space::Ndc(frustum) } else { space };
+        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 40.0, space }
+    }
+
+    fn field(space: Space) -> Field {
+        let architecture =
+            Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
+        Field::new(architecture, bounds(space), 5)
+    }
+
+    /// The middle of the cube alone: looks are slow on a CPU.
+    fn hull() -> Vec<u8> {
+        let middle = |cell: usize| [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c));
+        (0..128 * 128 * 128).map(|cell| u8::from(middle(cell))).collect()
+    }
+
+    fn devices() -> Vec<Device> {
+        std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
+    }
+
+    /// Step by step the same losses as the hand-written trainer's, through two looks at the occupancy and into the average of the weights, in
+    /// every space; and in the end the same field.
+    #[test]
+    fn trains_as_the_hand_written_trainer_does() {
+        let ndc = Space::Ndc(Frustum { camera_to_world: [[0.0; 4]; 3], min: [0.0; 2], max: [0.0; 2], near: 1.0, far: 2.0 });
+        for device in devices() {
+            for space in [Space::Box, ndc, Space::Contraction] {
+                let start = field(space);
+                let mut ours = Trainer::new(start.clone(), options());
+                let mut judge = GridTrainer::new(&start, options(), device).unwrap();
+                ours.limit_to_hull(&hull());
+                judge.limit_to_hull(&hull()).unwrap();
+                let (mut mine, mut its) = (Painted { seen: Vec::new() }, Painted { seen: Vec::new() });
+                let mut losses = Vec::new();
+                while let Some(report) = ours.step(&mut mine).unwrap() {
+                    let other = judge.step(&mut its).unwrap().unwrap();
+                    assert_eq!(report.rays, other.rays);
+                    let off = (report.loss - other.loss).abs() / report.loss;
+                    // On a CPU; a GPU adds in any order.
+                    assert!(
+                        off < if device == Device::Cpu { 1e-5 } else { 1e-2 },
+                        "{device:?} {space:?} step {}: {report:?} {other:?}",
+                        ours.steps()
+                    );
+                    losses.push(report.loss);
+                }
+                assert!(judge.step(&mut its).unwrap().is_none() && losses.len() == 36);
+                assert!(losses[35] < 0.9 * losses[0], "{losses:?}");
+                assert_eq!(mine.seen.len(), its.seen.len());
+                let rays: Vec<Ray> = (0..50)
+                    .flat_map(|g| {
+                        let mut rays = [Ray::default(); 4];
+                        mine.cast(g, &mut rays);
+                        rays
+                    })
+                    .collect();
+                let (a, b) = (ours.finish().render(&rays), judge.field().unwrap().render(&rays));
+                for (a, b) in a.iter().zip(&b) {
+                    let off = (a.colour[0] - b.colour[0]).abs().max((a.depth / b.depth - 1.0).abs());
+                    assert!(off < if device == Device::Cpu { 1e-3 } else { 5e-2 }, "{device:?} {space:?}: {a:?} {b:?}");
+                }
+            }
+        }
+    }
+
+    /// A hull that holds nothing leaves the background, and nothing to learn.
+    #[test]
+    fn nothing_outside_a_hull_is_learnt() {
+        let start = field(Space::Box);
+        let mut judge = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
+        judge.limit_to_hull(&vec![0; 128 * 128 * 128]).unwrap();
+        let report = judge.step(&mut Painted { seen: Vec::new() }).unwrap().unwrap();
+        assert_eq!((report.samples, report.skipped), (0, false));
+        assert_eq!(judge.field().unwrap().parts().0, start.parts().0);
+    }
+
+    /// What goes on from a checkpoint ends in the same numbers.
+    #[test]
+    fn a_checkpoint_holds_all() {
+        let run = |mut judge: GridTrainer, steps: u64| {
+            while judge.steps() < steps && judge.step(&mut Painted { seen: Vec::new() }).unwrap().is_some() {}
+            judge
+        };
+        let new = || {
+            let mut new = GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();
+            new.limit_to_hull(&hull()).unwrap();
+            new
+        };
+        let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
+        for at in [3, 33] {
+            run(new(), at).write_checkpoint(&path).unwrap();
+            assert_eq!(GridTrainer::checkpoint_step(&path).unwrap(), at);
+            let mut resumed = new();
+            resumed.resume(&path).unwrap();
+            let (through, on) = (run(new(), 36).field().unwrap(), run(resumed, 36).field().unwrap());
+            assert!(through.parts().0 == on.parts().0 && through.parts().1 == on.parts().1, "from step {at}");
+        }
+        std::fs::write(&path, b"cut short").unwrap();
+        assert!(new().resume(&path).is_err() && GridTrainer::checkpoint_step(&path).is_err());
+    }
+}
