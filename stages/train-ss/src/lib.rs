@@ -96,11 +96,13 @@ impl Stage for TrainSs {
         params.check().map_err(Failure::Usage)?;
         let input = context.input("scene")?;
         let views = Views::read(input)?;
+        let epoch = epoch(&views, params);
+        let params = &params.published(&views.bounds.space, epoch);
         let model = match params.field {
             FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
-        let all = params.rays(epoch(&views, params));
+        let all = params.rays(epoch);
         let progress = context.progress("training", all);
         let mut log = TrainingLog::default();
         for index in 0..params.members {

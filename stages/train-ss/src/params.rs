@@ -32,7 +32,7 @@ pub struct Params {
     #[schemars(range(min = 1.0, max = 100.0))]
     pub detail: Option<f64>,
     /// Steps at the start that draw from the middle half of each picture's width and height alone, where something is to be seen.
-    /// Without it: 0 for `grid`, 1000 for `mlp`.
+    /// Without it: 0 for `grid`; 1000 for `mlp`, but 0 in NDC.
     #[schemars(range(min = 0))]
     pub crop_steps: Option<u32>,
     /// How many fields to train apart, each with its share of the rays: what they render is averaged, and so is what each of them
@@ -40,7 +40,7 @@ pub struct Params {
     #[schemars(range(min = 1, max = 16))]
     pub members: u32,
     /// Rays to train with, sub-rays counted each, over all members. Without it: 30 million for `grid`; for `mlp` as many as 20 epochs
-    /// have.
+    /// have, or 30 in NDC.
     #[schemars(range(min = 1))]
     pub rays: Option<u64>,
     /// Most rays in a step. Without it: 4,096 for `grid`, 2,048 for `mlp`.
@@ -110,9 +110,9 @@ pub struct Params {
     /// `mlp`: samples that the fine network has besides those.
     #[schemars(range(min = 1, max = 4096))]
     pub fine_samples: u32,
-    /// `mlp`: standard deviation of the noise on raw densities; the reference has 1 for photographs.
+    /// `mlp`: standard deviation of the noise on raw densities. Without it: 0, and 1 in NDC.
     #[schemars(range(min = 0.0, max = 100.0))]
-    pub noise: f64,
+    pub noise: Option<f64>,
     /// `mlp`: how often a network that has collapsed to the background may start over, with the next seed.
     #[schemars(range(min = 0, max = 100))]
     pub restarts: u32,
@@ -156,7 +156,7 @@ impl Default for Params {
             layers: mlp.depth,
             coarse_samples: mlp.coarse_samples,
             fine_samples: mlp.fine_samples,
-            noise: 0.0,
+            noise: None,
             restarts: 0,
             seed: 0,
         }
@@ -183,8 +183,9 @@ pub enum RateSchedule {
     Paper,
 }
 
-/// Epochs of the published Blender trainings.
+/// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
 const EPOCHS: u64 = 20;
+const EPOCHS_IN_NDC: u64 = 30;
 
 impl Params {
     /// Fails on parameters that can't be meant together.
@@ -231,6 +232,20 @@ impl Params {
                 Err(format!("parameter {name}: it belongs to the other field; leave it out, or choose that field"))
             }
             None => Ok(()),
+        }
+    }
+
+    /// With what was published for a space, where nothing else is said: the paper's field is trained otherwise on photographs in NDC. `epoch`
+    /// counts the rays of all pixels.
+    pub fn published(&self, space: &Space, epoch: u64) -> Self {
+        if self.field != FieldKind::Mlp || !matches!(space, Space::Ndc(_)) {
+            return self.clone();
+        }
+        Self {
+            rays: self.rays.or(Some(EPOCHS_IN_NDC * epoch)),
+            crop_steps: self.crop_steps.or(Some(0)),
+            noise: self.noise.or(Some(1.0)),
+            ..self.clone()
         }
     }
 
@@ -331,7 +346,7 @@ impl Params {
                 RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
                 RateSchedule::Paper => torch_field::Schedule::Exponential,
             },
-            noise: self.noise,
+            noise: self.noise.unwrap_or(0.0),
             seed: self.seed,
         }
     }
@@ -341,5 +356,26 @@ impl Params {
         let members = u64::from(self.members.max(1));
         let own = rays / members + u64::from(u64::from(index) < rays % members);
         Self { members: 1, rays: Some(own), seed: self.seed.wrapping_add(u64::from(index)), ..self.clone() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use scene::Frustum;
+
+    use super::*;
+
+    /// What was published for photographs holds where nothing else is said, for that field, in that space.
+    #[test]
+    fn photographs_have_published_settings_of_their_own() {
+        let ndc = Space::Ndc(Frustum { camera_to_world: [[0.0; 4]; 3], min: [0.0; 2], max: [1.0; 2], near: 1.0, far: 2.0 });
+        let mlp = Params { field: FieldKind::Mlp, ..Params::default() };
+        let there = mlp.published(&ndc, 100);
+        assert_eq!((there.rays(100), there.crop_groups(4), there.noise), (3000, 0, Some(1.0)));
+        let here = mlp.published(&Space::Box, 100);
+        assert_eq!((here.rays(100), here.crop_groups(4), here.noise), (2000, 512_000, None));
+        let said = Params { rays: Some(7), noise: Some(0.0), crop_steps: Some(1), ..mlp };
+        assert_eq!(said.published(&ndc, 100), said);
+        assert_eq!(Params::default().published(&ndc, 100), Params::default());
     }
 }
