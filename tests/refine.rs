@@ -5,7 +5,7 @@ mod common;
 
 use std::path::Path;
 
-use common::{Finished, Project, kill_again_and_again, manifest, stage, stage_command};
+use common::{Finished, Project, data, kill_again_and_again, manifest, stage, stage_command};
 
 const REFINED: &str = "
   rehearsal-field:
@@ -180,11 +180,111 @@ fn references_are_used_by_a_network_that_knows_how() {
     assert!(left_out.code == 0 && left_out.stderr.contains("trained without references"), "{}", left_out.stderr);
 }
 
+/// A copy of a folder with its files of a kind changed.
+fn changed(project: &Project, name: &str, of: &Path, extension: &str, change: &dyn Fn(&Path)) -> std::path::PathBuf {
+    let to = project.path(name);
+    for file in walkdir::WalkDir::new(of).into_iter().flatten().filter(|f| f.file_type().is_file()) {
+        let target = to.join(file.path().strip_prefix(of).unwrap());
+        std::fs::create_dir_all(target.parent().unwrap()).unwrap();
+        std::fs::write(&target, std::fs::read(file.path()).unwrap()).unwrap();
+        if target.extension().is_some_and(|e| e == extension) {
+            change(&target);
+        }
+    }
+    // It says what the files were.
+    std::fs::remove_file(to.join("artifact.json")).ok();
+    to
+}
+
+/// Changes a view's depth, pixel by pixel.
+fn change_depth(path: &Path, change: fn(usize, f32) -> f32) {
+    let image = pixels::read_exr(path).unwrap();
+    let channels = &pixels::VIEW_CHANNELS[..5];
+    let written = pixels::write_exr(path, (image.width, image.height), channels, pixels::VIEW_NOTE, |first, _, samples| {
+        for (i, sample) in (first * image.width..).zip(samples.chunks_exact_mut(5)) {
+            (0..5).for_each(|c| sample[c] = image.channel(channels[c].name).unwrap()[i]);
+            sample[4] = change(i, sample[4]);
+        }
+        Ok::<(), pixels::PixelError>(())
+    });
+    written.unwrap();
+}
+
+/// A depth's factor, different at every pixel.
+fn noise(seed: u64, pixel: usize) -> f32 {
+    1.0 + 0.03 * (radiance::uniform(seed, 2, pixel as u64) - 0.5)
+}
+
+/// Depth with noise, depth of surfaces that lie elsewhere, references that see nothing, are of another exposure or show something else: never
+/// worse than what is rendered by more than a hair, and the log says what is wrong.
+#[test]
+fn bad_references_do_no_harm() {
+    let project = project();
+    project.replace("train: 12", "train: 30");
+    project.replace("rays: 60000", "rays: 300000");
+    project.replace("rays: 40000", "rays: 200000");
+    project.replace("parameters: {references: 2}", "parameters: {references: 2, steps: 600, channels: 16, blocks: 2}");
+    let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
+    let target = [&["refine-referenced", "-p", "prep.references=2"], &from_the_front[..]].concat();
+    project.ok(&[&["run"], &target[..]].concat());
+    let folder = |stage: &str| project.object(&project.output_of(stage, &target)[0]);
+    let (views, refiner, prep, reference_views) =
+        (folder("render-depth"), folder("train-referenced"), folder("prep"), folder("reference-views"));
+    let references = prep.join("references");
+    let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
+        changed(&project, name, of, "exr", &|path| change_depth(path, change))
+    };
+    let pictures = |name: &str, change: fn([f32; 3]) -> [f32; 3]| {
+        changed(&project, name, &references, "png", &|path| {
+            let picture = pixels::read_premultiplied(path).unwrap().over(1.0);
+            let data = picture.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
+            pixels::write_png(path, &pixels::Picture::new(picture.width, picture.height, 3, data).to_rgba8()).unwrap();
+        })
+    };
+    let psnr = |found: &Path| {
+        let read = |path: &Path| pixels::read_premultiplied(path).unwrap().over(1.0);
+        let truth = prep.join("truth/images").read_dir().unwrap().next().unwrap().unwrap().path();
+        let name = truth.with_extension("exr");
+        eval::psnr(&read(&found.join("images").join(name.file_name().unwrap())), &read(&truth))
+    };
+    let rendered = psnr(&views);
+    let refined = |name: &str, views: &Path, references: &Path, reference_views: &Path| {
+        let inputs = [("views", views), ("refiner", &refiner), ("references", references), ("reference-views", reference_views)];
+        let mut command = std::process::Command::new(common::bin("refine"));
+        command.arg("--output").arg(project.path(name));
+        command.args(inputs.map(|(input, folder)| format!("--input={input}={}", folder.display())));
+        let finished = Finished::of(command.output().unwrap());
+        assert_eq!(finished.code, 0, "{}", finished.stderr);
+        println!("{}", std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap());
+        println!("{name}: {:.2} dB, rendered {rendered:.2}; {}", psnr(&project.path(name)), finished.stderr);
+        assert!(psnr(&project.path(name)) > rendered - 0.05, "{name}: {} of {rendered}", psnr(&project.path(name)));
+        finished.stderr
+    };
+    let good = refined("good", &views, &references, &reference_views);
+    assert!(!good.contains("reference r_"), "{good}");
+
+    let (mine, theirs) = (depths("a", &views, |i, z| z * noise(1, i)), depths("b", &reference_views, |i, z| z * noise(3, i)));
+    refined("noisy", &mine, &references, &theirs);
+    let (mine, theirs) = (depths("c", &views, |_, _| 2.5), depths("d", &reference_views, |_, _| 2.5));
+    let said = refined("shifted", &mine, &references, &theirs);
+    assert!(said.contains("looks otherwise than what is rendered"), "{said}");
+    let said = refined("hidden", &views, &references, &depths("e", &reference_views, |_, z| 0.01 * z));
+    assert!(said.contains("sees nothing of these views"), "{said}");
+    let said = refined("dark", &views, &pictures("f", |p| p.map(|v| 0.6 * v)), &reference_views);
+    assert!(said.contains("has another exposure"), "{said}");
+    let said = refined("other", &views, &pictures("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
+    assert!(said.contains("looks otherwise than what is rendered"), "{said}");
+}
+
 /// `make refine-table` and `make quality REFINED=1`: rows for what is rendered and what is refined, on the same views.
 #[test]
 fn tables_have_rendered_and_refined_rows() {
     let project = project();
     project.demo_data();
+    // Where there are weights, scripts hand them to LPIPS.
+    if let Some(data) = data() {
+        std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
+    }
     let table = ["--scenes", "demo", "--protocols", "24x2", "--references", "1", "2", "--out", "out/table.json"];
     let more = ["--set", "rays=60000", "rehearsal-field.rays=30000"];
     let made = project.script("refine-table.py", &[&table[..], &more].concat());

@@ -19,7 +19,7 @@ use paper_refiner::PaperRefiner;
 use pixels::{
     Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
 };
-use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, WEIGHTS_FILE, guided};
+use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -82,7 +82,7 @@ impl Stage for Refine {
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(Photographs::read).transpose()?;
-        let job = Job {
+        let mut job = Job {
             context,
             input,
             background: views.background.shown(),
@@ -92,17 +92,28 @@ impl Stage for Refine {
             references,
             photographs,
         };
+        if job.takes_references() {
+            job.leave_out(&views, LITTLE * file.trusted.unwrap_or(1.0))?;
+        }
         let mut agreed = 0;
+        let mut uses = vec![Use::default(); job.references.len()];
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
             context.check_interrupt()?;
-            agreed += usize::from(job.refine(view)?);
+            agreed += usize::from(job.refine(view, &mut uses)?);
             progress.add(1);
         }
         context.write_json(VIEWS_FILE, &views)?;
+        for (reference, _) in job.references.iter().zip(&uses).filter(|(_, of_use)| job.takes_references() && of_use.seen == 0) {
+            context.say(format!("reference {} sees nothing of these views", reference.rendered.camera.name));
+        }
         let by = match job.references.len() {
             0 => String::new(),
-            count => format!(" by {count} references"),
+            count => {
+                let mut all = Use::default();
+                uses.iter().for_each(|u| all.add(u));
+                format!(" by {count} references, trusted by {:.0} %", 100.0 * all.trusted())
+            }
         };
         let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
         context.write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{own}", views.views.len()))
@@ -181,11 +192,14 @@ impl AnyRefiner {
         }
     }
 
-    /// A view refined: colours in 0..1.
-    fn refine(&self, rendered: &Rendered, references: &[&KnownView], strength: f32, turns: u32) -> anyhow::Result<Picture> {
+    /// A view refined: colours in 0..1. What each reference was of use for is added to `uses`.
+    fn refine(&self, rendered: &Rendered, references: &[&KnownView], job: &Job<'_>, uses: &mut [Use]) -> anyhow::Result<Picture> {
+        let Job { strength, turns, .. } = *job;
         let (network, patches) = match self {
             Self::Compact(network) if network.architecture().guided => {
-                return Ok(network.refine_by(&guided(rendered, references), strength, turns)?);
+                let guided = guided(rendered, references);
+                uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
+                return Ok(network.refine_by(&guided.view, strength, turns)?);
             }
             Self::Compact(network) => return Ok(network.refine_by(&rendered.view, strength, turns)?),
             Self::Paper(network, patches) => (network, *patches),
@@ -197,6 +211,12 @@ impl AnyRefiner {
         Ok(drawn)
     }
 }
+
+/// Something must be wrong with a reference that is trusted with less than this share of what those of the rehearsal were.
+const LITTLE: f64 = 0.75;
+
+/// Views, spread over all, by which that is judged.
+const JUDGES: usize = 8;
 
 /// What all views share.
 struct Job<'a> {
@@ -212,11 +232,11 @@ struct Job<'a> {
 
 impl Job<'_> {
     /// Refines one view: its files are written, and named in it. Whether it was made to agree with its own photograph.
-    fn refine(&self, view: &mut View) -> anyhow::Result<bool> {
+    fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
         let (rendered, image) = read(self.input, view, self.background)?;
         let references: Vec<&KnownView> = self.references.iter().collect();
-        let refined = self.network.refine(&rendered, &references, self.strength, self.turns)?;
+        let refined = self.network.refine(&rendered, &references, self, uses)?;
         let agreed = match &self.photographs {
             Some(photographs) => photographs.of(&view.camera)?.map(|own| photographs.agree(&refined, &own)),
             None => None,
@@ -228,6 +248,37 @@ impl Job<'_> {
         view.image = Some(path.clone());
         view.depth = view.depth.as_ref().map(|_| path);
         Ok(is_own)
+    }
+
+    /// Whether its network is ours and knows references.
+    fn takes_references(&self) -> bool {
+        matches!(self.network, AnyRefiner::Compact(_)) && self.network.takes_references()
+    }
+
+    /// Leaves references out that are trusted with less than a share of what they see: they look otherwise than what is rendered.
+    fn leave_out(&mut self, views: &Views, least: f64) -> anyhow::Result<()> {
+        let every = views.views.len().div_ceil(JUDGES).max(1);
+        let mut uses = vec![Use::default(); self.references.len()];
+        let references: Vec<&KnownView> = self.references.iter().collect();
+        for view in views.views.iter().step_by(every) {
+            let guided = guided(&read(self.input, view, self.background)?.0, &references);
+            uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
+        }
+        let mut uses = uses.iter();
+        let context = self.context;
+        self.references.retain(|reference| {
+            let trusted = uses.next().map_or(1.0, Use::trusted);
+            if trusted < least {
+                let name = &reference.rendered.camera.name;
+                context.say(format!(
+                    "reference {name} looks otherwise than what is rendered ({:.0} % agree) and is left out: wrong depth, a wrong pose, or \
+                     something that moved?",
+                    100.0 * trusted
+                ));
+            }
+            trusted >= least
+        });
+        Ok(())
     }
 
     /// A view's file with other colours.

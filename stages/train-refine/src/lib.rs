@@ -149,6 +149,7 @@ impl Stage for TrainRefine {
             strength: scores.strength,
             rendered_psnr: scores.rendered_psnr,
             refined_psnr: scores.refined_psnr,
+            trusted: scores.trusted,
         };
         context.write_json(REFINER_FILE, &file)?;
         say(context, "views it hasn't seen", &file)

@@ -44,7 +44,7 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
     }
     let network = Network::Paper { width, patches: params.patches };
-    let file = RefinerFile { network, strength: 1.0, rendered_psnr: rendered, refined_psnr: refined };
+    let file = RefinerFile { network, strength: 1.0, rendered_psnr: rendered, refined_psnr: refined, trusted: None };
     context.write_json(REFINER_FILE, &file)?;
     say(context, "the references that it learnt from", &file)
 }

@@ -1,47 +1,291 @@
+use std::ops::Range;
+
 use pixels::Picture;
 use rayon::prelude::*;
-use scene::Surface;
 
 use crate::refiner::{GUIDED_INPUTS, INPUTS};
 use crate::view::{KnownView, Rendered};
 
-/// What references know of a pixel of a view: how the colour they show there differs from the rendered one, and how far they can be trusted,
-/// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large).
-pub(crate) fn guide<'a>(
-    surface: &Surface<'_>,
-    references: impl Iterator<Item = &'a KnownView>,
-    (column, row): (usize, usize),
-    rendered: &[f32],
-) -> [f32; 4] {
-    let (mut sum, mut weights, mut confidence) = ([0.0f32; 3], 0.0, 0.0f32);
-    for reference in references {
-        let Some(sight) = surface.sight(column, row, &reference.rendered.surface()) else { continue };
-        let trust = sight.cosine.max(0.0) * sight.detail.min(1.0);
-        // The best counts most.
-        let weight = trust.powi(4);
-        let colour = reference.truth.colour_at(sight.place);
-        (0..3).for_each(|c| sum[c] += weight * colour[c]);
-        weights += weight;
-        confidence = confidence.max(trust);
-    }
-    if weights <= 0.0 {
-        return [0.0; 4];
-    }
-    let [r, g, b] = [0, 1, 2].map(|c| sum[c] / weights - rendered[c]);
-    [r, g, b, confidence]
+/// A rectangle of a view: columns and rows.
+pub(crate) type Part = (Range<usize>, Range<usize>);
+
+/// What references know of a part of a view: how the colour they show there differs from the rendered one, and how far they can be trusted,
+/// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered).
+#[derive(Debug)]
+pub(crate) struct Guide {
+    part: Part,
+    known: Vec<[f32; 4]>,
+    uses: Vec<Use>,
 }
 
-/// A view with what references know of it, as a guided refiner takes it: colour, opacity, difference to the references, their confidence.
-pub fn guided(rendered: &Rendered, references: &[&KnownView]) -> Picture {
-    let (view, surface) = (&rendered.view, rendered.surface());
-    let mut data = vec![0.0; view.width * view.height * GUIDED_INPUTS];
-    let rows = data.par_chunks_exact_mut(view.width * GUIDED_INPUTS).zip(view.data.par_chunks_exact(view.width * INPUTS));
-    rows.enumerate().for_each(|(row, (out, pixels))| {
-        let pixels = out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels.chunks_exact(INPUTS));
-        for (column, (out, pixel)) in pixels.enumerate() {
-            out[..INPUTS].copy_from_slice(pixel);
-            out[INPUTS..].copy_from_slice(&guide(&surface, references.iter().copied(), (column, row), pixel));
+/// What of a view a reference was of use for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Use {
+    /// Pixels that it sees.
+    pub seen: usize,
+    /// Sum over them of how well it sees them, by angle and size.
+    pub sight: f64,
+    /// Sum over them of how far it is trusted: less where it looks otherwise than what is rendered.
+    pub trust: f64,
+}
+
+impl Use {
+    /// Share of what it sees that it is trusted with.
+    pub fn trusted(&self) -> f64 {
+        if self.sight > 0.0 { self.trust / self.sight } else { 1.0 }
+    }
+
+    /// Adds what another part makes of the same reference.
+    pub fn add(&mut self, other: &Self) {
+        self.seen += other.seen;
+        self.sight += other.sight;
+        self.trust += other.trust;
+    }
+}
+
+/// A view with what references know of it.
+#[derive(Clone, Debug)]
+pub struct Guided {
+    /// As a guided refiner takes it: colour, opacity, difference to the references, their confidence.
+    pub view: Picture,
+    /// What each reference was of use for.
+    pub uses: Vec<Use>,
+}
+
+/// Pixels to each side over which what is shown is compared with what is rendered: in their mean the detail that rendering lacks evens out.
+const AROUND: usize = 5;
+/// A mean difference that halves the trust, twice; and how far, in pixels, a reference may jump between neighbours before it does.
+const DIFFERENT: f32 = 0.15;
+const JUMP: f32 = 1.0;
+
+/// What one reference shows of a pixel.
+#[derive(Clone, Copy, Default)]
+struct Shown {
+    /// Difference to what is rendered.
+    difference: [f32; 3],
+    place: [f32; 2],
+    /// By angle and size; 0 where it shows nothing.
+    sight: f32,
+    /// The same, less where it looks otherwise than what is rendered.
+    trust: f32,
+}
+
+impl Guide {
+    /// What references know of a part.
+    pub(crate) fn new<'a>(rendered: &Rendered, references: impl Iterator<Item = &'a KnownView>, part: Part) -> Self {
+        let mut sums = vec![([0.0f32; 3], 0.0f32, 0.0f32); part.0.len() * part.1.len()];
+        let mut uses = Vec::new();
+        for reference in references {
+            let trusted = trusted(rendered, reference, &part);
+            let mut of_use = Use::default();
+            for ((sum, weights, confidence), Shown { difference, sight, trust, .. }) in sums.iter_mut().zip(trusted) {
+                of_use.add(&Use { seen: usize::from(sight > 0.0), sight: f64::from(sight), trust: f64::from(trust) });
+                // The best counts most. What isn't trusted fades, as if it weren't seen.
+                let weight = trust.powi(4);
+                let agrees = trust / sight.max(f32::MIN_POSITIVE);
+                (0..3).for_each(|c| sum[c] += weight * agrees * difference[c]);
+                *weights += weight;
+                *confidence = confidence.max(trust);
+            }
+            uses.push(of_use);
         }
-    });
-    Picture::new(view.width, view.height, GUIDED_INPUTS, data)
+        let known = |([r, g, b], weights, confidence): ([f32; 3], f32, f32)| {
+            if weights > 0.0 { [r / weights, g / weights, b / weights, confidence] } else { [0.0; 4] }
+        };
+        Self { known: sums.into_iter().map(known).collect(), part, uses }
+    }
+
+    /// At a pixel of the part.
+    pub(crate) fn at(&self, (column, row): (usize, usize)) -> [f32; 4] {
+        let (columns, rows) = &self.part;
+        self.known[(row - rows.start) * columns.len() + column - columns.start]
+    }
+}
+
+/// What a reference shows of a part, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
+/// highlight) or comes from here and there (noisy depth, an edge).
+fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part) -> Vec<Shown> {
+    let (width, height) = (rendered.view.width, rendered.view.height);
+    let grown = |range: &Range<usize>, size: usize| range.start.saturating_sub(AROUND)..(range.end + AROUND).min(size);
+    let (wide, high) = (grown(columns, width), grown(rows, height));
+    let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
+    let show = |column: usize, row: usize| {
+        let Some(sight) = surface.sight(column, row, &theirs) else { return Shown::default() };
+        let colour = reference.truth.colour_at(sight.place);
+        let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
+        let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
+        // A picture with a hole in it shows nothing there.
+        let is_shown = difference.iter().all(|d: &f32| d.is_finite());
+        let well = sight.cosine.max(0.0) * sight.detail.min(1.0);
+        if is_shown { Shown { difference, place: sight.place, sight: well, trust: well } } else { Shown::default() }
+    };
+    let shown: Vec<Shown> =
+        high.clone().flat_map(|row| wide.clone().map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
+    let means = Sums::new(&shown, wide.len());
+    let mut all = Vec::with_capacity(columns.len() * rows.len());
+    for row in rows.clone() {
+        for column in columns.clone() {
+            let (x, y) = (column - wide.start, row - high.start);
+            let mut own = shown[y * wide.len() + x];
+            if own.trust > 0.0 {
+                let apart = means.around(x, y) / DIFFERENT;
+                let neighbour = |dx: isize, dy: isize| {
+                    let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
+                    let other = (x < wide.len() && y < high.len()).then(|| shown[y * wide.len() + x])?;
+                    (other.trust > 0.0).then_some(other.place)
+                };
+                let bend = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+                    let (Some(a), Some(b)) = (a, b) else { return 0.0 };
+                    (0..2).map(|i| (a[i] + b[i] - 2.0 * own.place[i]).powi(2)).sum::<f32>()
+                };
+                let bent = bend(neighbour(-1, 0), neighbour(1, 0)) + bend(neighbour(0, -1), neighbour(0, 1));
+                own.trust *= (1.0 + apart * apart).powi(-2) / (1.0 + bent / (JUMP * JUMP));
+            }
+            all.push(own);
+        }
+    }
+    all
+}
+
+/// Sums over all that lies above and to the left: of the differences, and of the pixels that are shown.
+struct Sums {
+    sums: Vec<[f64; 4]>,
+    width: usize,
+    height: usize,
+}
+
+impl Sums {
+    fn new(shown: &[Shown], width: usize) -> Self {
+        let height = shown.len() / width.max(1);
+        let across = width + 1;
+        let mut sums = vec![[0.0; 4]; across * (height + 1)];
+        for (y, row) in shown.chunks_exact(width.max(1)).enumerate() {
+            let mut left = [0.0; 4];
+            for (x, pixel) in row.iter().enumerate() {
+                if pixel.trust > 0.0 {
+                    (0..3).for_each(|c| left[c] += f64::from(pixel.difference[c]));
+                    left[3] += 1.0;
+                }
+                sums[(y + 1) * across + x + 1] = std::array::from_fn(|c| sums[y * across + x + 1][c] + left[c]);
+            }
+        }
+        Self { sums, width, height }
+    }
+
+    /// Length of the mean difference around a pixel.
+    fn around(&self, x: usize, y: usize) -> f32 {
+        let (left, right) = (x.saturating_sub(AROUND), (x + AROUND + 1).min(self.width));
+        let (top, bottom) = (y.saturating_sub(AROUND), (y + AROUND + 1).min(self.height));
+        let at = |x: usize, y: usize, c: usize| self.sums[y * (self.width + 1) + x][c];
+        let sum = |c: usize| at(right, bottom, c) - at(left, bottom, c) - at(right, top, c) + at(left, top, c);
+        let count = sum(3).max(1.0);
+        (0..3).map(|c| (sum(c) / count).powi(2)).sum::<f64>().sqrt() as f32
+    }
+}
+
+/// A view with what references know of it, as a guided refiner takes it.
+pub fn guided(rendered: &Rendered, references: &[&KnownView]) -> Guided {
+    let (width, height) = (rendered.view.width, rendered.view.height);
+    let mut data = vec![0.0; width * height * GUIDED_INPUTS];
+    let band = |(i, out): (usize, &mut [f32])| {
+        let rows = i * BAND..(i * BAND + BAND).min(height);
+        let guide = Guide::new(rendered, references.iter().copied(), (0..width, rows.clone()));
+        let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&guide.known);
+        for (out, (pixel, known)) in out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels) {
+            out[..INPUTS].copy_from_slice(pixel);
+            out[INPUTS..].copy_from_slice(known);
+        }
+        guide.uses
+    };
+    let uses: Vec<Vec<Use>> = data.par_chunks_mut(width * BAND * GUIDED_INPUTS).enumerate().map(band).collect();
+    let mut sums = vec![Use::default(); references.len()];
+    uses.iter().for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
+    Guided { view: Picture::new(width, height, GUIDED_INPUTS, data), uses: sums }
+}
+
+/// Rows of a view that are looked at together: memory is bounded, whatever its size.
+const BAND: usize = 32;
+
+#[cfg(test)]
+mod tests {
+    use radiance::uniform;
+    use scene::{Camera, Intrinsics};
+
+    use super::*;
+
+    const WIDTH: usize = 96;
+    const HEIGHT: usize = 48;
+
+    /// A wall at distance 2 with patches of six pixels, as it is and blurred, from a camera so many pixels to the right; `depth` is what the
+    /// field believes.
+    fn wall(right: usize, depth: impl Fn(usize) -> f32) -> KnownView {
+        let level = |x: isize, y: isize, c: u64| {
+            let patch = (x + right as isize).div_euclid(6) * 1000 + y.div_euclid(6);
+            0.2 + 0.6 * uniform(4, c, patch as u64)
+        };
+        let pixels = || (0..HEIGHT as isize).flat_map(|y| (0..WIDTH as isize).map(move |x| (x, y)));
+        let truth = pixels().flat_map(|(x, y)| [0, 1, 2].map(|c| level(x, y, c))).collect();
+        let blurred =
+            |x: isize, y: isize, c: u64| (-1..=1).map(|i| level(x + i, y - i, c) + level(x + i, y + i, c)).sum::<f32>() / 6.0;
+        let view = pixels().flat_map(|(x, y)| [blurred(x, y, 0), blurred(x, y, 1), blurred(x, y, 2), 1.0]).collect();
+        let camera = Camera {
+            name: right.to_string(),
+            intrinsics: Intrinsics { width: WIDTH as u32, height: HEIGHT as u32, fx: 300.0, fy: 300.0, cx: 48.0, cy: 24.0 },
+            camera_to_world: [[1.0, 0.0, 0.0, right as f64 * 2.0 / 300.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+        };
+        let view = Picture::new(WIDTH, HEIGHT, 4, view);
+        let depth = (0..WIDTH * HEIGHT).map(depth).collect();
+        let rendered = Rendered { camera, view, depth, opacity: vec![1.0; WIDTH * HEIGHT] };
+        KnownView { rendered, truth: Picture::new(WIDTH, HEIGHT, 3, truth) }
+    }
+
+    /// Share of the view that is known of, trust there, and how far what is shown there is from the truth, weighted by the trust.
+    fn judged(view: &KnownView, reference: &KnownView) -> (f64, f64, f64) {
+        let Guided { view: guided, uses } = guided(&view.rendered, &[reference]);
+        let (seen, trust) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].trust / uses[0].seen.max(1) as f64);
+        let (mut sum, mut all) = (0.0, 0.0);
+        for (pixel, truth) in guided.data.chunks_exact(GUIDED_INPUTS).zip(view.truth.data.chunks_exact(3)) {
+            let off = (0..3).map(|c| f64::from(pixel[c] + pixel[4 + c] - truth[c]).abs()).sum::<f64>() / 3.0;
+            sum += off * f64::from(pixel[7]);
+            all += f64::from(pixel[7]);
+        }
+        (seen, trust, sum / f64::max(all, 1e-9))
+    }
+
+    #[test]
+    fn what_looks_otherwise_than_rendered_is_not_trusted() {
+        let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
+        let (seen, trust, off) = judged(&view, &reference);
+        assert!((0.7..0.8).contains(&seen) && trust > 0.85 && off < 0.01, "right: {seen} {trust} {off}");
+        // A plane a third too far away: the reference shows what lies eight pixels to the side.
+        let (_, trust, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0));
+        assert!(trust < 0.5, "shifted: {trust}");
+        // Depths with noise within what counts as the same surface, seen from far aside.
+        let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
+        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0));
+        let (_, trust, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)));
+        assert!(trust < 0.8 * calm, "noisy: {trust} of {calm}");
+        // A reference of something else.
+        let mut other = wall(24, |_| 2.0);
+        other.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
+        let (_, trust, _) = judged(&view, &other);
+        assert!(trust < 0.5, "other: {trust}");
+        // One that looks away.
+        assert_eq!(judged(&view, &wall(500, |_| 2.0)).0, 0.0);
+    }
+
+    /// Parts have what the whole has.
+    #[test]
+    fn parts_are_those_of_the_whole() {
+        let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
+        let whole = guided(&view.rendered, &[&reference]).view;
+        let part = Guide::new(&view.rendered, [&reference].into_iter(), (30..50, 7..41));
+        for row in 7..41 {
+            for column in 30..50 {
+                let expected = &whole.data[(row * WIDTH + column) * GUIDED_INPUTS + INPUTS..][..4];
+                let found = part.at((column, row));
+                assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
+            }
+        }
+    }
 }

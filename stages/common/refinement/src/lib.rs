@@ -35,7 +35,7 @@ mod refiner;
 mod trainer;
 mod view;
 
-pub use guide::guided;
+pub use guide::{Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
 pub use view::{Exposure, KnownView, Rendered};

@@ -61,6 +61,9 @@ pub struct RefinerFile {
     pub rendered_psnr: f64,
     /// Mean PSNR of those views refined, in dB.
     pub refined_psnr: f64,
+    /// Share of what references saw of those views that they were trusted with, where the network knows references.
+    #[serde(default)]
+    pub trusted: Option<f64>,
 }
 
 /// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (He et al. 2016), one out. It pads
