@@ -104,17 +104,7 @@ impl Stage for Refine {
             progress.add(1);
         }
         context.write_json(VIEWS_FILE, &views)?;
-        for (reference, _) in job.references.iter().zip(&uses).filter(|(_, of_use)| job.takes_references() && of_use.seen == 0) {
-            context.say(format!("reference {} sees nothing of these views", reference.rendered.camera.name));
-        }
-        let by = match job.references.len() {
-            0 => String::new(),
-            count => {
-                let mut all = Use::default();
-                uses.iter().for_each(|u| all.add(u));
-                format!(" by {count} references, trusted by {:.0} %", 100.0 * all.trusted())
-            }
-        };
+        let by = job.say_of(&uses);
         let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
         context.write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{own}", views.views.len()))
     }
@@ -279,6 +269,22 @@ impl Job<'_> {
             trusted >= least
         });
         Ok(())
+    }
+
+    /// Says which references were of no use; in a word or two, of what use all were.
+    fn say_of(&self, uses: &[Use]) -> String {
+        let count = self.references.len();
+        if count == 0 || !self.takes_references() {
+            return if count == 0 { String::new() } else { format!(" by {count} references") };
+        }
+        let mut all = Use::default();
+        for (reference, of_use) in self.references.iter().zip(uses) {
+            all.add(of_use);
+            if of_use.seen == 0 {
+                self.context.say(format!("reference {} sees nothing of these views", reference.rendered.camera.name));
+            }
+        }
+        format!(" by {count} references, trusted by {:.0} %", 100.0 * all.trusted())
     }
 
     /// A view's file with other colours.
