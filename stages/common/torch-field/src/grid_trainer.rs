@@ -268,12 +268,11 @@ fn lazy_adam(
     let second1 = gradient.f_square()?.f_lerp(&second, BETA[1])?;
     let by = first1.f_div(&second1.f_sqrt()?.f_add_scalar(EPSILON)?)?.f_mul_scalar(rate)?;
     let moved = parameter.f_sub(&by)?.f_where_self(&touched, &parameter)?;
-    let _ = parameter.f_copy_(&moved)?;
+    parameter.f_copy_(&moved)?;
     let kept = first1.f_where_self(&touched, &first)?;
-    let _ = first.f_copy_(&kept)?;
+    first.f_copy_(&kept)?;
     let kept = second1.f_where_self(&touched, &second)?;
-    let _ = second.f_copy_(&kept)?;
-    Ok(())
+    second.f_copy_(&kept)
 }
 
 /// The distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
