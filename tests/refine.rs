@@ -148,9 +148,9 @@ fn views_agree_with_their_own_photographs() {
 
 #[test]
 fn references_are_used_by_a_network_that_knows_how() {
-    let project = project();
-    project.ok(&["run", "refine-referenced", "-p", "prep.references=2"]);
-    let folder = |stage: &str| project.object(&project.output_of(stage, &["refine-referenced", "-p", "prep.references=2"])[0]);
+    let (project, target) = seen_from_the_front();
+    project.ok(&[&["run"], &target[..]].concat());
+    let folder = |stage: &str| project.object(&project.output_of(stage, &target)[0]);
     let (views, refiner) = (folder("render-depth"), folder("train-referenced"));
     let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
@@ -173,11 +173,23 @@ fn references_are_used_by_a_network_that_knows_how() {
     let both = [("references", references.as_path()), ("reference-views", views.as_path())];
     refine("no", &refiner, &both).0.fails(3, &["input reference-views: no view r_0 with that pose"]);
     // A network that can't use them says so.
-    project.ok(&["run", "train-refine"]);
-    let plain = project.object(&project.output_of("train-refine", &["train-refine"])[0]);
+    let plain_target = [&["train-refine"], &target[1..]].concat();
+    project.ok(&[&["run"], &plain_target[..]].concat());
+    let plain = project.object(&project.output_of("train-refine", &plain_target)[0]);
     let both = [("references", references.as_path()), ("reference-views", reference_views.as_path())];
     let (left_out, _) = refine("plain", &plain, &both);
     assert!(left_out.code == 0 && left_out.stderr.contains("trained without references"), "{}", left_out.stderr);
+}
+
+/// A scene of which references see much, trained as far as it takes that they look as rendered; and what to run of it.
+fn seen_from_the_front() -> (Project, Vec<&'static str>) {
+    let project = project();
+    project.replace("train: 12", "train: 30");
+    project.replace("rays: 60000", "rays: 300000");
+    project.replace("rays: 40000", "rays: 200000");
+    project.replace("parameters: {references: 2}", "parameters: {references: 2, steps: 600, channels: 16, blocks: 2}");
+    let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
+    (project, [&["refine-referenced", "-p", "prep.references=2"], &from_the_front[..]].concat())
 }
 
 /// A copy of a folder with its files of a kind changed.
@@ -219,13 +231,7 @@ fn noise(seed: u64, pixel: usize) -> f32 {
 /// worse than what is rendered by more than a hair, and the log says what is wrong.
 #[test]
 fn bad_references_do_no_harm() {
-    let project = project();
-    project.replace("train: 12", "train: 30");
-    project.replace("rays: 60000", "rays: 300000");
-    project.replace("rays: 40000", "rays: 200000");
-    project.replace("parameters: {references: 2}", "parameters: {references: 2, steps: 600, channels: 16, blocks: 2}");
-    let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
-    let target = [&["refine-referenced", "-p", "prep.references=2"], &from_the_front[..]].concat();
+    let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.object(&project.output_of(stage, &target)[0]);
     let (views, refiner, prep, reference_views) =
@@ -255,7 +261,6 @@ fn bad_references_do_no_harm() {
         command.args(inputs.map(|(input, folder)| format!("--input={input}={}", folder.display())));
         let finished = Finished::of(command.output().unwrap());
         assert_eq!(finished.code, 0, "{}", finished.stderr);
-        println!("{}", std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap());
         println!("{name}: {:.2} dB, rendered {rendered:.2}; {}", psnr(&project.path(name)), finished.stderr);
         assert!(psnr(&project.path(name)) > rendered - 0.05, "{name}: {} of {rendered}", psnr(&project.path(name)));
         finished.stderr
