@@ -92,7 +92,7 @@ impl Stage for Refine {
             references,
             photographs,
         };
-        if job.takes_references() {
+        if job.network.is_guided() && !job.references.is_empty() {
             job.leave_out(&views, LITTLE * file.trusted.unwrap_or(1.0))?;
         }
         let mut agreed = 0;
@@ -175,30 +175,13 @@ impl AnyRefiner {
         .bad_input("input refiner")
     }
 
-    fn takes_references(&self) -> bool {
-        match self {
-            Self::Compact(network) => network.architecture().guided,
-            Self::Paper(..) => true,
-        }
+    /// Whether it is ours, and knows references.
+    fn is_guided(&self) -> bool {
+        matches!(self, Self::Compact(network) if network.architecture().guided)
     }
 
-    /// A view refined: colours in 0..1. What each reference was of use for is added to `uses`.
-    fn refine(&self, rendered: &Rendered, references: &[&KnownView], job: &Job<'_>, uses: &mut [Use]) -> anyhow::Result<Picture> {
-        let Job { strength, turns, .. } = *job;
-        let (network, patches) = match self {
-            Self::Compact(network) if network.architecture().guided => {
-                let guided = guided(rendered, references);
-                uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
-                return Ok(network.refine_by(&guided.view, strength, turns)?);
-            }
-            Self::Compact(network) => return Ok(network.refine_by(&rendered.view, strength, turns)?),
-            Self::Paper(network, patches) => (network, *patches),
-        };
-        let mut drawn = network.refine(rendered, references, patches).bad_input("input views")?;
-        for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
-            (0..3).for_each(|c| to[c] = (from[c] + strength * (to[c] - from[c])).clamp(0.0, 1.0));
-        }
-        Ok(drawn)
+    fn takes_references(&self) -> bool {
+        self.is_guided() || matches!(self, Self::Paper(..))
     }
 }
 
@@ -225,8 +208,7 @@ impl Job<'_> {
     fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
         let (rendered, image) = read(self.input, view, self.background)?;
-        let references: Vec<&KnownView> = self.references.iter().collect();
-        let refined = self.network.refine(&rendered, &references, self, uses)?;
+        let refined = self.redraw(&rendered, uses)?;
         let agreed = match &self.photographs {
             Some(photographs) => photographs.of(&view.camera)?.map(|own| photographs.agree(&refined, &own)),
             None => None,
@@ -240,9 +222,24 @@ impl Job<'_> {
         Ok(is_own)
     }
 
-    /// Whether its network is ours and knows references.
-    fn takes_references(&self) -> bool {
-        matches!(self.network, AnyRefiner::Compact(_)) && self.network.takes_references()
+    /// What the network makes of a view: colours in 0..1. What each reference was of use for is added to `uses`.
+    fn redraw(&self, rendered: &Rendered, uses: &mut [Use]) -> anyhow::Result<Picture> {
+        let references: Vec<&KnownView> = self.references.iter().collect();
+        match &self.network {
+            AnyRefiner::Compact(network) if self.network.is_guided() => {
+                let guided = guided(rendered, &references);
+                uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
+                Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
+            }
+            AnyRefiner::Compact(network) => Ok(network.refine_by(&rendered.view, self.strength, self.turns)?),
+            AnyRefiner::Paper(network, patches) => {
+                let mut drawn = network.refine(rendered, &references, *patches).bad_input("input views")?;
+                for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
+                    (0..3).for_each(|c| to[c] = (from[c] + self.strength * (to[c] - from[c])).clamp(0.0, 1.0));
+                }
+                Ok(drawn)
+            }
+        }
     }
 
     /// Leaves references out that are trusted with less than a share of what they see: they look otherwise than what is rendered.
@@ -274,8 +271,11 @@ impl Job<'_> {
     /// Says which references were of no use; in a word or two, of what use all were.
     fn say_of(&self, uses: &[Use]) -> String {
         let count = self.references.len();
-        if count == 0 || !self.takes_references() {
-            return if count == 0 { String::new() } else { format!(" by {count} references") };
+        if count == 0 {
+            return String::new();
+        }
+        if !self.network.is_guided() {
+            return format!(" by {count} references");
         }
         let mut all = Use::default();
         for (reference, of_use) in self.references.iter().zip(uses) {
@@ -283,6 +283,9 @@ impl Job<'_> {
             if of_use.seen == 0 {
                 self.context.say(format!("reference {} sees nothing of these views", reference.rendered.camera.name));
             }
+        }
+        if all.seen == 0 {
+            return format!(" by {count} references that see nothing of them");
         }
         format!(" by {count} references, trusted by {:.0} %", 100.0 * all.trusted())
     }

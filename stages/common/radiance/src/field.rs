@@ -52,6 +52,11 @@ impl Architecture {
         ];
         in_ranges(&ranges)
     }
+
+    /// Samples of a ray through all of the cube, more or less: what a training expects before it has seen any.
+    pub fn full_ray(&self) -> f64 {
+        f64::from(self.steps) * 0.6
+    }
 }
 
 /// A radiance field: density and view-dependent colour of every point of a box.
@@ -217,7 +222,7 @@ impl Field {
 
     /// Share of the cells that may hold something.
     pub fn occupied(&self) -> f64 {
-        self.occupancy.cells().count() as f64 / (CELLS) as f64
+        self.occupancy.cells().count() as f64 / CELLS as f64
     }
 
     /// Numbers in the grid.

@@ -48,15 +48,6 @@ pub struct Occupancy {
     blocks: Vec<u64>,
 }
 
-/// A place of a cell that is looked at.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Look {
-    /// The cell's number.
-    pub cell: usize,
-    /// Somewhere in it, in the unit cube.
-    pub position: [f32; 3],
-}
-
 impl Occupancy {
     /// Everything may be occupied.
     pub fn full() -> Self {
@@ -84,36 +75,40 @@ impl Occupancy {
         self.hull = Some(mask);
     }
 
-    /// Where to look at a step of a training: nowhere at most of them.
-    pub fn looks(&self, seed: u64, step: u64) -> Vec<Look> {
+    /// Cells to look at, at a step of a training: none at most of them.
+    pub fn looks(&self, step: u64) -> Vec<u32> {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
         let turn = (step / EVERY) as usize % TURNS;
-        let look = |cell: usize| {
+        let is_looked_at = |&cell: &u32| {
+            let cell = cell as usize;
             let allowed = self.hull.as_ref().is_none_or(|h| h[cell]);
             let [.., z] = corner(cell);
             let wanted = step <= WARM_UP || self.is_occupied(cell) || (cell % (GRID * GRID) + z) % TURNS == turn;
-            (allowed && wanted).then(|| {
-                let mut draws = Draws::new(seed, 3, step * CELLS as u64 + cell as u64);
-                Look { cell, position: corner(cell).map(|c| (c as f32 + draws.uniform()) / GRID as f32) }
-            })
+            allowed && wanted
         };
-        (0..CELLS).into_par_iter().filter_map(look).collect()
+        (0..CELLS as u32).into_par_iter().filter(is_looked_at).collect()
     }
 
-    /// Takes the densities that were found there, and decides anew which cells may hold something, for rays with samples so far apart in
+    /// Where in a cell to look at that step, in the unit cube.
+    pub fn place_in(cell: u32, seed: u64, step: u64) -> [f32; 3] {
+        let mut draws = Draws::new(seed, 3, step * CELLS as u64 + u64::from(cell));
+        corner(cell as usize).map(|c| (c as f32 + draws.uniform()) / GRID as f32)
+    }
+
+    /// Takes the densities that were found in cells, and decides anew which cells may hold something, for rays with samples so far apart in
     /// the cube.
-    pub fn learn(&mut self, looks: &[Look], densities: &[f32], step: f32) {
-        if looks.is_empty() {
+    pub fn learn(&mut self, cells: &[u32], densities: &[f32], step: f32) {
+        if cells.is_empty() {
             return;
         }
-        for (look, &found) in looks.iter().zip(densities) {
-            let density = &mut self.density[look.cell];
+        for (&cell, &found) in cells.iter().zip(densities) {
+            let density = &mut self.density[cell as usize];
             *density = (*density * DECAY).max(found);
         }
-        let cells = self.hull.as_ref().map_or(CELLS, |h| h.iter().filter(|k| **k).count()).max(1);
-        let mean = (self.density.iter().map(|&d| f64::from(d)).sum::<f64>() / cells as f64) as f32;
+        let possible = self.hull.as_ref().map_or(CELLS, |h| h.iter().filter(|k| **k).count()).max(1);
+        let mean = (self.density.iter().map(|&d| f64::from(d)).sum::<f64>() / possible as f64) as f32;
         // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
         let threshold = mean.min(0.01 / step);
         let allowed = |cell: usize| self.hull.as_ref().is_none_or(|h| h[cell]);

@@ -6,10 +6,10 @@ use safetensors::SafeTensors;
 
 use crate::adam::{AdamStep, adam};
 use crate::chunk::{Chunk, FeatureGradients, densities};
-use crate::field::{Architecture, CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
+use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
-use crate::occupancy::CELLS;
+use crate::occupancy::{CELLS, Occupancy};
 use crate::random::uniform;
 use crate::ray::{Ray, UnitRay, clip};
 use crate::simd::LANES;
@@ -75,6 +75,11 @@ impl TrainingOptions {
         tally.rate_scale * warm * self.final_rate.powf(tally.done(self.rays))
     }
 
+    /// Share of a step by which the samples of a ray are shifted, by its number in the training.
+    pub fn offset(&self, ray: u64) -> f32 {
+        uniform(self.seed, 4, ray)
+    }
+
     /// Learning rate of a level, for a schedule.
     pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
         self.rate * schedule * self.level_rate.powi(level as i32)
@@ -84,11 +89,6 @@ impl TrainingOptions {
     pub fn averages(&self, tally: &Tally) -> bool {
         self.averaging > 0.0 && tally.done(self.rays) > AVERAGE_FROM && tally.steps.is_multiple_of(AVERAGE_EVERY)
     }
-}
-
-/// Samples of a ray through all of the cube, more or less: what a training expects before it has seen any.
-pub fn full_ray(architecture: &Architecture) -> f64 {
-    f64::from(architecture.steps) * 0.6
 }
 
 /// What a step did.
@@ -184,7 +184,7 @@ impl Trainer {
             touched_network: vec![0; field.network.len().div_ceil(LANES)],
             transposed: vec![0.0; field.network.len()],
             tally: Tally::default(),
-            samples_per_ray: full_ray(&field.architecture),
+            samples_per_ray: field.architecture.full_ray(),
             shards: (0..SHARDS).map(|_| Shard::default()).collect(),
             workers: Mutex::new(Vec::new()),
             field,
@@ -337,21 +337,22 @@ impl Trainer {
 
     /// Looks at the density of cells where it is time to.
     fn update_occupancy(&mut self) {
-        let field = &self.field;
-        let looks = field.occupancy.looks(self.options.seed, self.tally.steps);
-        let found = looks.par_chunks(1024).map_init(
+        let (field, seed, at) = (&self.field, self.options.seed, self.tally.steps);
+        let cells = field.occupancy.looks(at);
+        let found = cells.par_chunks(1024).map_init(
             || (Chunk::default(), vec![0.0; 3 * 1024]),
-            |(chunk, positions), looks| {
-                let n = looks.len().next_multiple_of(LANES);
-                for (k, look) in looks.iter().enumerate() {
-                    (0..3).for_each(|axis| positions[axis * n + k] = look.position[axis]);
+            |(chunk, positions), cells| {
+                let n = cells.len().next_multiple_of(LANES);
+                for (k, &cell) in cells.iter().enumerate() {
+                    let place = Occupancy::place_in(cell, seed, at);
+                    (0..3).for_each(|axis| positions[axis * n + k] = place[axis]);
                 }
-                densities(chunk, field, &positions[..3 * n], n)[..looks.len()].to_vec()
+                densities(chunk, field, &positions[..3 * n], n)[..cells.len()].to_vec()
             },
         );
         let found: Vec<f32> = found.flatten_iter().collect();
         let step = field.step();
-        self.field.occupancy.learn(&looks, &found, step);
+        self.field.occupancy.learn(&cells, &found, step);
     }
 
     /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.
@@ -438,7 +439,7 @@ impl Shard {
         field: &Field,
         transposed: &[f32],
         supervision: &impl Supervision,
-        &TrainingOptions { seed, distortion, .. }: &TrainingOptions,
+        options: &TrainingOptions,
         (first_group, first_ray): (u64, u64),
         range: std::ops::Range<usize>,
         groups: usize,
@@ -469,7 +470,7 @@ impl Shard {
             worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
             let ray = first_ray + (here.start * group) as u64;
             worker.offsets.clear();
-            worker.offsets.extend((0..rays as u64).map(|r| uniform(seed, 4, ray + r)));
+            worker.offsets.extend((0..rays as u64).map(|r| options.offset(ray + r)));
             worker.chunk.forward(field, &worker.clipped, &worker.offsets);
             self.samples += worker.chunk.samples();
             for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
@@ -487,7 +488,7 @@ impl Shard {
                 transposed,
                 &worker.gradients,
                 &worker.backgrounds,
-                distortion * scale / group as f32,
+                options.distortion * scale / group as f32,
                 &mut worker.lanes,
                 &mut self.features,
             );

@@ -95,7 +95,7 @@ impl RefinerTrainer {
     /// serves them best.
     pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
         let mut uses = Use::default();
-        let mut view = |(i, example): (usize, &KnownView)| -> Picture {
+        let view = |(i, example): (usize, &KnownView)| -> Picture {
             if !self.refiner.architecture().guided {
                 return example.rendered.view.clone();
             }
@@ -105,7 +105,7 @@ impl RefinerTrainer {
             guided.uses.iter().for_each(|of_use| uses.add(of_use));
             guided.view
         };
-        let views: Vec<Picture> = examples.iter().enumerate().map(&mut view).collect();
+        let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
         let trusted = (uses.seen > 0).then(|| uses.trusted());
         let (mut rendered, mut agreement, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {

@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{Field, Occupancy, StepReport, Supervision, Tally, TrainingOptions, full_ray, uniform};
+use radiance::{Field, Occupancy, StepReport, Supervision, Tally, TrainingOptions};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -45,7 +45,7 @@ impl GridTrainer {
         let (first, second) = (zeros()?, zeros()?);
         Ok(Self {
             occupancy: field.parts().2.clone(),
-            samples_per_ray: full_ray(&field.architecture),
+            samples_per_ray: field.architecture.full_ray(),
             grid,
             options,
             first,
@@ -124,7 +124,7 @@ impl GridTrainer {
     fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
         let rays = step.cast(supervision, &range);
         let first = step.first_ray(&range);
-        let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| uniform(self.options.seed, 4, r)).collect();
+        let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let seen = self.grid.see(&rays, &Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?)?;
         let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
         let backgrounds = Tensor::f_from_slice(&backgrounds)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
@@ -179,17 +179,18 @@ impl GridTrainer {
 
     /// Looks at the density of cells where it is time to.
     fn look(&mut self) -> Result<(), TchError> {
-        let looks = self.occupancy.looks(self.options.seed, self.tally.steps);
-        if looks.is_empty() {
+        let (seed, at) = (self.options.seed, self.tally.steps);
+        let cells = self.occupancy.looks(at);
+        if cells.is_empty() {
             return Ok(());
         }
-        let mut found = Vec::with_capacity(looks.len());
-        for looks in looks.chunks(LOOKS) {
-            let positions: Vec<f32> = looks.iter().flat_map(|l| l.position).collect();
+        let mut found = Vec::with_capacity(cells.len());
+        for cells in cells.chunks(LOOKS) {
+            let positions: Vec<f32> = cells.iter().flat_map(|&cell| Occupancy::place_in(cell, seed, at)).collect();
             let positions = Tensor::f_from_slice(&positions)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
             found.extend(host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.learn(&looks, &found, self.grid.step() as f32);
+        self.occupancy.learn(&cells, &found, self.grid.step() as f32);
         self.grid.occupy(&self.occupancy)
     }
 
