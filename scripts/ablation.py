@@ -24,7 +24,6 @@ PARTS = [
     ("all sub-rays from the start", ["coarse=0"]),
     ("no weight averaging", ["averaging=0"]),
     ("one ray a rendered pixel", ["sub_rays=1"]),
-    ("jittered sub-rays", ["jitter=true"]),
     ("networks 32 wide", ["hidden=32"]),
     ("two fields, half the rays each", ["members=2"]),
     ("supervision: refiltered", ["supervision=refiltered"]),
@@ -41,7 +40,8 @@ PARTS = [
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
     ("distortion loss 0.01", ["distortion=0.01"]),
-    ("grid decay 1e-6", ["grid_decay=0.000001"]),
+    ("all levels' rates alike", ["level_rate=1"]),
+    ("no weight decay", ["network_decay=0"]),
     ("alpha supervision, averaged", ["background=alpha"]),
     ("alpha hull", ["hull=alpha"]),
 ]

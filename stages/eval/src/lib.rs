@@ -8,7 +8,8 @@
 //! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
 //!   photographs are all there is, no HR truth exists, and this alone can be known.
 //!
-//! Means over views are means of per-view values. Open backgrounds are scored on white.
+//! Means over views are means of per-view values. Open backgrounds are scored on white. Where a view has a mask, what doesn't count is taken
+//! as right, and PSNR is that of the rest.
 
 mod depth;
 #[cfg(feature = "torch")]
@@ -21,8 +22,8 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{
-    DEGRADATION_FILE, Degradation, Filter, Palette, Picture, Resampling, Rgba8, heat, psnr_of, read_exr, read_premultiplied,
-    write_png,
+    DEGRADATION_FILE, Degradation, Filter, Mask, Palette, Picture, Resampling, Rgba8, heat, psnr_of, read_exr,
+    read_premultiplied, write_png,
 };
 use rayon::prelude::*;
 use scene::{Background, View, Views};
@@ -212,7 +213,7 @@ impl Stage for Eval {
         };
         let scored = truth.views.par_iter().map(score).collect::<anyhow::Result<Vec<_>>>()?;
         let mean = mean_of(&scored);
-        let metrics = Metrics { conventions: conventions(params, truth.background, &perceptual, made), mean, views: scored };
+        let metrics = Metrics { conventions: conventions(params, &truth, &perceptual, made), mean, views: scored };
         context.write_json("metrics.json", &metrics)?;
         context.write_summary(&summary(&metrics))
     }
@@ -240,7 +241,7 @@ impl Job<'_> {
         let read_true = |file: &Option<String>| -> anyhow::Result<Option<Picture>> {
             file.as_ref().map(|f| read_view(truth_in, true_view, f, truth.background)).transpose()
         };
-        let (expected, low) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
+        let (mut expected, mut low) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
         let wanted = (true_view.camera.intrinsics.width as usize, true_view.camera.intrinsics.height as usize);
         if wanted != (found.width, found.height) {
             let message = format!(
@@ -261,6 +262,27 @@ impl Job<'_> {
             shrunk.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
             shrunk
         });
+        // What doesn't count can't differ; PSNR is that of the rest: so many dB more or less.
+        let of_mask = |picture: &Picture| -> anyhow::Result<Option<Mask>> {
+            let file = true_view.mask.as_ref();
+            file.map(|f| Mask::read(&truth_in.path(f), size(picture)).bad_input(format!("view {name}"))).transpose()
+        };
+        let mask = expected.as_ref().or(low.as_ref()).map(of_mask).transpose()?.flatten();
+        let mut counted = [0.0; 2];
+        if let Some(mask) = &mask {
+            let pairs = [(expected.as_mut(), Some(&found)), (low.as_mut(), shrunk.as_ref())];
+            for (decibels, (truth, found)) in counted.iter_mut().zip(pairs) {
+                if let (Some(truth), Some(found)) = (truth, found) {
+                    let mask = mask.resized(size(truth), 0);
+                    mask.fill(truth, found);
+                    if mask.share() == 0.0 {
+                        let message = format!("view {name}: its mask leaves no pixel to score; remove the view or its mask");
+                        return Err(Failure::BadInput(message).into());
+                    }
+                    *decibels = 10.0 * mask.share().log10();
+                }
+            }
+        }
         let (shown, against) = match (&expected, &shrunk, &low) {
             (Some(expected), ..) => (&found, expected),
             (None, Some(shrunk), Some(low)) => (shrunk, low),
@@ -271,7 +293,7 @@ impl Job<'_> {
         let border = self.params.ssim_border;
         let warped = expected.as_ref().map(|e| self.warp(view, e)).transpose()?.flatten();
         let scores = Scores {
-            psnr: expected.as_ref().map(|e| psnr(&found, e)),
+            psnr: expected.as_ref().map(|e| psnr(&found, e) + counted[0]),
             ssim: expected.as_ref().map(|e| ssim(&found, e, border)),
             lpips: expected.as_ref().map(|e| self.perceptual.distance(&found, e)).transpose()?.flatten(),
             depth: score_depth((views_in, view), (truth_in, true_view))?,
@@ -279,7 +301,7 @@ impl Job<'_> {
             low_resolution: shrunk
                 .iter()
                 .zip(&low)
-                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low), ssim: ssim(shrunk, low, border) })
+                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low) + counted[1], ssim: ssim(shrunk, low, border) })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
@@ -369,8 +391,9 @@ fn mean_of(views: &[ViewScores]) -> Scores {
     }
 }
 
-fn conventions(params: &Params, background: Background, perceptual: &Perceptual, made: Option<Degradation>) -> MetricConventions {
-    let on = match background {
+fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Option<Degradation>) -> MetricConventions {
+    let masked = if truth.views.iter().any(|v| v.mask.is_some()) { "; of the pixels that masks leave" } else { "" };
+    let on = match truth.background {
         Background::Black => "black",
         Background::White | Background::Alpha => "white",
         Background::Opaque => "none: the pictures are opaque",
@@ -381,7 +404,7 @@ fn conventions(params: &Params, background: Background, perceptual: &Perceptual,
     };
     MetricConventions {
         background: on.to_owned(),
-        psnr: "-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in half precision, clamped; mean of per-view values".to_owned(),
+        psnr: format!("-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in half precision, clamped; mean of per-view values{masked}"),
         ssim: format!("Gaussian 11×11, σ 1.5, {border}, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels"),
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),

@@ -16,6 +16,14 @@ pub(crate) fn footprint(kernel: Kernel) -> usize {
     }
 }
 
+/// LR pixels beside one that its mask has to be clear of, too: beyond them lie a kernel's last lobe and less than a tenth of its weight.
+pub(crate) fn mask_reach(kernel: Kernel) -> usize {
+    match kernel {
+        Kernel::Lanczos | Kernel::Bicubic => 1,
+        Kernel::Box | Kernel::Average => 0,
+    }
+}
+
 /// An LR picture as its kernel gives it.
 #[derive(Clone, Debug, PartialEq)]
 pub enum LowResolution {
@@ -34,6 +42,14 @@ impl LowResolution {
                 let shrink = Resampling::new(kernel.filter(), (picture.width, picture.height), (width, height));
                 Self::Floats(shrink.apply(picture))
             }
+        }
+    }
+
+    /// Columns and rows.
+    pub(crate) fn size(&self) -> (usize, usize) {
+        match self {
+            Self::Bytes(image) => (image.width, image.height),
+            Self::Floats(picture) => (picture.width, picture.height),
         }
     }
 

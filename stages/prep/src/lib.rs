@@ -21,7 +21,7 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use dataset::{Dataset, Format, Frame, Split};
-use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Rgba8, SampleType, read_exr, write_exr, write_png};
+use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera, Space, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -320,6 +320,17 @@ fn space_note(bounds: &Bounds, background: Background) -> String {
     format!("{space}; {behind}")
 }
 
+/// A mask's file, where a frame has one.
+fn mask_name(frame: &Frame) -> Option<String> {
+    frame.mask.as_ref().map(|_| format!("masks/{}.png", frame.name))
+}
+
+/// What is made of a frame to train on.
+struct TrainingPicture {
+    picture: LowResolution,
+    mask: Option<Mask>,
+}
+
 /// Everything the steps of one run share.
 struct Job<'a> {
     context: &'a Context,
@@ -376,26 +387,36 @@ impl Job<'_> {
         let train_pictures = train
             .par_iter()
             .enumerate()
-            .map(|(i, frame)| -> anyhow::Result<LowResolution> {
+            .map(|(i, frame)| -> anyhow::Result<TrainingPicture> {
                 self.context.check_interrupt()?;
                 let (hr, lr) = self.pictures(frame)?;
                 self.write_low("train/images", &frame.name, &lr)?;
+                let mask = frame.mask().bad_input(frame_name(frame))?;
+                let low_mask = mask.as_ref().map(|mask| self.low_mask(mask, &lr));
+                low_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
                 if let Some(hr) = hr.filter(|_| references.contains(&i)) {
                     self.write_high("references", &frame.name, &hr)?;
+                    mask.iter()
+                        .try_for_each(|m| self.write_mask("references", &frame.name, &m.resized((hr.width, hr.height), 0)))?;
                 }
                 progress.add(1);
-                Ok(lr)
+                Ok(TrainingPicture { picture: lr, mask: low_mask })
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
         let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
         let mut views = Views::new(background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
-            .map(|c| View { image: Some(low_name(&c.name)), ..View::camera_only(self.resized(c, |s| s.lr)) })
+            .zip(train)
+            .map(|(c, frame)| View {
+                image: Some(low_name(&c.name)),
+                mask: mask_name(frame),
+                ..View::camera_only(self.resized(c, |s| s.lr))
+            })
             .collect();
         if self.params.hull == HullSource::Alpha {
             let cameras: Vec<Camera> = views.views.iter().map(|v| v.camera.clone()).collect();
-            let alphas: Vec<Vec<f32>> = train_pictures.iter().map(LowResolution::alpha).collect();
+            let alphas: Vec<Vec<f32>> = train_pictures.iter().map(|p| p.picture.alpha()).collect();
             let footprint = degrade::footprint(self.making.kernel);
             bounds = hull::tightened(&bounds, &cameras, &alphas, footprint).bad_input("hull: alpha")?;
             if self.params.near.is_none() && self.params.far.is_none() {
@@ -420,8 +441,11 @@ impl Job<'_> {
         let high = |c: &Camera| self.resized(c, |s| s.hr);
         let reference_views = references
             .iter()
-            .map(|&i| &train_cameras[i])
-            .map(|c| View { image: Some(format!("images/{}.png", c.name)), ..View::camera_only(high(c)) })
+            .map(|&i| View {
+                image: Some(format!("images/{}.png", train[i].name)),
+                mask: mask_name(train[i]),
+                ..View::camera_only(high(&train_cameras[i]))
+            })
             .collect();
         if !references.is_empty() {
             let views = Views::new(background, bounds, reference_views);
@@ -436,6 +460,13 @@ impl Job<'_> {
                     self.write_high("truth", &frame.name, hr)?;
                 }
                 self.write_low("truth/low", &frame.name, &lr)?;
+                if let Some(mask) = frame.mask().bad_input(frame_name(frame))? {
+                    let mask = match &hr {
+                        Some(hr) => mask.resized((hr.width, hr.height), 0),
+                        None => self.low_mask(&mask, &lr),
+                    };
+                    self.write_mask("truth", &frame.name, &mask)?;
+                }
                 if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
                     self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(frame_name(frame))?;
                 }
@@ -449,6 +480,7 @@ impl Job<'_> {
             .map(|(c, frame)| View {
                 camera: high(c),
                 image: self.making.has_truth.then(|| format!("images/{}.png", c.name)),
+                mask: mask_name(frame),
                 depth: frame.depth.as_ref().filter(|_| self.making.has_truth).map(|_| format!("depth/{}.exr", c.name)),
                 low_resolution: Some(format!("low/{}.{}", c.name, degrade::extension(self.making.kernel))),
             })
@@ -460,16 +492,18 @@ impl Job<'_> {
     }
 
     /// The same task one size down, where its solution is known: LR pictures shrunk as HR ones were to make them.
-    fn write_rehearsal(&self, train: &Views, pictures: &[LowResolution]) -> anyhow::Result<()> {
+    fn write_rehearsal(&self, train: &Views, pictures: &[TrainingPicture]) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
         let kernel = self.making.kernel;
-        let make = |(view, picture): (&View, &LowResolution)| -> anyhow::Result<View> {
+        let make = |(view, TrainingPicture { picture, mask }): (&View, &TrainingPicture)| -> anyhow::Result<View> {
             self.context.check_interrupt()?;
             let k = &view.camera.intrinsics;
             let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
             let small = picture.shrunk((width as usize, height as usize), kernel);
             self.write_low("rehearsal/images", &view.camera.name, &small)?;
+            let mask = mask.as_ref().map(|mask| self.low_mask(mask, &small));
+            mask.iter().try_for_each(|mask| self.write_mask("rehearsal", &view.camera.name, mask))?;
             Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
         };
         let views = train.views.par_iter().zip(pictures).map(make).collect::<anyhow::Result<Vec<_>>>()?;
@@ -524,6 +558,17 @@ impl Job<'_> {
 
     fn write_high(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
         write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image).map_err(Into::into)
+    }
+
+    fn write_mask(&self, subtree: &str, name: &str, mask: &Mask) -> anyhow::Result<()> {
+        write_png(&self.context.output_path(&format!("{subtree}/masks/{name}.png"))?, &mask.to_rgba8()).map_err(Into::into)
+    }
+
+    /// The mask of an LR picture: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
+    fn low_mask(&self, mask: &Mask, picture: &LowResolution) -> Mask {
+        let size = picture.size();
+        let around = if size == (mask.width, mask.height) { 0 } else { degrade::mask_reach(self.making.kernel) };
+        mask.resized(size, around)
     }
 
     fn write_low(&self, folder: &str, name: &str, image: &LowResolution) -> anyhow::Result<()> {

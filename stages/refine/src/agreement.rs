@@ -1,5 +1,5 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling, read_premultiplied};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Mask, Picture, Resampling, read_premultiplied};
 use scene::{Camera, Views};
 
 /// LR photographs of some of the views.
@@ -7,6 +7,12 @@ pub(crate) struct Photographs<'a> {
     input: &'a GivenInput,
     views: Views,
     filter: Filter,
+}
+
+/// One of them, over the background, and which of its pixels count.
+pub(crate) struct Photograph {
+    pub(crate) picture: Picture,
+    pub(crate) mask: Option<Mask>,
 }
 
 /// LR pixels that the nearest picture looks at on each side.
@@ -19,22 +25,30 @@ impl<'a> Photographs<'a> {
     }
 
     /// The LR photograph that was taken by a view's own camera, where there is one: of that name and pose, and smaller.
-    pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Picture>> {
-        let Some(file) = self.views.taken_by(camera).and_then(|v| v.image.as_ref()) else { return Ok(None) };
-        let photograph = read_premultiplied(&self.input.path(file)).bad_input(format!("photograph {}", camera.name))?;
+    pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Photograph>> {
+        let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
+        let Some(file) = &view.image else { return Ok(None) };
+        let place = || format!("photograph {}", camera.name);
+        let picture = read_premultiplied(&self.input.path(file)).bad_input(place())?;
+        let size = (picture.width, picture.height);
+        let mask = view.mask.as_ref().map(|file| Mask::read(&self.input.path(file), size)).transpose().bad_input(place())?;
         let k = &camera.intrinsics;
-        let is_smaller = photograph.width <= k.width as usize && photograph.height <= k.height as usize;
-        Ok(is_smaller.then(|| photograph.over(self.views.background.shown())))
+        let is_smaller = size.0 <= k.width as usize && size.1 <= k.height as usize;
+        Ok(is_smaller.then(|| Photograph { picture: picture.over(self.views.background.shown()), mask }))
     }
 
     /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
-    /// photograph was clipped to black or white and the prediction lies beyond, it says nothing.
-    pub(crate) fn agree(&self, refined: &Picture, photograph: &Picture) -> Picture {
+    /// photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
+    pub(crate) fn agree(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
         let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
         let mut residual = kernel.apply(refined);
         for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
             let clipped = (y >= 1.0 && *r > 1.0) || (y <= 0.0 && *r < 0.0);
             *r = if clipped { 0.0 } else { y - *r };
+        }
+        if let Some(mask) = mask {
+            let none = Picture { data: vec![0.0; residual.data.len()], ..residual.clone() };
+            mask.fill(&mut residual, &none);
         }
         let share = (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
         let mut moved = kernel.inverse(REACH).adjoint(&residual);
@@ -59,7 +73,7 @@ mod tests {
             let data = (0..size.0 * size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
             let truth = Picture::new(size.0, size.1, 3, data);
             let kernel = Resampling::new(filter, size, low_size);
-            let low = kernel.apply(&truth);
+            let low = Photograph { picture: kernel.apply(&truth), mask: None };
             let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
@@ -71,10 +85,13 @@ mod tests {
             assert!(error(&photographs.agree(&truth, &low), &truth) < 1e-5, "{filter:?}");
             let softer = Picture { data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(), ..truth.clone() };
             let agreed = photographs.agree(&softer, &low);
-            let (off, was) = (error(&kernel.apply(&agreed), &low), error(&kernel.apply(&softer), &low));
+            let (off, was) = (error(&kernel.apply(&agreed), &low.picture), error(&kernel.apply(&softer), &low.picture));
             assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
             let (off, was) = (error(&agreed, &truth), error(&softer, &truth));
             assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");
+            let none = Mask { width: low_size.0, height: low_size.1, counts: vec![false; low_size.0 * low_size.1] };
+            let low = Photograph { mask: Some(none), ..low };
+            assert!(error(&photographs.agree(&softer, &low), &softer) < 1e-7, "{filter:?}: what doesn't count moves nothing");
         }
     }
 }

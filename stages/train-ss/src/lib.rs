@@ -16,7 +16,7 @@ mod supervision;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, read_premultiplied};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Mask, read_premultiplied};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Space, Views};
 use schemars::JsonSchema;
@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 use member::Member;
 pub use params::{FieldKind, Params, RateSchedule};
-pub use supervision::{Order, Supersampling, SupersamplingOptions, Supervision};
+pub use supervision::{Order, Photograph, Supersampling, SupersamplingOptions, Supervision};
 
 /// `training.json`: how the training went, over all members one after the other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -130,9 +130,9 @@ pub fn epoch(views: &Views, params: &Params) -> u64 {
     views.views.iter().map(pixels).sum::<u64>() * sub_rays * sub_rays
 }
 
-/// LR pictures as the supervision wants them: over the background, or RGBA premultiplied where it is open.
-pub fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Picture>> {
-    let read = |view: &scene::View| -> anyhow::Result<Picture> {
+/// LR photographs as the supervision wants them: over the background, or RGBA premultiplied where it is open.
+pub fn read_photographs(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
+    let read = |view: &scene::View| -> anyhow::Result<Photograph> {
         let name = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name));
         let path = input.path(name.bad_input("scene")?);
         let picture = read_premultiplied(&path).bad_input("scene")?;
@@ -148,8 +148,10 @@ pub fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Res
             );
             return Err(Failure::BadInput(message).into());
         }
+        let size = (picture.width, picture.height);
+        let mask = view.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose().bad_input("scene")?;
         let is_open = views.background == scene::Background::Alpha;
-        Ok(if is_open { picture } else { picture.over(views.background.shown()) })
+        Ok(Photograph { picture: if is_open { picture } else { picture.over(views.background.shown()) }, mask })
     };
     views.views.iter().map(read).collect()
 }
@@ -159,8 +161,11 @@ pub fn supervision(
     input: &artifact::GivenInput,
     params: &Params,
     views: &Views,
-    pictures: Vec<Picture>,
+    photographs: Vec<Photograph>,
 ) -> anyhow::Result<Supersampling> {
+    if photographs.iter().all(|p| p.mask.as_ref().is_some_and(|mask| mask.share() == 0.0)) {
+        return Err(Failure::BadInput("scene: masks leave no pixel of any photograph; white is what counts".to_owned()).into());
+    }
     let known = input.path(DEGRADATION_FILE).exists();
     let made: Option<Degradation> = if known { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
     let is_open = views.background == scene::Background::Alpha;
@@ -181,13 +186,12 @@ pub fn supervision(
         scale: [params.supersample; 2],
         filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
         coarse: params.coarse(),
-        jitter: params.jitter,
         order: params.order(),
         crop_groups: params.crop_groups(((params.supersample - 1e-6).ceil() as u64).pow(2)),
         detail: params.detail(),
         seed: params.seed,
     };
-    Ok(Supersampling::new(views, pictures, &options))
+    Ok(Supersampling::new(views, photographs, &options))
 }
 
 fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {

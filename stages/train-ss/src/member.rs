@@ -7,7 +7,7 @@ use scene::Views;
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, start};
-use crate::{Params, TrainingLog, epoch, read_hull, read_pictures, supervision};
+use crate::{Params, TrainingLog, epoch, read_hull, read_photographs, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
@@ -75,7 +75,7 @@ impl<'a> Member<'a> {
         progress: &Progress,
     ) -> anyhow::Result<TrainingLog> {
         let context = self.context;
-        let mut supervision = supervision(input, params, views, read_pictures(input, views)?)?;
+        let mut supervision = supervision(input, params, views, read_photographs(input, views)?)?;
         let epoch = epoch(views, params);
         let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
         if total < group as u64 {

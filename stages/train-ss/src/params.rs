@@ -23,8 +23,6 @@ pub struct Params {
     /// What an LR pixel is compared with. Without it: for `grid`, `kernel` where the scene says what made it and has a background;
     /// else `average`.
     pub supervision: Option<Supervision>,
-    /// Where a sub-ray passes its share of the pixel: at the centre, as in the paper, or anywhere.
-    pub jitter: bool,
     /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.
     pub order: Option<Order>,
     /// How many times as often a pixel with detail around it is drawn as a flat one, in random order. What a pixel teaches weighs less by
@@ -69,9 +67,6 @@ pub struct Params {
     /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze, fewer samples, and less detail.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub distortion: f64,
-    /// `grid`: weight decay of the grid.
-    #[schemars(range(min = 0.0, max = 1.0))]
-    pub grid_decay: f64,
     /// `grid`: weight decay of the networks.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub network_decay: f64,
@@ -128,7 +123,6 @@ impl Default for Params {
             supersample: 2.0,
             coarse: None,
             supervision: None,
-            jitter: false,
             order: None,
             detail: None,
             crop_steps: None,
@@ -143,7 +137,6 @@ impl Default for Params {
             schedule: RateSchedule::Code,
             averaging: 0.97,
             distortion: 0.0,
-            grid_decay: 0.0,
             network_decay: 1e-6,
             levels: grid.levels,
             coarsest: grid.coarsest,
@@ -218,7 +211,6 @@ impl Params {
                 ("network_rate", self.network_rate != default.network_rate),
                 ("averaging", self.averaging != default.averaging),
                 ("distortion", self.distortion != default.distortion),
-                ("grid_decay", self.grid_decay != default.grid_decay),
                 ("network_decay", self.network_decay != default.network_decay),
                 ("levels", self.levels != default.levels),
                 ("coarsest", self.coarsest != default.coarsest),
@@ -327,7 +319,6 @@ impl Params {
             warm_up: 100,
             averaging: self.averaging as f32,
             distortion: self.distortion as f32,
-            grid_decay: self.grid_decay as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,
         }

@@ -1,7 +1,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use pixels::{Filter, Picture, Resampling};
+use pixels::{Filter, Mask, Picture, Resampling};
 use radiance::{Draws, Ray};
 use scene::{Background, Views};
 use schemars::JsonSchema;
@@ -46,7 +46,6 @@ pub struct Supersampling {
     full: [usize; 2],
     side: [usize; 2],
     coarse: f64,
-    jitter: bool,
     order: Order,
     crop_groups: u64,
     focus: Focus,
@@ -107,6 +106,7 @@ fn detailed(picture: &Picture) -> impl Iterator<Item = usize> + '_ {
 }
 
 struct TrainingView {
+    /// NaN where nothing is known: pixels that don't count.
     picture: Picture,
     /// Number of pixels in the views before this one.
     before: u64,
@@ -115,6 +115,21 @@ struct TrainingView {
     corner: [f64; 3],
     right: [f64; 3],
     down: [f64; 3],
+}
+
+/// An LR photograph to train on.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Photograph {
+    /// RGB over the background, or premultiplied RGBA where that is open.
+    pub picture: Picture,
+    /// Which pixels count; without it all do. The others are neither drawn nor compared with.
+    pub mask: Option<Mask>,
+}
+
+impl From<Picture> for Photograph {
+    fn from(picture: Picture) -> Self {
+        Self { picture, mask: None }
+    }
 }
 
 /// How to supersample.
@@ -128,8 +143,6 @@ pub struct SupersamplingOptions {
     pub filter: Filter,
     /// Share of the training during which fewer sub-rays are cast.
     pub coarse: f64,
-    /// Whether a sub-ray passes anywhere in its share of the pixel instead of at its centre.
-    pub jitter: bool,
     /// In which order pixels are drawn.
     pub order: Order,
     /// Pixels at the start that come from the middle half of each picture's width and height alone.
@@ -143,30 +156,33 @@ pub struct SupersamplingOptions {
 /// Purposes of draws.
 const PIXEL: u64 = 100;
 const BACKGROUND: u64 = 101;
-const JITTER: u64 = 102;
 /// The first of four.
 const ORDER: u64 = 110;
+
+/// Draws until one is of a pixel that counts; after so many the last is taken, and has no residual.
+const REDRAWS: usize = 64;
 
 /// Above this (254.5 in 8 bits) an LR sample may have been clipped, and below its counterpart.
 const SATURATED: f32 = 254.5 / 255.0;
 
 impl Supersampling {
-    /// Supervision by pictures that match the views: RGB over the background, or premultiplied RGBA where that is open.
-    pub fn new(views: &Views, pictures: Vec<Picture>, options: &SupersamplingOptions) -> Self {
+    /// Supervision by photographs that match the views.
+    pub fn new(views: &Views, photographs: Vec<Photograph>, options: &SupersamplingOptions) -> Self {
         let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
         let operator = |picture: &Picture| {
             let (low, high) = ((picture.width, picture.height), (fine(picture.width, 0), fine(picture.height, 1)));
             (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
         };
-        let smallest = |i: usize, length: fn(&Picture) -> usize| pictures.iter().map(|p| fine(length(p), i)).min().unwrap_or(1);
+        let smallest =
+            |i: usize, length: fn(&Picture) -> usize| photographs.iter().map(|p| fine(length(&p.picture), i)).min().unwrap_or(1);
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
         let mut memory = None;
         let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut with_detail = Vec::new();
-        let mut ready = Vec::with_capacity(pictures.len());
-        for (view, mut picture) in views.views.iter().zip(pictures) {
+        let mut ready = Vec::with_capacity(photographs.len());
+        for (view, Photograph { mut picture, mask }) in views.views.iter().zip(photographs) {
             match options.supervision {
                 Supervision::Average => {}
                 Supervision::Refiltered => {
@@ -182,8 +198,15 @@ impl Supersampling {
                 }
             }
             let before = pixels;
+            let counts = |pixel: &usize| mask.as_ref().is_none_or(|m| m.counts[*pixel]);
             if options.detail > 1.0 {
-                with_detail.extend(detailed(&picture).map(|pixel| before + pixel as u64));
+                with_detail.extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
+            }
+            // What the kernel needs to know of pixels around them stays: what was photographed, since it blurred into its neighbours.
+            for (i, pixel) in picture.data.chunks_exact_mut(picture.channels).enumerate() {
+                if !counts(&i) {
+                    pixel.fill(f32::NAN);
+                }
             }
             pixels += (picture.width * picture.height) as u64;
             let (k, r) = (view.camera.intrinsics, view.camera.rotation());
@@ -197,9 +220,9 @@ impl Supersampling {
                 down: (-r.y_axis / k.fy).to_array(),
             });
         }
-        let SupersamplingOptions { coarse, jitter, order, crop_groups, detail, seed, .. } = *options;
+        let SupersamplingOptions { coarse, order, crop_groups, detail, seed, .. } = *options;
         let (background, focus) = (views.background, Focus::new(detail, pixels, with_detail));
-        Self { views: ready, pixels, background, full, side: full, coarse, jitter, order, crop_groups, focus, seed, memory }
+        Self { views: ready, pixels, background, full, side: full, coarse, order, crop_groups, focus, seed, memory }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -230,16 +253,38 @@ impl Supersampling {
                 let group = group - self.crop_groups;
                 shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels)
             }
-            _ => self.focus.draw(self.pixels, &mut draws),
+            _ => {
+                let mut at = self.focus.draw(self.pixels, &mut draws);
+                for _ in 1..REDRAWS {
+                    if self.counts(at) {
+                        break;
+                    }
+                    at = self.focus.draw(self.pixels, &mut draws);
+                }
+                at
+            }
         };
-        let view = self.views.partition_point(|v| v.before <= at) - 1;
+        let (view, pixel) = self.place(at);
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
         if group < self.crop_groups {
             let mut middle = |length: u64| length / 4 + draws.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
             return (view, (y * width + x) as usize);
         }
-        (view, (at - self.views[view].before) as usize)
+        (view, pixel)
+    }
+
+    /// The view and its pixel that have a number among those of all views.
+    fn place(&self, pixel: u64) -> (usize, usize) {
+        let view = self.views.partition_point(|v| v.before <= pixel) - 1;
+        (view, (pixel - self.views[view].before) as usize)
+    }
+
+    /// Whether anything is known of a pixel.
+    fn counts(&self, pixel: u64) -> bool {
+        let (view, pixel) = self.place(pixel);
+        let picture = &self.views[view].picture;
+        !picture.data[pixel * picture.channels].is_nan()
     }
 
     /// What lies behind a group's rays: with an open background, or none, another colour each time, so that opacity is learnt.
@@ -272,9 +317,14 @@ fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
     }
 }
 
-/// Prediction less target; nothing where the target was clipped and the prediction lies beyond it.
+/// Prediction less target; nothing where the target isn't known.
+fn residual(prediction: f32, target: f32) -> f32 {
+    if target.is_nan() { 0.0 } else { prediction - target }
+}
+
+/// The same, and nothing where the target was clipped and the prediction lies beyond it.
 fn unclipped_residual(prediction: f32, target: f32) -> f32 {
-    let residual = prediction - target;
+    let residual = residual(prediction, target);
     if (target >= SATURATED && residual > 0.0) || (target <= 1.0 - SATURATED && residual < 0.0) { 0.0 } else { residual }
 }
 
@@ -308,8 +358,6 @@ impl radiance::Supervision for Supersampling {
         let view = &self.views[index];
         let background = self.behind(group);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
-        let mut draws = Draws::new(self.seed, JITTER, group);
-        let mut offset = || if self.jitter { f64::from(draws.uniform()) } else { 0.5 };
         // Where the sub-rays begin, and how far apart they are, in LR pixels.
         let (start, apart) = match self.kernel() {
             Some(memory) => memory.block_in_pixels(index, x, y),
@@ -317,8 +365,8 @@ impl radiance::Supervision for Supersampling {
         };
         for (k, ray) in rays.iter_mut().enumerate() {
             let (a, b) = (k % self.side[0], k / self.side[0]);
-            let u = start[0] + (a as f64 + offset()) * apart[0];
-            let v = start[1] + (b as f64 + offset()) * apart[1];
+            let u = start[0] + (a as f64 + 0.5) * apart[0];
+            let v = start[1] + (b as f64 + 0.5) * apart[1];
             let d: [f64; 3] = std::array::from_fn(|i| view.corner[i] + u * view.right[i] + v * view.down[i]);
             let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
             *ray = Ray { origin: view.origin, direction: d.map(|x| (x / length) as f32), background };
@@ -343,7 +391,7 @@ impl radiance::Supervision for Supersampling {
         for c in 0..3 {
             let target = if picture.channels == 4 { sample[c] + (1.0 - sample[3]) * behind[c] } else { sample[c] };
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = mean - target;
+            let residual = residual(mean, target);
             loss += f64::from(weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
                 gradient[c] = weight * residual * share * (2.0 / 3.0);
@@ -377,7 +425,6 @@ mod tests {
             scale,
             filter: Filter::Lanczos,
             coarse: 0.0,
-            jitter: false,
             order: Order::Random,
             crop_groups: 0,
             detail: 1.0,
@@ -399,7 +446,7 @@ mod tests {
         let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0, ..Default::default() };
         let views = Views::new(Background::White, bounds, vec![View::camera_only(camera.clone())]);
         let picture = picture.unwrap_or_else(|| Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
-        (Supersampling::new(&views, vec![picture], &options(supervision, scale)), camera)
+        (Supersampling::new(&views, vec![picture.into()], &options(supervision, scale)), camera)
     }
 
     /// The sub-rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
@@ -573,6 +620,37 @@ mod tests {
             order.sort_unstable();
             assert!(order.iter().copied().eq(0..n));
         }
+    }
+
+    /// Pixels that don't count are neither drawn, nor pulled to what the photograph has there; what counts beside them is.
+    #[test]
+    fn masked_pixels_say_nothing() {
+        for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
+            let (plain, camera) = example(kind, [2.0, 2.0], None);
+            let mask = Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
+            let picture = Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
+            let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
+            let photograph = Photograph { picture, mask: Some(mask) };
+            let masked = Supersampling::new(&views, vec![photograph], &options(kind, [2.0, 2.0]));
+            let mut drawn = [false; 20];
+            (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
+            assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
+            // Far from the masked pixels all is as without them; beside them the kernel feels less.
+            let judged = |of: &Supersampling, pixel: usize| {
+                let group = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
+                let mut gradients = [[0.0; 3]; 4];
+                let loss = of.judge(group, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+                (loss, gradients)
+            };
+            assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
+            if kind == Supervision::Kernel {
+                assert_ne!(judged(&masked, 7), judged(&plain, 7));
+            } else {
+                assert_eq!(judged(&masked, 7), judged(&plain, 7));
+            }
+        }
+        assert_eq!(residual(0.2, f32::NAN), 0.0);
+        assert_eq!(unclipped_residual(0.2, f32::NAN), 0.0);
     }
 
     #[test]

@@ -15,7 +15,7 @@ pub struct Frame {
     pub image: PathBuf,
     /// Whether it has to be turned as its EXIF data ask to be what its camera saw.
     pub turned: bool,
-    /// What is to be left out of it: black there, white elsewhere.
+    /// What is to be left out of it: a picture of its size, black there, white elsewhere.
     pub mask: Option<PathBuf>,
     /// True depth (EXR, channels `Z` and `A`), where the data has it.
     pub depth: Option<PathBuf>,

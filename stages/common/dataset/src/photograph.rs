@@ -4,7 +4,7 @@ use std::path::Path;
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
-use pixels::{PixelError, Rgba8, read_exr, sample_cubic, srgb_from_linear, to_u8};
+use pixels::{Mask, PixelError, Rgba8, read_exr, sample_cubic, srgb_from_linear, to_u8};
 use scene::Intrinsics;
 
 use crate::{DatasetError, Frame, Lens};
@@ -122,16 +122,24 @@ impl Frame {
     /// The picture with its lens's distortion undone, as sharp as it was, and the pinhole camera that would have taken it: of the same
     /// size, with a border cut off where the lens saw no more.
     pub fn photograph(&self) -> Result<(Rgba8, Intrinsics), DatasetError> {
-        let pinhole = self.pinhole()?;
-        let image = read(&self.image, self.turned)?;
+        Ok((self.seen_as_pinhole(&self.image)?, self.pinhole()?))
+    }
+
+    /// Which of [`Frame::photograph`]'s pixels count, where the data say so.
+    pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
+        self.mask.as_ref().map(|path| Ok(Mask::of(&self.seen_as_pinhole(path)?))).transpose()
+    }
+
+    /// A picture of the photograph's pixels as a pinhole camera would have taken it.
+    fn seen_as_pinhole(&self, path: &Path) -> Result<Rgba8, DatasetError> {
+        let image = read(path, self.turned)?;
         let k = self.lens.intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
-            let reason =
-                format!("{}×{} pixels, but {}×{} when it was first looked at", image.width, image.height, k.width, k.height);
-            return Err(PixelError::Format { path: self.image.clone(), reason }.into());
+            let reason = format!("{}×{} pixels where its photograph has {}×{}", image.width, image.height, k.width, k.height);
+            return Err(PixelError::Format { path: path.to_path_buf(), reason }.into());
         }
         let has_distortion = !self.lens.distortion.is_none();
-        Ok((if has_distortion { undistorted(&image, &self.lens, &pinhole) } else { image }, pinhole))
+        Ok(if has_distortion { undistorted(&image, &self.lens, &self.pinhole()?) } else { image })
     }
 
     /// The pinhole camera of [`Frame::photograph`], without looking at the picture.

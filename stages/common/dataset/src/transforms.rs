@@ -78,7 +78,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     }
     let masked = frames.iter().filter(|f| f.mask.is_some()).count();
     if masked > 0 {
-        notes.push(format!("{masked} frames have a mask, which nothing uses yet: all of their pictures is trained on"));
+        notes.push(format!("{masked} frames have a mask: what is black there is neither trained on nor scored"));
     }
     Ok(Dataset { format: Format::Transforms, frames, split, notes })
 }

@@ -6,6 +6,7 @@
 //!   [`VIEW_CHANNELS`]: what a rendered view's EXR has.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
+//! * [`Mask`]: which pixels of a picture count.
 //! * [`sample_cubic`], [`Picture::colour_at`]: a picture between its pixels.
 //! * [`psnr_of`]: a mean squared error in dB.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
@@ -23,6 +24,7 @@ mod degradation;
 mod exr_file;
 mod heat;
 mod image_buffer;
+mod mask;
 mod operator;
 mod picture_file;
 mod pillow_resample;
@@ -35,6 +37,7 @@ pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr};
 pub use heat::{Palette, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
+pub use mask::Mask;
 pub use operator::{AxisTaps, Resampling};
 pub use picture_file::read_premultiplied;
 pub use pillow_resample::{Filter, resize_pillow};

@@ -54,8 +54,6 @@ pub struct TrainingOptions {
     pub averaging: f32,
     /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision gives.
     pub distortion: f32,
-    /// Weight decay of the grid's entries.
-    pub grid_decay: f32,
     /// Weight decay of the networks.
     pub network_decay: f32,
     /// Seed of everything that is drawn.
@@ -317,7 +315,7 @@ impl Trainer {
                 }
             }
             let rate = options.rate_of_level(i, schedule);
-            adam(&AdamStep::new(step, rate, options.grid_decay), touched, w, g, m, v);
+            adam(&AdamStep::new(step, rate, 0.0), touched, w, g, m, v);
         });
     }
 

@@ -1,4 +1,4 @@
-use pixels::{ExrImage, Picture};
+use pixels::{ExrImage, Mask, Picture};
 use scene::{Camera, Surface};
 
 use crate::RefinementError;
@@ -61,6 +61,13 @@ impl KnownView {
             return Err(RefinementError::View { name: name.clone(), reason });
         }
         Ok(Self { rendered, truth })
+    }
+
+    /// The same without what doesn't count: there the truth is what is rendered, and so says nothing.
+    #[must_use]
+    pub fn masked(mut self, mask: Option<&Mask>) -> Self {
+        mask.iter().for_each(|mask| mask.fill(&mut self.truth, &self.rendered.view));
+        self
     }
 }
 

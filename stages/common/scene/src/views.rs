@@ -36,6 +36,9 @@ pub struct View {
     /// The picture: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<String>,
+    /// Which of the picture's pixels count: PNG of its size, white where they do, black where they don't. Without it: all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mask: Option<String>,
     /// Depth: EXR, channel `Z`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub depth: Option<String>,
@@ -47,7 +50,7 @@ pub struct View {
 impl View {
     /// A camera without files.
     pub fn camera_only(camera: Camera) -> Self {
-        Self { camera, image: None, depth: None, low_resolution: None }
+        Self { camera, image: None, mask: None, depth: None, low_resolution: None }
     }
 }
 
@@ -207,7 +210,7 @@ impl Views {
                 return Err(ViewsError::Name(name.clone()));
             }
             view.camera.check().map_err(|source| ViewsError::Camera { name: name.clone(), source })?;
-            for path in [&view.image, &view.depth, &view.low_resolution].into_iter().flatten() {
+            for path in [&view.image, &view.mask, &view.depth, &view.low_resolution].into_iter().flatten() {
                 relative_path(path).map_err(ViewsError::Path)?;
             }
         }

@@ -155,7 +155,7 @@ impl GridTrainer {
             let (g, first, second) = moments(0);
             let rate = options.rate_of_level(i, schedule);
             let moments = [part(first)?, part(second)?];
-            lazy_adam(t, rate, options.grid_decay, part(&self.grid.table)?, &part(g)?, moments)?;
+            lazy_adam(t, rate, 0.0, part(&self.grid.table)?, &part(g)?, moments)?;
         }
         for (i, layer) in self.grid.layers.iter().enumerate() {
             let (g, first, second) = moments(i + 1);
@@ -344,7 +344,6 @@ mod tests {
             warm_up: 5,
             averaging: 0.9,
             distortion: 0.02,
-            grid_decay: 1e-4,
             network_decay: 1e-4,
             seed: 9,
         }
