@@ -264,8 +264,7 @@ impl Job<'_> {
         });
         // What doesn't count can't differ; PSNR is that of the rest: so many dB more or less.
         let of_mask = |picture: &Picture| -> anyhow::Result<Option<Mask>> {
-            let file = true_view.mask.as_ref();
-            file.map(|f| Mask::read(&truth_in.path(f), size(picture)).bad_input(format!("view {name}"))).transpose()
+            true_view.read_mask(truth_in, size(picture)).bad_input(format!("view {name}"))
         };
         let mask = expected.as_ref().or(low.as_ref()).map(of_mask).transpose()?.flatten();
         let mut counted = [0.0; 2];

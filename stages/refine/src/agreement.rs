@@ -31,7 +31,7 @@ impl<'a> Photographs<'a> {
         let place = || format!("photograph {}", camera.name);
         let picture = read_premultiplied(&self.input.path(file)).bad_input(place())?;
         let size = (picture.width, picture.height);
-        let mask = view.mask.as_ref().map(|file| Mask::read(&self.input.path(file), size)).transpose().bad_input(place())?;
+        let mask = view.read_mask(self.input, size).bad_input(place())?;
         let k = &camera.intrinsics;
         let is_smaller = size.0 <= k.width as usize && size.1 <= k.height as usize;
         Ok(is_smaller.then(|| Photograph { picture: picture.over(self.views.background.shown()), mask }))

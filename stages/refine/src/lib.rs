@@ -17,7 +17,7 @@ use std::path::Path;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use paper_refiner::PaperRefiner;
 use pixels::{
-    Channel, ExrImage, Mask, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
+    Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
 };
 use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
@@ -137,7 +137,7 @@ fn references(context: &Context, wanted: bool, background: Background) -> anyhow
             let place = || format!("reference {name}");
             let truth = read_premultiplied(&pictures.path(file)).bad_input(place())?.over(shown);
             let size = (truth.width, truth.height);
-            let mask = picture.mask.as_ref().map(|file| Mask::read(&pictures.path(file), size)).transpose().bad_input(place())?;
+            let mask = picture.read_mask(pictures, size).bad_input(place())?;
             let known = KnownView::new(read(rendered, view, shown)?.0, truth).bad_input("input reference-views")?;
             Ok(same_exposure(context, known.masked(mask.as_ref())))
         })

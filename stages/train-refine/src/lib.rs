@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{Mask, psnr_of, read_exr, read_premultiplied};
+use pixels::{psnr_of, read_exr, read_premultiplied};
 use refinement::{
     Architecture, KnownView, Network, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining,
     Rendered, Training, WEIGHTS_FILE,
@@ -222,7 +222,7 @@ fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<Known
         let rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
         let picture = read_premultiplied(&truth.path(truth_file)).bad_input(place())?.over(background);
         let size = (picture.width, picture.height);
-        let mask = true_view.mask.as_ref().map(|file| Mask::read(&truth.path(file), size)).transpose().bad_input(place())?;
+        let mask = true_view.read_mask(truth, size).bad_input(place())?;
         Ok(Some(KnownView::new(rendered, picture).bad_input("input views")?.masked(mask.as_ref())))
     };
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;

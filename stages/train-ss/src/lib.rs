@@ -16,7 +16,7 @@ mod supervision;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, Mask, read_premultiplied};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, read_premultiplied};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Space, Views};
 use schemars::JsonSchema;
@@ -149,7 +149,7 @@ pub fn read_photographs(input: &artifact::GivenInput, views: &Views) -> anyhow::
             return Err(Failure::BadInput(message).into());
         }
         let size = (picture.width, picture.height);
-        let mask = view.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose().bad_input("scene")?;
+        let mask = view.read_mask(input, size).bad_input("scene")?;
         let is_open = views.background == scene::Background::Alpha;
         Ok(Photograph { picture: if is_open { picture } else { picture.over(views.background.shown()) }, mask })
     };

@@ -1,6 +1,7 @@
 use std::collections::BTreeSet;
 
 use artifact::relative_path;
+use pixels::{Mask, PixelError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -51,6 +52,11 @@ impl View {
     /// A camera without files.
     pub fn camera_only(camera: Camera) -> Self {
         Self { camera, image: None, mask: None, depth: None, low_resolution: None }
+    }
+
+    /// Which pixels of its picture, of that size, count; none where all do.
+    pub fn read_mask(&self, input: &artifact::GivenInput, size: (usize, usize)) -> Result<Option<Mask>, PixelError> {
+        self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
     }
 }
 
