@@ -195,6 +195,44 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     assert!(page.contains("render, 64 px") && page.contains("PSNR at LR") && !page.contains("ground truth"), "no such page");
 }
 
+/// Photographs of one scene with exposures and white balances of their own: the field has one, and it is that of the untouched ones.
+#[test]
+fn exposures_are_found() {
+    let project = Project::tiny();
+    let folder = as_transforms(&project);
+    let file = folder.join("transforms.json");
+    let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    // Every eighth is held out and stays as it is; the others' factors have 1 as their mean.
+    let factors = |i: usize| [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[i % 2];
+    let frames = transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
+    for (taken, (_, frame)) in frames.enumerate() {
+        let path = folder.join(frame["file_path"].as_str().unwrap());
+        let mut picture = pixels::read_png(&path).unwrap();
+        for pixel in picture.data.chunks_exact_mut(4) {
+            (0..3).for_each(|c| pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8);
+        }
+        pixels::write_png(&path, &picture).unwrap();
+    }
+    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("rays: 60000", "rays: 500000");
+    let scored = |exposure: &str| {
+        let settings = ["-i", "dataset=./transforms", "-p", exposure];
+        project.ok(&[&["run"], &settings[..]].concat());
+        let read = |stage: &str, file: &str| -> Value {
+            let artifact = project.object(&project.output_of(stage, &settings)[0]);
+            serde_json::from_slice(&std::fs::read(artifact.join(file)).unwrap()).unwrap()
+        };
+        (read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(), read("train-ss", "training.json"))
+    };
+    let ((found, training), (ignored, _)) = (scored("exposure=true"), scored("exposure=false"));
+    let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
+    println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
+    let off = exposures.iter().enumerate().flat_map(|(i, e)| (0..3).map(move |c| (e[c] / factors(i)[c]).ln().abs()));
+    let (off, was) = (off.sum::<f32>() / 51.0, 0.25);
+    assert!(off < 0.5 * was, "off by {off}: {exposures:?}");
+    assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
+}
+
 /// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor scored.
 #[test]
 fn what_masks_leave_out_is_not_learnt() {

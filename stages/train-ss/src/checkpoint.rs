@@ -40,11 +40,17 @@ impl Curve {
     }
 
     pub(crate) fn finish(self, steps: u64, rays: u64) -> TrainingLog {
-        TrainingLog { steps, rays, samples_per_ray: self.samples as f64 / rays.max(1) as f64, curve: self.points }
+        TrainingLog {
+            steps,
+            rays,
+            samples_per_ray: self.samples as f64 / rays.max(1) as f64,
+            curve: self.points,
+            exposures: Vec::new(),
+        }
     }
 }
 
-/// Checkpoints in the work folder: `curve-STEP.json` and, where the supervision remembers renders, `renders-STEP.bin`; then
+/// Checkpoints in the work folder: `curve-STEP.json` and `kept-STEP.bin`, what the supervision has come to know; then
 /// `checkpoint.safetensors`, which says which STEP they belong to.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
@@ -64,11 +70,8 @@ impl Checkpoints {
         if !path.exists() {
             return Curve::default();
         }
-        match whole(folder, &path, trainer, supervision).filter(|_| trainer.resume(&path)) {
-            Some((curve, renders)) => {
-                if let Some(memory) = supervision.memory_mut() {
-                    memory.restore(&renders);
-                }
+        match restored(folder, &path, trainer, supervision) {
+            Some(curve) => {
                 say(&format!("going on from step {}", trainer.steps()));
                 curve
             }
@@ -97,18 +100,16 @@ impl Checkpoints {
         let started = Instant::now();
         let (name, temporary) = (folder.join(CHECKPOINT), folder.join("checkpoint.partial"));
         let step = trainer.steps();
-        let own = [curve_name(step), renders_name(step)];
+        let own = [curve_name(step), kept_name(step)];
         artifact::write_json(&folder.join(&own[0]), curve)?;
-        if let Some(memory) = supervision.memory() {
-            let mut file = std::fs::File::create(folder.join(&own[1]))?;
-            memory.parts().try_for_each(|part| file.write_all(part))?;
-        }
+        let mut file = std::fs::File::create(folder.join(&own[1]))?;
+        supervision.kept().try_for_each(|part| file.write_all(&part))?;
         trainer.write_checkpoint(&temporary)?;
         std::fs::rename(&temporary, &name)?;
         for entry in std::fs::read_dir(folder)? {
             let entry = entry?;
             let file = entry.file_name().to_string_lossy().into_owned();
-            if (file.starts_with("curve-") || file.starts_with("renders-")) && !own.contains(&file) {
+            if (file.starts_with("curve-") || file.starts_with("kept-")) && !own.contains(&file) {
                 std::fs::remove_file(entry.path())?;
             }
         }
@@ -123,15 +124,18 @@ fn curve_name(step: u64) -> String {
     format!("curve-{step}.json")
 }
 
-fn renders_name(step: u64) -> String {
-    format!("renders-{step}.bin")
+fn kept_name(step: u64) -> String {
+    format!("kept-{step}.bin")
 }
 
-/// The curve and the remembered renders of a checkpoint's step, where all of it is there: looked for before anything changes.
-fn whole(folder: &Path, checkpoint: &Path, trainer: &dyn FieldTrainer, supervision: &Supersampling) -> Option<(Curve, Vec<u8>)> {
+/// The curve of a checkpoint's step, with trainer and supervision as they were then, where all of it is there.
+fn restored(folder: &Path, checkpoint: &Path, trainer: &mut dyn FieldTrainer, supervision: &mut Supersampling) -> Option<Curve> {
     let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
-    let Some(memory) = supervision.memory() else { return Some((curve, Vec::new())) };
-    let renders = std::fs::read(folder.join(renders_name(step))).ok()?;
-    (renders.len() == memory.len()).then_some((curve, renders))
+    let kept = std::fs::read(folder.join(kept_name(step))).ok()?;
+    // A trainer that can't resume is as it was.
+    (kept.len() == supervision.kept_len() && trainer.resume(checkpoint)).then(|| {
+        supervision.restore(&kept);
+        curve
+    })
 }

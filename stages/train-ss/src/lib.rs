@@ -5,9 +5,11 @@
 //!   kernel that made the LR images.
 //! * `memory`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
 //! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
+//! * `exposure`: how bright each photograph is, where that is asked for.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
 mod checkpoint;
+mod exposure;
 mod field_trainer;
 mod member;
 mod memory;
@@ -38,6 +40,9 @@ pub struct TrainingLog {
     pub samples_per_ray: f64,
     /// PSNR of training pixels against rays, about a hundred points a member.
     pub curve: Vec<CurvePoint>,
+    /// How many times as bright as all together each training view is, red, green and blue, where that was asked for; of the first member.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub exposures: Vec<[f32; 3]>,
 }
 
 impl TrainingLog {
@@ -45,6 +50,9 @@ impl TrainingLog {
     fn add(&mut self, next: TrainingLog) {
         let samples = self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
         let before = self.rays;
+        if self.exposures.is_empty() {
+            self.exposures = next.exposures;
+        }
         self.curve.extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
         self.steps += next.steps;
         self.rays += next.rays;
@@ -189,6 +197,7 @@ pub fn supervision(
         order: params.order(),
         crop_groups: params.crop_groups(((params.supersample - 1e-6).ceil() as u64).pow(2)),
         detail: params.detail(),
+        exposure: params.exposure,
         seed: params.seed,
     };
     Ok(Supersampling::new(views, photographs, &options))

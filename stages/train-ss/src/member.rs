@@ -106,7 +106,8 @@ impl<'a> Member<'a> {
             progress.set(self.before + rays, &curve.note());
             checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
         }
-        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        let mut log = curve.finish(trainer.steps(), trainer.rays_done());
+        log.exposures = supervision.exposures().to_vec();
         trainer.finish(&self.output)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;

@@ -78,15 +78,15 @@ impl Memory {
 
     /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else as remembered, and what they
     /// ask of the block: writes P·residual for each colour, where P = Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse but for the factor s², and
-    /// returns the residual of the pixel itself. `judge` gets a prediction and its target, for each channel, and gives the
-    /// residual.
+    /// returns the residual of the pixel itself. `judge` gets a channel, a prediction and its target, and
+    /// gives the residual.
     pub(crate) fn pull(
         &self,
         view: usize,
         [x, y]: [usize; 2],
         colours: &[[f32; 3]],
         targets: &Picture,
-        judge: impl Fn(f32, f32) -> f32,
+        judge: impl Fn(usize, f32, f32) -> f32,
         pulls: &mut [[f32; 3]],
     ) -> [f32; 3] {
         const MOST: usize = 2 * Memory::REACH + 1;
@@ -119,7 +119,7 @@ impl Memory {
                 let (made, target) = (&view.made[at], &targets.data[3 * at..]);
                 *residual = std::array::from_fn(|c| {
                     let prediction = (made[c] as f32).mul_add(1.0 / (ONE * ONE), residual[c]);
-                    judge(prediction / 255.0, target[c])
+                    judge(c, prediction / 255.0, target[c])
                 });
                 if [qx, qy] == [x, y] {
                     own = *residual;
@@ -268,7 +268,7 @@ mod tests {
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
                     let expected = inverse.adjoint(&residual);
                     let mut pulls = vec![[9.0; 3]; fresh.len()];
-                    let own = memory.pull(0, [x, y], &fresh, &targets, |p, t| p - t, &mut pulls);
+                    let own = memory.pull(0, [x, y], &fresh, &targets, |_, p, t| p - t, &mut pulls);
                     for c in 0..3 {
                         assert!((own[c] - residual.data[3 * (y * low.0 + x) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y})");
                         for (k, pull) in pulls.iter().enumerate() {

@@ -23,6 +23,9 @@ pub struct Params {
     /// What an LR pixel is compared with. Without it: for `grid`, `kernel` where the scene says what made it and has a background;
     /// else `average`.
     pub supervision: Option<Supervision>,
+    /// Whether to find, while training, how bright each photograph is against the others (a factor for red, green and blue), for pictures
+    /// taken with several exposures or white balances. Views come out in the mean exposure.
+    pub exposure: bool,
     /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.
     pub order: Option<Order>,
     /// How many times as often a pixel with detail around it is drawn as a flat one, in random order. What a pixel teaches weighs less by
@@ -123,6 +126,7 @@ impl Default for Params {
             supersample: 2.0,
             coarse: None,
             supervision: None,
+            exposure: false,
             order: None,
             detail: None,
             crop_steps: None,

@@ -1,3 +1,4 @@
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -7,6 +8,7 @@ use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::exposure::Exposures;
 use crate::memory::{Kernel, Memory};
 
 /// What an LR pixel is compared with.
@@ -51,6 +53,7 @@ pub struct Supersampling {
     focus: Focus,
     seed: u64,
     memory: Option<Memory>,
+    exposures: Option<Exposures>,
 }
 
 /// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
@@ -149,6 +152,8 @@ pub struct SupersamplingOptions {
     pub crop_groups: u64,
     /// How many times as often a pixel with detail is drawn as a flat one, in random order.
     pub detail: f64,
+    /// Whether to find each photograph's exposure.
+    pub exposure: bool,
     /// Seed of what is drawn.
     pub seed: u64,
 }
@@ -220,9 +225,10 @@ impl Supersampling {
                 down: (-r.y_axis / k.fy).to_array(),
             });
         }
-        let SupersamplingOptions { coarse, order, crop_groups, detail, seed, .. } = *options;
+        let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
         let (background, focus) = (views.background, Focus::new(detail, pixels, with_detail));
-        Self { views: ready, pixels, background, full, side: full, coarse, order, crop_groups, focus, seed, memory }
+        let exposures = exposure.then(|| Exposures::new(ready.len()));
+        Self { views: ready, pixels, background, full, side: full, coarse, order, crop_groups, focus, seed, memory, exposures }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -235,14 +241,27 @@ impl Supersampling {
         self.memory.as_ref().filter(|_| self.side == self.full)
     }
 
-    /// The field's HR pixels as last rendered, where the supervision keeps them.
-    pub(crate) fn memory(&self) -> Option<&Memory> {
-        self.memory.as_ref()
+    /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, and what exposures follow from.
+    pub(crate) fn kept(&self) -> impl Iterator<Item = Cow<'_, [u8]>> {
+        let renders = self.memory.iter().flat_map(Memory::parts).map(Cow::Borrowed);
+        renders.chain(self.exposures.iter().map(|e| Cow::Owned(e.bytes())))
     }
 
-    /// The same, to be restored.
-    pub(crate) fn memory_mut(&mut self) -> Option<&mut Memory> {
-        self.memory.as_mut()
+    /// Bytes of that.
+    pub(crate) fn kept_len(&self) -> usize {
+        self.memory.as_ref().map_or(0, Memory::len) + self.exposures.as_ref().map_or(0, Exposures::len)
+    }
+
+    /// Restores what was kept, [`Supersampling::kept_len`] bytes.
+    pub(crate) fn restore(&mut self, kept: &[u8]) {
+        let (renders, sums) = kept.split_at(self.memory.as_ref().map_or(0, Memory::len));
+        self.memory.iter_mut().for_each(|memory| memory.restore(renders));
+        self.exposures.iter_mut().for_each(|exposures| exposures.restore(sums));
+    }
+
+    /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
+    pub fn exposures(&self) -> &[[f32; 3]] {
+        self.exposures.as_ref().map_or(&[], Exposures::factors)
     }
 
     /// The view and pixel that a group trains on.
@@ -322,9 +341,9 @@ fn residual(prediction: f32, target: f32) -> f32 {
     if target.is_nan() { 0.0 } else { prediction - target }
 }
 
-/// The same, and nothing where the target was clipped and the prediction lies beyond it.
-fn unclipped_residual(prediction: f32, target: f32) -> f32 {
-    let residual = residual(prediction, target);
+/// The same, with the target's exposure taken back by a factor, and nothing where it was clipped and the prediction lies beyond it.
+fn unclipped_residual(prediction: f32, target: f32, back: f32) -> f32 {
+    let residual = residual(prediction, back * target);
     if (target >= SATURATED && residual > 0.0) || (target <= 1.0 - SATURATED && residual < 0.0) { 0.0 } else { residual }
 }
 
@@ -341,6 +360,7 @@ fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> P
 
 impl radiance::Supervision for Supersampling {
     fn begin(&mut self, done: f64) {
+        self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
         if done < self.coarse {
             let doublings = self.full[0].max(self.full[1]).next_power_of_two().trailing_zeros();
@@ -378,12 +398,14 @@ impl radiance::Supervision for Supersampling {
         let picture = &self.views[index].picture;
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
         let share = 1.0 / colours.len() as f32;
+        let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
         let is_cropped = group < self.crop_groups;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(memory) = self.kernel() {
             let at = [pixel % picture.width, pixel / picture.width];
-            let own = memory.pull(index, at, colours, picture, unclipped_residual, gradients);
+            let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
+            let own = memory.pull(index, at, colours, picture, residual, gradients);
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
             return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
@@ -391,7 +413,7 @@ impl radiance::Supervision for Supersampling {
         for c in 0..3 {
             let target = if picture.channels == 4 { sample[c] + (1.0 - sample[3]) * behind[c] } else { sample[c] };
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = residual(mean, target);
+            let residual = residual(mean, back[c] * target);
             loss += f64::from(weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
                 gradient[c] = weight * residual * share * (2.0 / 3.0);
@@ -401,13 +423,21 @@ impl radiance::Supervision for Supersampling {
     }
 
     fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
-        if self.kernel().is_none() {
+        if self.kernel().is_none() && self.exposures.is_none() {
             return;
         }
         let (index, pixel) = self.pixel(group);
-        let width = self.views[index].picture.width;
-        if let Some(memory) = &mut self.memory {
-            memory.remember(index, pixel % width, pixel / width, colours);
+        let picture = &self.views[index].picture;
+        if let Some(exposures) = &mut self.exposures {
+            let at = pixel * picture.channels;
+            let is_clipped = |y: f32| y >= SATURATED || y <= 1.0 - SATURATED;
+            let photographed = [0, 1, 2].map(|c| picture.data[at + c]).map(|y| if is_clipped(y) { f32::NAN } else { y });
+            let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
+            exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
+        }
+        let is_remembered = self.side == self.full;
+        if let Some(memory) = self.memory.as_mut().filter(|_| is_remembered) {
+            memory.remember(index, pixel % picture.width, pixel / picture.width, colours);
         }
     }
 }
@@ -428,6 +458,7 @@ mod tests {
             order: Order::Random,
             crop_groups: 0,
             detail: 1.0,
+            exposure: false,
             seed: 9,
         }
     }
@@ -556,7 +587,7 @@ mod tests {
         let cases =
             [(1.1, 1.0, 0.0), (0.9, 1.0, -0.1), (-0.1, 0.0, 0.0), (0.1, 0.0, 0.1), (1.1, 0.99, 0.11), (-0.1, 0.01, -0.11)];
         for (prediction, target, residual) in cases {
-            assert!((unclipped_residual(prediction, target) - residual).abs() < 1e-6, "{prediction} {target}");
+            assert!((unclipped_residual(prediction, target, 1.0) - residual).abs() < 1e-6, "{prediction} {target}");
         }
         let white = Picture::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
@@ -650,7 +681,7 @@ mod tests {
             }
         }
         assert_eq!(residual(0.2, f32::NAN), 0.0);
-        assert_eq!(unclipped_residual(0.2, f32::NAN), 0.0);
+        assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
     }
 
     #[test]
