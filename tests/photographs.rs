@@ -231,6 +231,8 @@ fn exposures_are_found() {
     let (off, was) = (off.sum::<f32>() / 51.0, 0.25);
     assert!(off < 0.5 * was, "off by {off}: {exposures:?}");
     assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
+    let open = ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
+    project.run(&open).fails(2, &["parameter exposure", "open background"]);
 }
 
 /// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor scored.

@@ -189,6 +189,10 @@ pub fn supervision(
             "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
         return Err(Failure::Usage(message.to_owned()).into());
     }
+    if params.exposure && is_open {
+        let message = "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
+        return Err(Failure::Usage(message.to_owned()).into());
+    }
     let options = SupersamplingOptions {
         supervision,
         scale: [params.supersample; 2],
