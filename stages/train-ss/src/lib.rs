@@ -190,7 +190,8 @@ pub fn supervision(
         return Err(Failure::Usage(message.to_owned()).into());
     }
     if params.exposure && is_open {
-        let message = "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
+        let message =
+            "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
         return Err(Failure::Usage(message.to_owned()).into());
     }
     let options = SupersamplingOptions {
