@@ -1,18 +1,12 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, Mask, Picture, Resampling, read_premultiplied};
-use scene::{Camera, Views};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling};
+use scene::{Camera, Photograph, Views};
 
 /// LR photographs of some of the views.
 pub(crate) struct Photographs<'a> {
     input: &'a GivenInput,
     views: Views,
     filter: Filter,
-}
-
-/// One of them, over the background, and which of its pixels count.
-pub(crate) struct Photograph {
-    pub(crate) picture: Picture,
-    pub(crate) mask: Option<Mask>,
 }
 
 /// LR pixels that the nearest picture looks at on each side.
@@ -24,17 +18,13 @@ impl<'a> Photographs<'a> {
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
 
-    /// The LR photograph that was taken by a view's own camera, where there is one: of that name and pose, and smaller.
+    /// The LR photograph that was taken by a view's own camera, over the background, where there is one: of that name and pose, and smaller.
     pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Photograph>> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
-        let Some(file) = &view.image else { return Ok(None) };
-        let place = || format!("photograph {}", camera.name);
-        let picture = read_premultiplied(&self.input.path(file)).bad_input(place())?;
-        let size = (picture.width, picture.height);
-        let mask = view.read_mask(self.input, size).bad_input(place())?;
+        let photograph = view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
-        let is_smaller = size.0 <= k.width as usize && size.1 <= k.height as usize;
-        Ok(is_smaller.then(|| Photograph { picture: picture.over(self.views.background.shown()), mask }))
+        let is_smaller = |p: &Photograph| p.picture.width <= k.width as usize && p.picture.height <= k.height as usize;
+        Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
     }
 
     /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
@@ -73,7 +63,7 @@ mod tests {
             let data = (0..size.0 * size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
             let truth = Picture::new(size.0, size.1, 3, data);
             let kernel = Resampling::new(filter, size, low_size);
-            let low = Photograph { picture: kernel.apply(&truth), mask: None };
+            let low = Photograph::from(kernel.apply(&truth));
             let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
@@ -89,7 +79,7 @@ mod tests {
             assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
             let (off, was) = (error(&agreed, &truth), error(&softer, &truth));
             assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");
-            let none = Mask { width: low_size.0, height: low_size.1, counts: vec![false; low_size.0 * low_size.1] };
+            let none = pixels::Mask { width: low_size.0, height: low_size.1, counts: vec![false; low_size.0 * low_size.1] };
             let low = Photograph { mask: Some(none), ..low };
             assert!(error(&photographs.agree(&softer, &low), &softer) < 1e-7, "{filter:?}: what doesn't count moves nothing");
         }

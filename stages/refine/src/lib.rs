@@ -16,9 +16,7 @@ use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use paper_refiner::PaperRefiner;
-use pixels::{
-    Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, read_premultiplied, write_exr, write_png,
-};
+use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -127,21 +125,16 @@ fn references(context: &Context, wanted: bool, background: Background) -> anyhow
     }
     let (pictures_list, rendered_list) = (Views::read(pictures)?, Views::read(rendered)?);
     let shown = background.shown();
-    let known = pictures_list.views.iter().filter_map(|picture| Some((picture, picture.image.as_ref()?)));
-    known
-        .map(|(picture, file)| {
-            let name = &picture.camera.name;
-            let view = rendered_list.taken_by(&picture.camera).ok_or_else(|| {
-                Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
-            })?;
-            let place = || format!("reference {name}");
-            let truth = read_premultiplied(&pictures.path(file)).bad_input(place())?.over(shown);
-            let size = (truth.width, truth.height);
-            let mask = picture.read_mask(pictures, size).bad_input(place())?;
-            let known = KnownView::new(read(rendered, view, shown)?.0, truth).bad_input("input reference-views")?;
-            Ok(same_exposure(context, known.masked(mask.as_ref())))
-        })
-        .collect()
+    let reference = |picture: &View| -> anyhow::Result<Option<KnownView>> {
+        let name = &picture.camera.name;
+        let Some(truth) = picture.read_photograph(pictures).bad_input(format!("reference {name}"))? else { return Ok(None) };
+        let view = rendered_list.taken_by(&picture.camera).ok_or_else(|| {
+            Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
+        })?;
+        let known = KnownView::new(read(rendered, view, shown)?.0, truth.over(shown)).bad_input("input reference-views")?;
+        Ok(Some(same_exposure(context, known)))
+    };
+    pictures_list.views.iter().filter_map(|picture| reference(picture).transpose()).collect()
 }
 
 /// A reference as it would look with the exposure of the pictures that the field learnt from.

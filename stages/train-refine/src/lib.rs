@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::{psnr_of, read_exr, read_premultiplied};
+use pixels::{psnr_of, read_exr};
 use refinement::{
     Architecture, KnownView, Network, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining,
     Rendered, Training, WEIGHTS_FILE,
@@ -215,15 +215,12 @@ fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<Known
     let background = known.background.shown();
     let example = |view: &View| -> anyhow::Result<Option<KnownView>> {
         let name = &view.camera.name;
-        let true_view = known.taken_by(&view.camera).and_then(|v| Some((v, v.image.as_ref()?)));
-        let (Some(file), Some((true_view, truth_file))) = (&view.image, true_view) else { return Ok(None) };
+        let (Some(file), Some(true_view)) = (&view.image, known.taken_by(&view.camera)) else { return Ok(None) };
         let place = || format!("view {name}");
+        let Some(photograph) = true_view.read_photograph(truth).bad_input(place())? else { return Ok(None) };
         let image = read_exr(&views.path(file)).bad_input(place())?;
         let rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
-        let picture = read_premultiplied(&truth.path(truth_file)).bad_input(place())?.over(background);
-        let size = (picture.width, picture.height);
-        let mask = true_view.read_mask(truth, size).bad_input(place())?;
-        Ok(Some(KnownView::new(rendered, picture).bad_input("input views")?.masked(mask.as_ref())))
+        Ok(Some(KnownView::new(rendered, photograph.over(background)).bad_input("input views")?))
     };
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;
     if all.is_empty() {

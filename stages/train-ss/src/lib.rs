@@ -18,15 +18,15 @@ mod supervision;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, read_premultiplied};
+use pixels::{DEGRADATION_FILE, Degradation, Filter};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
-use scene::{Space, Views};
+use scene::{Photograph, Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use member::Member;
 pub use params::{FieldKind, Params, RateSchedule};
-pub use supervision::{Order, Photograph, Supersampling, SupersamplingOptions, Supervision};
+pub use supervision::{Order, Supersampling, SupersamplingOptions, Supervision};
 
 /// `training.json`: how the training went, over all members one after the other.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -40,7 +40,8 @@ pub struct TrainingLog {
     pub samples_per_ray: f64,
     /// PSNR of training pixels against rays, about a hundred points a member.
     pub curve: Vec<CurvePoint>,
-    /// How many times as bright as all together each training view is, red, green and blue, where that was asked for; of the first member.
+    /// How many times as bright as all together each training view is, in the order of `views.json`, red, green and blue, where that was asked
+    /// for; of the first member.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exposures: Vec<[f32; 3]>,
 }
@@ -138,28 +139,19 @@ pub fn epoch(views: &Views, params: &Params) -> u64 {
     views.views.iter().map(pixels).sum::<u64>() * sub_rays * sub_rays
 }
 
-/// LR photographs as the supervision wants them: over the background, or RGBA premultiplied where it is open.
+/// LR photographs as the supervision wants them: over the background, or premultiplied RGBA where it is open.
 pub fn read_photographs(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
     let read = |view: &scene::View| -> anyhow::Result<Photograph> {
-        let name = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name));
-        let path = input.path(name.bad_input("scene")?);
-        let picture = read_premultiplied(&path).bad_input("scene")?;
-        let k = view.camera.intrinsics;
-        if (picture.width, picture.height) != (k.width as usize, k.height as usize) {
-            let message = format!(
-                "{}: {}×{} pixels where its camera has {}×{}",
-                path.display(),
-                picture.width,
-                picture.height,
-                k.width,
-                k.height
-            );
+        let (name, k) = (&view.camera.name, view.camera.intrinsics);
+        let photograph = view.read_photograph(input).bad_input("scene")?;
+        let photograph = photograph.with_context(|| format!("view {name}: it has no image")).bad_input("scene")?;
+        let (width, height) = (photograph.picture.width, photograph.picture.height);
+        if (width, height) != (k.width as usize, k.height as usize) {
+            let message = format!("view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
             return Err(Failure::BadInput(message).into());
         }
-        let size = (picture.width, picture.height);
-        let mask = view.read_mask(input, size).bad_input("scene")?;
         let is_open = views.background == scene::Background::Alpha;
-        Ok(Photograph { picture: if is_open { picture } else { picture.over(views.background.shown()) }, mask })
+        Ok(if is_open { photograph } else { photograph.over(views.background.shown()) })
     };
     views.views.iter().map(read).collect()
 }

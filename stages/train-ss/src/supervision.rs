@@ -2,9 +2,9 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use pixels::{Filter, Mask, Picture, Resampling};
+use pixels::{Filter, Picture, Resampling};
 use radiance::{Draws, Ray};
-use scene::{Background, Views};
+use scene::{Background, Photograph, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -120,21 +120,6 @@ struct TrainingView {
     down: [f64; 3],
 }
 
-/// An LR photograph to train on.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Photograph {
-    /// RGB over the background, or premultiplied RGBA where that is open.
-    pub picture: Picture,
-    /// Which pixels count; without it all do. The others are neither drawn nor compared with.
-    pub mask: Option<Mask>,
-}
-
-impl From<Picture> for Photograph {
-    fn from(picture: Picture) -> Self {
-        Self { picture, mask: None }
-    }
-}
-
 /// How to supersample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SupersamplingOptions {
@@ -171,7 +156,8 @@ const REDRAWS: usize = 64;
 const SATURATED: f32 = 254.5 / 255.0;
 
 impl Supersampling {
-    /// Supervision by photographs that match the views.
+    /// Supervision by LR photographs that match the views, over the background or premultiplied where that is open. Pixels that don't count are
+    /// neither drawn nor compared with.
     pub fn new(views: &Views, photographs: Vec<Photograph>, options: &SupersamplingOptions) -> Self {
         let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
         let operator = |picture: &Picture| {
@@ -267,23 +253,23 @@ impl Supersampling {
     /// The view and pixel that a group trains on.
     fn pixel(&self, group: u64) -> (usize, usize) {
         let mut draws = Draws::new(self.seed, PIXEL, group);
-        let at = match self.order {
+        let (view, pixel) = match self.order {
             Order::Epochs if group >= self.crop_groups => {
                 let group = group - self.crop_groups;
-                shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels)
+                self.place(shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels))
             }
             _ => {
-                let mut at = self.focus.draw(self.pixels, &mut draws);
+                let mut draw = || self.place(self.focus.draw(self.pixels, &mut draws));
+                let mut place = draw();
                 for _ in 1..REDRAWS {
-                    if self.counts(at) {
+                    if self.counts(place) {
                         break;
                     }
-                    at = self.focus.draw(self.pixels, &mut draws);
+                    place = draw();
                 }
-                at
+                place
             }
         };
-        let (view, pixel) = self.place(at);
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
         if group < self.crop_groups {
             let mut middle = |length: u64| length / 4 + draws.below((length / 2).max(1));
@@ -300,8 +286,7 @@ impl Supersampling {
     }
 
     /// Whether anything is known of a pixel.
-    fn counts(&self, pixel: u64) -> bool {
-        let (view, pixel) = self.place(pixel);
+    fn counts(&self, (view, pixel): (usize, usize)) -> bool {
         let picture = &self.views[view].picture;
         !picture.data[pixel * picture.channels].is_nan()
     }

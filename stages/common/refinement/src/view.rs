@@ -1,5 +1,5 @@
-use pixels::{ExrImage, Mask, Picture};
-use scene::{Camera, Surface};
+use pixels::{ExrImage, Picture};
+use scene::{Camera, Photograph, Surface};
 
 use crate::RefinementError;
 
@@ -45,14 +45,14 @@ impl Rendered {
 pub struct KnownView {
     /// As rendered.
     pub rendered: Rendered,
-    /// Colour, on the background that is shown; of the view's size.
+    /// Colour, on the background that is shown; of the view's size. What is rendered, where nothing is known.
     pub truth: Picture,
 }
 
 impl KnownView {
-    /// A rendered view with its picture.
-    pub fn new(rendered: Rendered, truth: Picture) -> Result<Self, RefinementError> {
-        let (view, name) = (&rendered.view, &rendered.camera.name);
+    /// A rendered view with its photograph, over the same background. Where that doesn't count it is taken for what is rendered, and so says nothing.
+    pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
+        let (view, name, Photograph { picture: mut truth, mask }) = (&rendered.view, &rendered.camera.name, photograph);
         if (view.width, view.height) != (truth.width, truth.height) {
             let reason = format!(
                 "{}×{} pixels where its picture has {}×{}; render it for the picture's camera",
@@ -60,14 +60,8 @@ impl KnownView {
             );
             return Err(RefinementError::View { name: name.clone(), reason });
         }
+        mask.iter().for_each(|mask| mask.fill(&mut truth, view));
         Ok(Self { rendered, truth })
-    }
-
-    /// The same without what doesn't count: there the truth is what is rendered, and so says nothing.
-    #[must_use]
-    pub fn masked(mut self, mask: Option<&Mask>) -> Self {
-        mask.iter().for_each(|mask| mask.fill(&mut self.truth, &self.rendered.view));
-        self
     }
 }
 

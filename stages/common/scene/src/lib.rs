@@ -29,5 +29,5 @@ mod warp;
 
 pub use camera::{Camera, CameraError, Intrinsics, Ray, common_direction};
 pub use space::{Frustum, Space};
-pub use views::{Background, Bounds, Conventions, VIEWS_FILE, View, Views, ViewsError};
+pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Sight, Surface};

@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 
 use artifact::relative_path;
-use pixels::{Mask, PixelError};
+use pixels::{Mask, Picture, PixelError, read_premultiplied};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -54,9 +54,40 @@ impl View {
         Self { camera, image: None, mask: None, depth: None, low_resolution: None }
     }
 
+    /// Its picture, premultiplied RGBA, and which of its pixels count; none where it has no picture.
+    pub fn read_photograph(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+        let Some(file) = &self.image else { return Ok(None) };
+        let picture = read_premultiplied(&input.path(file))?;
+        let mask = self.read_mask(input, (picture.width, picture.height))?;
+        Ok(Some(Photograph { picture, mask }))
+    }
+
     /// Which pixels of its picture, of that size, count; none where all do.
     pub fn read_mask(&self, input: &artifact::GivenInput, size: (usize, usize)) -> Result<Option<Mask>, PixelError> {
         self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
+    }
+}
+
+/// What a camera took: a picture, and what of it shows the scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Photograph {
+    /// Premultiplied RGBA, or RGB over a background.
+    pub picture: Picture,
+    /// Which pixels count; without it all do. The others say nothing of the scene.
+    pub mask: Option<Mask>,
+}
+
+impl Photograph {
+    /// RGB over a grey level.
+    #[must_use]
+    pub fn over(self, background: f32) -> Self {
+        Self { picture: self.picture.over(background), ..self }
+    }
+}
+
+impl From<Picture> for Photograph {
+    fn from(picture: Picture) -> Self {
+        Self { picture, mask: None }
     }
 }
 
