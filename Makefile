@@ -41,7 +41,7 @@ endif
 lint: setup ## rustfmt, clippy with and without libtorch; cargo-deny and typos where installed
 	cargo fmt --all --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
-	cargo clippy --release -p train-ss -p render-depth -p eval --no-default-features --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p locate -p eval --no-default-features --all-targets -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 

@@ -238,6 +238,57 @@ fn exposures_are_found() {
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
 }
 
+/// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those that it is tested by are found by it.
+#[test]
+fn poses_are_refined_and_test_views_located() {
+    let project = Project::tiny();
+    let folder = as_transforms(&project);
+    let file = folder.join("transforms.json");
+    let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let mut draws = radiance::Draws::new(7, 1, 1);
+    let mut off = |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * draws.uniform() - 1.0)));
+    for frame in transforms["frames"].as_array_mut().unwrap() {
+        let matrix: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
+        let turn = DMat3::from_quat(DQuat::from_scaled_axis(off(0.02)));
+        let axes = DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [0, 1, 2].map(|r| matrix[r][c]))) * turn;
+        let shift = off(0.08);
+        let row = |r: usize| [axes.x_axis[r], axes.y_axis[r], axes.z_axis[r], matrix[r][3] + shift[r]];
+        frame["transform_matrix"] = json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]);
+    }
+    std::fs::write(&file, transforms.to_string()).unwrap();
+    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("rays: 60000", "rays: 300000");
+    let located = "  locate:
+    inputs: {field: train-ss, photographs: prep/truth}
+  located-views:
+    like: render-depth
+    inputs: {field: train-ss, cameras: locate}
+  eval-located:
+    like: eval
+    inputs: {views: located-views, truth: prep/truth}
+";
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    project.write("pipeline.yaml", &(text + located));
+    let scored = |refined: &str| {
+        let settings = ["eval", "eval-located", "-i", "dataset=./transforms", "-p", refined];
+        project.ok(&[&["run"], &settings[..]].concat());
+        ["eval", "eval-located"].map(|stage| {
+            let metrics = project.object(&project.output_of(stage, &settings)[0]).join("metrics.json");
+            let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+            metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+        })
+    };
+    let ([as_given, only_located], [only_refined, both]) = (scored("pose_refinement=false"), scored("pose_refinement=true"));
+    println!("{as_given:.2} dB as given, {only_located:.2} located, {only_refined:.2} refined, {both:.2} both");
+    assert!(both > only_located + 1.0 && both > only_refined + 1.0 && both > as_given + 3.0);
+    let settings = ["-i", "dataset=./transforms", "-p", "pose_refinement=true"];
+    let training = project.object(&project.output_of("train-ss", &settings)[0]).join("training.json");
+    let training: Value = serde_json::from_slice(&std::fs::read(training).unwrap()).unwrap();
+    assert_eq!(training["poses"].as_array().unwrap().len(), 17);
+    let open = ["run", "-i", "dataset=./transforms", "-p", "pose_refinement=true", "-p", "background=alpha"];
+    project.run(&open).fails(2, &["parameter pose_refinement", "open background"]);
+}
+
 /// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor scored.
 #[test]
 fn what_masks_leave_out_is_not_learnt() {

@@ -6,12 +6,11 @@
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
 
-use std::path::PathBuf;
-
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use artifact::{Context, Failure, Input, Output, Stage};
+use fields::Members;
 use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
-use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Ray, RayField};
+use radiance::{Ray, RayField};
 use scene::{Background, Camera, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -56,8 +55,7 @@ impl Stage for RenderDepth {
     type Params = Params;
     const NAME: &'static str = "render-depth";
     const SUMMARY: &'static str = "Renders colour, opacity and depth of a field for a list of cameras.";
-    #[cfg(feature = "torch")]
-    const ENVIRONMENT: &'static [&'static str] = &[nets::TF32_VARIABLE];
+    const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras = ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
@@ -73,15 +71,14 @@ impl Stage for RenderDepth {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("field")?;
-        let file: FieldFile = input.read_json(FIELD_FILE)?;
-        let members = read_members(&file, input, &context.device)?;
+        let Members { file, fields } = Members::read(input, &context.device)?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
         let progress = context.progress("rendering", rows);
         let mut views = Vec::with_capacity(resized.len());
         for camera in resized {
-            let job = Job { context, params, members: &members, background: file.background, camera: &camera };
+            let job = Job { context, params, members: &fields, background: file.background, camera: &camera };
             job.render(&progress)?;
             let image = format!("images/{}.exr", camera.name);
             views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
@@ -90,51 +87,6 @@ impl Stage for RenderDepth {
         context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(file.background, cameras.bounds, views) })?;
         context.write_summary(&format!("{count} views, {:.1} M pixels", pixels_of(&cameras, params.size) as f64 / 1e6))
     }
-}
-
-/// All members of a field, whichever it is.
-fn read_members(file: &FieldFile, input: &GivenInput, device: &str) -> anyhow::Result<Vec<Box<dyn RayField>>> {
-    file.check().map_err(|reason| Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display())))?;
-    let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
-    match file.field {
-        FieldModel::Grid(architecture) => {
-            let read = |path: PathBuf| Field::read(&path, architecture, file.bounds).bad_input("field");
-            paths.map(|path| grid_on(device, read(path)?)).collect()
-        }
-        #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
-            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-            nets::deterministic();
-            let read = |path: PathBuf| torch_field::Mlp::read(&path, architecture, file.bounds, device).bad_input("field");
-            paths.map(|path| Ok(Box::new(read(path)?) as Box<dyn RayField>)).collect()
-        }
-        #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
-            let message = "field: mlp needs libtorch, and render-depth was built without it; build with --features torch";
-            Err(Failure::Usage(message.to_owned()).into())
-        }
-    }
-}
-
-/// A grid: on the CPU as it is, elsewhere through libtorch.
-#[cfg(feature = "torch")]
-fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
-    if device == "cpu" {
-        return Ok(Box::new(field));
-    }
-    let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
-    nets::deterministic();
-    Ok(Box::new(torch_field::TorchGrid::new(&field, device)?))
-}
-
-#[cfg(not(feature = "torch"))]
-fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
-    if device == "cpu" {
-        return Ok(Box::new(field));
-    }
-    let message =
-        format!("--device {device}: it needs libtorch, and render-depth was built without it; build with --features torch");
-    Err(Failure::Usage(message).into())
 }
 
 fn resize(camera: &Camera, width: Option<u32>) -> Camera {

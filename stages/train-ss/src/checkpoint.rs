@@ -46,6 +46,7 @@ impl Curve {
             samples_per_ray: self.samples as f64 / rays.max(1) as f64,
             curve: self.points,
             exposures: Vec::new(),
+            poses: Vec::new(),
         }
     }
 }

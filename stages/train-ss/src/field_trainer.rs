@@ -2,7 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::Failure;
-use radiance::{Field, FieldModel, StepReport, Trainer, TrainingError, TrainingOptions};
+use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
 use crate::{Params, Supersampling};
@@ -11,6 +11,8 @@ use crate::{Params, Supersampling};
 pub(crate) trait FieldTrainer {
     /// Takes a step; `None` once all rays are spent.
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>>;
+    /// The field as it is now.
+    fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>>;
     /// Steps taken.
     fn steps(&self) -> u64;
     /// Rays cast so far.
@@ -133,6 +135,10 @@ impl FieldTrainer for Trainer {
         })
     }
 
+    fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
+        Ok(Box::new(Self::field(self)))
+    }
+
     forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
@@ -152,6 +158,10 @@ fn write_grid(field: &Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
 impl FieldTrainer for torch_field::GridTrainer {
     fn step(&mut self, supervision: &mut Supersampling) -> anyhow::Result<Option<StepReport>> {
         Self::step(self, supervision).map_err(numerical)
+    }
+
+    fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
+        Ok(Box::new(Self::field(self)?))
     }
 
     forwarded!();
@@ -177,9 +187,13 @@ impl FieldTrainer for torch_field::MlpTrainer {
         Self::step(self, supervision).map_err(numerical)
     }
 
+    fn field(&self) -> anyhow::Result<Box<dyn RayField + '_>> {
+        Ok(Box::new(Self::field(self)))
+    }
+
     forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        self.field().write(weights).context("cannot write the field")
+        Self::field(&self).write(weights).context("cannot write the field")
     }
 }

@@ -13,6 +13,7 @@ mod exposure;
 mod field_trainer;
 mod member;
 mod memory;
+mod moving_cameras;
 mod params;
 mod supervision;
 
@@ -44,6 +45,10 @@ pub struct TrainingLog {
     /// for; of the first member.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exposures: Vec<[f32; 3]>,
+    /// Where each training view was found to be taken from, `camera_to_world` in the order of `views.json`, where that was asked for; of the first
+    /// member.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub poses: Vec<[[f64; 4]; 3]>,
 }
 
 impl TrainingLog {
@@ -51,8 +56,8 @@ impl TrainingLog {
     fn add(&mut self, next: TrainingLog) {
         let samples = self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
         let before = self.rays;
-        if self.exposures.is_empty() {
-            self.exposures = next.exposures;
+        if self.steps == 0 {
+            (self.exposures, self.poses) = (next.exposures, next.poses);
         }
         self.curve.extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
         self.steps += next.steps;
@@ -181,6 +186,10 @@ pub fn supervision(
             "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
         return Err(Failure::Usage(message.to_owned()).into());
     }
+    if params.pose_refinement && is_open {
+        let message = "parameter pose_refinement: photographs with an open background can't be compared with renderings; choose prep.background white or opaque";
+        return Err(Failure::Usage(message.to_owned()).into());
+    }
     if params.exposure && is_open {
         let message =
             "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
@@ -195,6 +204,7 @@ pub fn supervision(
         crop_groups: params.crop_groups(((params.supersample - 1e-6).ceil() as u64).pow(2)),
         detail: params.detail(),
         exposure: params.exposure,
+        pose_refinement: params.pose_refinement,
         seed: params.seed,
     };
     Ok(Supersampling::new(views, photographs, &options))

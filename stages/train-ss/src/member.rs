@@ -102,12 +102,14 @@ impl<'a> Member<'a> {
                 ));
             }
             let rays = trainer.rays_done();
+            supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
             progress.set(self.before + rays, &curve.note());
             checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
         }
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         log.exposures = supervision.exposures().to_vec();
+        log.poses = supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
         trainer.finish(&self.output)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;

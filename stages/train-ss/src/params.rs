@@ -26,6 +26,10 @@ pub struct Params {
     /// Whether to find, while training, how bright each photograph is against the others (a factor for red, green and blue), for pictures
     /// taken with several exposures or white balances. Views come out in the mean exposure.
     pub exposure: bool,
+    /// Whether to move cameras, while training, to where the field's renderings meet their photographs best, for poses that aren't exact. What all
+    /// cameras share stays; with several `members` each finds its own. Test views are then better rendered from where `nerf-sr run located` finds
+    /// them to be taken from.
+    pub pose_refinement: bool,
     /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.
     pub order: Option<Order>,
     /// How many times as often a pixel with detail around it is drawn as a flat one, in random order. What a pixel teaches weighs less by
@@ -127,6 +131,7 @@ impl Default for Params {
             coarse: None,
             supervision: None,
             exposure: false,
+            pose_refinement: false,
             order: None,
             detail: None,
             crop_steps: None,

@@ -3,13 +3,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use pixels::{Filter, Picture, Resampling};
-use radiance::{Draws, Ray};
-use scene::{Background, Photograph, Views};
+use radiance::{Draws, Ray, RayField};
+use scene::{Background, Camera, Photograph, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::exposure::Exposures;
 use crate::memory::{Kernel, Memory};
+use crate::moving_cameras::MovingCameras;
 
 /// What an LR pixel is compared with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -54,6 +55,7 @@ pub struct Supersampling {
     seed: u64,
     memory: Option<Memory>,
     exposures: Option<Exposures>,
+    moving: Option<MovingCameras>,
 }
 
 /// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
@@ -120,6 +122,23 @@ struct TrainingView {
     down: [f64; 3],
 }
 
+impl TrainingView {
+    fn new(picture: Picture, before: u64, camera: &Camera) -> Self {
+        let mut view = Self { picture, before, origin: [0.0; 3], corner: [0.0; 3], right: [0.0; 3], down: [0.0; 3] };
+        view.place(camera);
+        view
+    }
+
+    /// Has its rays cast from where a camera is.
+    fn place(&mut self, camera: &Camera) {
+        let (k, r) = (camera.intrinsics, camera.rotation());
+        self.origin = camera.centre().as_vec3().to_array();
+        self.corner = (r * glam::DVec3::new(-k.cx / k.fx, k.cy / k.fy, -1.0)).to_array();
+        self.right = (r.x_axis / k.fx).to_array();
+        self.down = (-r.y_axis / k.fy).to_array();
+    }
+}
+
 /// How to supersample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SupersamplingOptions {
@@ -139,6 +158,8 @@ pub struct SupersamplingOptions {
     pub detail: f64,
     /// Whether to find each photograph's exposure.
     pub exposure: bool,
+    /// Whether to move cameras to where photographs are met best.
+    pub pose_refinement: bool,
     /// Seed of what is drawn.
     pub seed: u64,
 }
@@ -194,27 +215,17 @@ impl Supersampling {
                 with_detail.extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
             }
             // What the kernel needs to know of pixels around them stays: what was photographed, since it blurred into its neighbours.
-            for (i, pixel) in picture.data.chunks_exact_mut(picture.channels).enumerate() {
-                if !counts(&i) {
-                    pixel.fill(f32::NAN);
-                }
-            }
+            let picture = Photograph { picture, mask }.known();
             pixels += (picture.width * picture.height) as u64;
-            let (k, r) = (view.camera.intrinsics, view.camera.rotation());
-            let corner = r * glam::DVec3::new(-k.cx / k.fx, k.cy / k.fy, -1.0);
-            ready.push(TrainingView {
-                picture,
-                before,
-                origin: view.camera.centre().as_vec3().to_array(),
-                corner: corner.to_array(),
-                right: (r.x_axis / k.fx).to_array(),
-                down: (-r.y_axis / k.fy).to_array(),
-            });
+            ready.push(TrainingView::new(picture, before, &view.camera));
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
         let (background, focus) = (views.background, Focus::new(detail, pixels, with_detail));
         let exposures = exposure.then(|| Exposures::new(ready.len()));
-        Self { views: ready, pixels, background, full, side: full, coarse, order, crop_groups, focus, seed, memory, exposures }
+        let cameras = || views.views.iter().map(|view| view.camera.clone()).collect();
+        let moving = options.pose_refinement.then(|| MovingCameras::new(cameras(), ready.iter().map(|view| &view.picture)));
+        let side = full;
+        Self { views: ready, pixels, background, full, side, coarse, order, crop_groups, focus, seed, memory, exposures, moving }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -227,22 +238,61 @@ impl Supersampling {
         self.memory.as_ref().filter(|_| self.side == self.full)
     }
 
-    /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, and what exposures follow from.
+    /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
     pub(crate) fn kept(&self) -> impl Iterator<Item = Cow<'_, [u8]>> {
         let renders = self.memory.iter().flat_map(Memory::parts).map(Cow::Borrowed);
-        renders.chain(self.exposures.iter().map(|e| Cow::Owned(e.bytes())))
+        let exposures = self.exposures.iter().map(|e| Cow::Owned(e.bytes()));
+        renders.chain(exposures).chain(self.moving.iter().map(|m| Cow::Owned(m.bytes())))
     }
 
-    /// Bytes of that.
+    /// Bytes of each of the three.
+    fn kept_lengths(&self) -> [usize; 3] {
+        [
+            self.memory.as_ref().map_or(0, Memory::len),
+            self.exposures.as_ref().map_or(0, Exposures::len),
+            self.moving.as_ref().map_or(0, MovingCameras::len),
+        ]
+    }
+
+    /// Bytes of all that.
     pub(crate) fn kept_len(&self) -> usize {
-        self.memory.as_ref().map_or(0, Memory::len) + self.exposures.as_ref().map_or(0, Exposures::len)
+        self.kept_lengths().iter().sum()
     }
 
     /// Restores what was kept, [`Supersampling::kept_len`] bytes.
     pub(crate) fn restore(&mut self, kept: &[u8]) {
-        let (renders, sums) = kept.split_at(self.memory.as_ref().map_or(0, Memory::len));
+        let [renders, sums, _] = self.kept_lengths();
+        let (renders, rest) = kept.split_at(renders);
+        let (sums, poses) = rest.split_at(sums);
         self.memory.iter_mut().for_each(|memory| memory.restore(renders));
         self.exposures.iter_mut().for_each(|exposures| exposures.restore(sums));
+        self.moving.iter_mut().for_each(|moving| moving.restore(poses));
+        self.place_views();
+    }
+
+    /// Moves cameras, where that was asked for and it is time for it, to where the field's renderings meet their photographs best. `field` is
+    /// only made when it is.
+    pub(crate) fn refine_poses<'a>(
+        &mut self,
+        done: f64,
+        field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
+    ) -> anyhow::Result<()> {
+        let Some(moving) = self.moving.as_mut().filter(|moving| moving.are_due(done)) else { return Ok(()) };
+        let exposure = |view: usize| self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(view).map(f32::recip));
+        moving.step(&*field()?, done, self.background.shown(), exposure).map_err(|e| anyhow::anyhow!(e))?;
+        self.place_views();
+        Ok(())
+    }
+
+    /// Has rays cast from where cameras have moved to.
+    fn place_views(&mut self) {
+        let cameras = self.moving.iter().flat_map(MovingCameras::cameras);
+        self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.place(camera));
+    }
+
+    /// Where the photographs were taken from, where that was asked for.
+    pub fn refined_cameras(&self) -> &[Camera] {
+        self.moving.as_ref().map_or(&[], MovingCameras::cameras)
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
@@ -444,6 +494,7 @@ mod tests {
             crop_groups: 0,
             detail: 1.0,
             exposure: false,
+            pose_refinement: false,
             seed: 9,
         }
     }
@@ -643,7 +694,7 @@ mod tests {
     fn masked_pixels_say_nothing() {
         for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
             let (plain, camera) = example(kind, [2.0, 2.0], None);
-            let mask = Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
+            let mask = pixels::Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
             let picture = Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
             let photograph = Photograph { picture, mask: Some(mask) };

@@ -130,6 +130,12 @@ pub trait RayField {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>>;
 }
 
+impl<F: RayField + ?Sized> RayField for &F {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
+        (**self).render(rays)
+    }
+}
+
 impl RayField for Field {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
         Ok(Self::render(self, rays))

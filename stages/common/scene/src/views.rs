@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 
 use artifact::relative_path;
-use pixels::{Mask, Picture, PixelError, read_premultiplied};
+use pixels::{Mask, Picture, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -62,6 +62,15 @@ impl View {
         Ok(Some(Photograph { picture, mask }))
     }
 
+    /// The same at low resolution; a pixel of it counts where all that lies under it does.
+    pub fn read_low_resolution(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+        let Some(file) = &self.low_resolution else { return Ok(None) };
+        let picture = read_premultiplied(&input.path(file))?;
+        let mask = self.mask.as_ref().map(|file| read_png(&input.path(file))).transpose()?;
+        let mask = mask.map(|image| Mask::of(&image).resized((picture.width, picture.height), 0));
+        Ok(Some(Photograph { picture, mask }))
+    }
+
     /// Which pixels of its picture, of that size, count; none where all do.
     pub fn read_mask(&self, input: &artifact::GivenInput, size: (usize, usize)) -> Result<Option<Mask>, PixelError> {
         self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
@@ -82,6 +91,18 @@ impl Photograph {
     #[must_use]
     pub fn over(self, background: f32) -> Self {
         Self { picture: self.picture.over(background), ..self }
+    }
+
+    /// The picture, NaN where it doesn't count.
+    pub fn known(self) -> Picture {
+        let mut picture = self.picture;
+        let counts = self.mask.iter().flat_map(|mask| &mask.counts);
+        for (pixel, counts) in picture.data.chunks_exact_mut(picture.channels).zip(counts) {
+            if !counts {
+                pixel.fill(f32::NAN);
+            }
+        }
+        picture
     }
 }
 

@@ -1,0 +1,328 @@
+//! Pose refinement: moves cameras until what a field renders meets their photographs.
+//!
+//! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
+//! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
+//! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
+//!
+//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the picture, and the rendered depth how
+//! that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a step takes one rendering
+//! of some thousand pixels, and any field will do that renders colour and depth: nothing is differentiated but photographs.
+//!
+//! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up, looking along -z).
+//!
+//! ```
+//! use poses::{Pyramid, Refinement, refine};
+//! use pixels::Picture;
+//! use radiance::{Architecture, Field};
+//! use scene::{Bounds, Camera, Intrinsics};
+//! let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Default::default() };
+//! let field = Field::new(Architecture::default(), bounds, 7);
+//! let intrinsics = Intrinsics::from_angle_x(16, 16, 0.69);
+//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
+//! let photograph = Picture::new(16, 16, 3, vec![0.5; 16 * 16 * 3]);
+//! let pyramid = Pyramid::new(&photograph, 2);
+//! let Refinement { camera: found, before, after } = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
+//! // A grey wall says nothing of where it was seen from.
+//! assert!(found == camera && before == after);
+//! ```
+
+use std::error::Error;
+
+use glam::{DMat3, DQuat, DVec3};
+use nalgebra::{Matrix6, Vector6};
+use pixels::{Filter, Picture, Resampling};
+use radiance::{Ray, RayField};
+use scene::Camera;
+
+/// A photograph at several sizes.
+#[derive(Clone, Debug)]
+pub struct Pyramid {
+    levels: Vec<Level>,
+}
+
+#[derive(Clone, Debug)]
+struct Level {
+    width: usize,
+    height: usize,
+    telling: Vec<Telling>,
+}
+
+/// A pixel that says where it was taken from.
+#[derive(Clone, Copy, Debug)]
+struct Telling {
+    x: usize,
+    y: usize,
+    colour: [f32; 3],
+    /// Change of each channel a pixel to the right, and a pixel down.
+    gradient: [[f32; 2]; 3],
+}
+
+/// Smaller levels have too little to go by.
+const SMALLEST: usize = 12;
+/// At most so many pixels of a level are rendered, spread over all that tell something.
+const MOST: usize = 4096;
+/// Fewer say nothing.
+const LEAST: usize = 24;
+/// A pixel tells something where a channel changes by more, from a pixel to the next.
+const STEEP: f32 = 3.0 / 255.0;
+
+impl Pyramid {
+    /// Of an RGB picture over its background; NaN where nothing is known. Each level has half the width of the one before it; there are at most
+    /// `smaller` below the picture itself.
+    ///
+    /// # Panics
+    /// When the picture has other than three channels.
+    pub fn new(photograph: &Picture, smaller: u32) -> Self {
+        assert_eq!(photograph.channels, 3, "a photograph over its background");
+        let size = |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
+        let is_large = |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= SMALLEST);
+        let level = |level: u32| {
+            let [width, height] = size(level);
+            let shrink = Resampling::new(Filter::Box, (photograph.width, photograph.height), (width, height));
+            Level::new(&shrink.apply(photograph))
+        };
+        Self { levels: (0..=smaller).take_while(is_large).map(level).collect() }
+    }
+
+    /// How many levels lie below the picture itself.
+    pub fn smaller(&self) -> u32 {
+        self.levels.len() as u32 - 1
+    }
+}
+
+impl Level {
+    fn new(picture: &Picture) -> Self {
+        let (width, height) = (picture.width, picture.height);
+        let colour = |x: usize, y: usize| [0, 1, 2].map(|c| picture.data[(y * width + x) * 3 + c]);
+        let inner = |n: usize| 1..n.saturating_sub(1);
+        let telling = |(x, y): (usize, usize)| {
+            let [left, right, up, down] = [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
+            let gradient = [0, 1, 2].map(|c| [0.5 * (right[c] - left[c]), 0.5 * (down[c] - up[c])]);
+            let pixel = Telling { x, y, colour: colour(x, y), gradient };
+            let numbers = gradient.as_flattened();
+            let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
+            (is_known && numbers.iter().any(|g| g.abs() > STEEP)).then_some(pixel)
+        };
+        let all: Vec<Telling> = inner(height).flat_map(|y| inner(width).map(move |x| (x, y))).filter_map(telling).collect();
+        let every = all.len().div_ceil(MOST).max(1);
+        Self { width, height, telling: all.into_iter().step_by(every).collect() }
+    }
+}
+
+/// How to refine.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// Renderings at most: one to begin with, and one for each step tried.
+    pub renderings: u32,
+    /// What is behind the scene.
+    pub background: f32,
+    /// What the photograph's channels are multiplied by to have the field's exposure.
+    pub exposure: [f32; 3],
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self { renderings: 6, background: 1.0, exposure: [1.0; 3] }
+    }
+}
+
+/// A camera that was moved.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Refinement {
+    /// Where it is now.
+    pub camera: Camera,
+    /// Mean robust error of the pixels looked at, where it was: Huber's, of colours.
+    pub before: f64,
+    /// The same where it is.
+    pub after: f64,
+}
+
+/// Moves a camera, whose intrinsics have any size, to where a pyramid's level is met best. It stays where that says too little, and never ends
+/// where it is met worse.
+pub fn refine(
+    field: &dyn RayField,
+    camera: &Camera,
+    pyramid: &Pyramid,
+    level: u32,
+    options: &Options,
+) -> Result<Refinement, Box<dyn Error + Send + Sync>> {
+    let level = &pyramid.levels[(level as usize).min(pyramid.levels.len() - 1)];
+    let start = Equations::of(field, camera, level, options)?;
+    let before = start.error;
+    let (mut best, mut equations, mut damping) = (camera.clone(), start, DAMPING);
+    for _ in 1..options.renderings {
+        let Some(motion) = equations.solve(damping) else { break };
+        let moved = motion.applied_to(&best);
+        let there = Equations::of(field, &moved, level, options)?;
+        if there.error < equations.error {
+            (best, equations, damping) = (moved, there, damping / 4.0);
+        } else {
+            damping *= 16.0;
+        }
+    }
+    Ok(Refinement { camera: best, before, after: equations.error })
+}
+
+/// Damping of the first step, as a share of the equations' own diagonal.
+const DAMPING: f64 = 1e-3;
+/// Errors of colours beyond this are outliers: what moved, or was never learnt.
+const HUBER: f64 = 0.1;
+/// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to pull from both sides: their inner halves
+/// alone would make everything too large, and cameras back away.
+const THIN: f32 = 0.02;
+
+/// Least squares for a small motion of the camera, linear about where it is.
+struct Equations {
+    matrix: Matrix6<f64>,
+    right: Vector6<f64>,
+    /// Unit of translation: the middle distance of what is seen, so that turning and moving weigh alike.
+    unit: f64,
+    error: f64,
+    pixels: usize,
+}
+
+impl Equations {
+    fn of(field: &dyn RayField, camera: &Camera, level: &Level, options: &Options) -> Result<Self, Box<dyn Error + Send + Sync>> {
+        let camera = camera.resized(level.width as u32, level.height as u32);
+        let cast = |pixel: &Telling| camera.ray(pixel.x as f64 + 0.5, pixel.y as f64 + 0.5);
+        let rays: Vec<Ray> = level
+            .telling
+            .iter()
+            .map(|pixel| {
+                let ray = cast(pixel);
+                let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
+                Ray { origin, direction, background: [options.background; 3] }
+            })
+            .collect();
+        let rendered = field.render(&rays)?;
+        let depths: Vec<Option<f64>> = (level.telling.iter().zip(&rendered))
+            .map(|(pixel, seen)| {
+                let distance = if seen.opacity > 0.5 { seen.median_depth } else { seen.depth };
+                let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel));
+                (seen.opacity > THIN && depth.is_finite() && depth > 0.0).then_some(depth)
+            })
+            .collect();
+        let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();
+        sorted.sort_unstable_by(f64::total_cmp);
+        let unit = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
+        let mut sums = Self { matrix: Matrix6::zeros(), right: Vector6::zeros(), unit, error: 0.0, pixels: 0 };
+        for ((pixel, seen), depth) in level.telling.iter().zip(&rendered).zip(&depths) {
+            let errors = [0, 1, 2].map(|c| f64::from(pixel.colour[c] * options.exposure[c] - seen.colour[c]));
+            sums.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
+            let Some(depth) = *depth else { continue };
+            sums.pixels += 1;
+            let motion = image_motion(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], depth, unit);
+            for (c, error) in errors.into_iter().enumerate() {
+                let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
+                // What is seen would have to move by the opposite of the error over the gradient.
+                let row = -(motion[0] * right + motion[1] * down);
+                let weight = if error.abs() > HUBER { HUBER / error.abs() } else { 1.0 };
+                sums.matrix += weight * row * row.transpose();
+                sums.right += weight * error * row;
+            }
+        }
+        sums.error /= (3 * level.telling.len()).max(1) as f64;
+        Ok(sums)
+    }
+
+    /// The motion that they ask for; none where they say too little.
+    fn solve(&self, damping: f64) -> Option<Motion> {
+        if self.pixels < LEAST || !self.error.is_finite() {
+            return None;
+        }
+        let mut matrix = self.matrix;
+        let floor = 1e-9 * matrix.trace();
+        (0..6).for_each(|i| matrix[(i, i)] += damping.mul_add(self.matrix[(i, i)], floor));
+        let motion = matrix.cholesky()?.solve(&self.right);
+        let motion = Motion {
+            turn: DVec3::new(motion[0], motion[1], motion[2]),
+            shift: self.unit * DVec3::new(motion[3], motion[4], motion[5]),
+        };
+        (motion.turn.is_finite() && motion.shift.is_finite()).then_some(motion)
+    }
+}
+
+fn huber(error: f64) -> f64 {
+    let size = error.abs();
+    if size > HUBER { HUBER * (2.0 * size - HUBER) } else { size * size }
+}
+
+/// How far what is seen at an image position moves to the right and down when the camera turns about its axes and shifts along them, by a radian
+/// and by so many scene units.
+fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [Vector6<f64>; 2] {
+    let k = &camera.intrinsics;
+    let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
+    let place = depth * DVec3::new(x, y, -1.0);
+    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    // In camera space a point goes the other way: by place × turn, and by -shift.
+    let moves = axes.map(|axis| place.cross(axis)).into_iter().chain(axes.map(|axis| -unit * axis));
+    let (mut right, mut down) = (Vector6::zeros(), Vector6::zeros());
+    for (i, by) in moves.enumerate() {
+        right[i] = k.fx * (by.x + x * by.z) / depth;
+        down[i] = -k.fy * (by.y + y * by.z) / depth;
+    }
+    [right, down]
+}
+
+/// A motion of a camera in its own axes.
+#[derive(Clone, Copy, Debug)]
+struct Motion {
+    /// Axis times angle.
+    turn: DVec3,
+    shift: DVec3,
+}
+
+impl Motion {
+    fn applied_to(&self, camera: &Camera) -> Camera {
+        let turned = rotation(camera) * DQuat::from_scaled_axis(self.turn);
+        placed(camera, turned, camera.centre() + camera.rotation() * self.shift)
+    }
+}
+
+fn rotation(camera: &Camera) -> DQuat {
+    DQuat::from_mat3(&camera.rotation()).normalize()
+}
+
+/// The camera with another pose.
+fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
+    let r = DMat3::from_quat(rotation.normalize());
+    let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
+    Camera { camera_to_world: [row(0), row(1), row(2)], ..camera.clone() }
+}
+
+/// How far one camera is from another.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Apart {
+    /// Angle between the two, in radians.
+    pub angle: f64,
+    /// Distance between their centres, in scene units.
+    pub distance: f64,
+}
+
+/// How far two cameras are apart.
+pub fn apart(a: &Camera, b: &Camera) -> Apart {
+    Apart { angle: rotation(a).angle_between(rotation(b)), distance: a.centre().distance(b.centre()) }
+}
+
+/// Moves all cameras back together so that in the mean they have neither turned nor shifted nor spread from where they were: a motion that all
+/// share could as well be the scene's, which would leave its bounds, and test views would miss it.
+pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
+    let share = 1.0 / cameras.len().max(1) as f64;
+    let turns = cameras.iter().zip(were).map(|(camera, was)| {
+        let turn = rotation(camera) * rotation(was).inverse();
+        // The shorter way round.
+        (if turn.w < 0.0 { -turn } else { turn }).to_scaled_axis()
+    });
+    let back = DQuat::from_scaled_axis(-share * turns.sum::<DVec3>());
+    let middle = |cameras: &[Camera]| share * cameras.iter().map(Camera::centre).sum::<DVec3>();
+    let spread = |cameras: &[Camera], middle: DVec3| cameras.iter().map(|c| c.centre().distance_squared(middle)).sum::<f64>();
+    let (now, before) = (middle(cameras), middle(were));
+    let (wide, was_wide) = (spread(cameras, now), spread(were, before));
+    let narrower = if wide > 0.0 && was_wide > 0.0 { (was_wide / wide).sqrt() } else { 1.0 };
+    for camera in cameras {
+        *camera = placed(camera, back * rotation(camera), before + narrower * (back * (camera.centre() - now)));
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,120 @@
+use pixels::Picture;
+use poses::{Options, Pyramid, refine, take_back_common_motion};
+use radiance::RayField;
+use scene::Camera;
+
+/// Cameras that move while the field learns, so that it renders what their photographs show.
+#[derive(Debug)]
+pub(crate) struct MovingCameras {
+    were: Vec<Camera>,
+    now: Vec<Camera>,
+    photographs: Vec<Pyramid>,
+    /// Rounds taken; in each every camera is moved.
+    rounds: u32,
+}
+
+/// Rounds of a training.
+const ROUNDS: u32 = 24;
+/// Shares of the training at the first and after the last round. It begins early, before the field has explained photographs that don't fit
+/// by haze, and ends before weights are averaged.
+const FIRST: f64 = 0.02;
+const LAST: f64 = 0.7;
+/// Share at which photographs are compared at their own size; before it at smaller ones, since a field that isn't sharp yet pulls from afar.
+const OWN_SIZE: f64 = 0.4;
+/// Renderings of a camera in a round.
+const RENDERINGS: u32 = 3;
+/// Halvings of the photographs' size to begin with.
+const SMALLER: u32 = 3;
+
+impl MovingCameras {
+    /// Cameras, and their RGB photographs, NaN where nothing is known.
+    pub(crate) fn new<'a>(cameras: Vec<Camera>, photographs: impl Iterator<Item = &'a Picture>) -> Self {
+        let photographs = photographs.map(|picture| Pyramid::new(picture, SMALLER)).collect();
+        Self { were: cameras.clone(), now: cameras, photographs, rounds: 0 }
+    }
+
+    /// Where they are now.
+    pub(crate) fn cameras(&self) -> &[Camera] {
+        &self.now
+    }
+
+    /// Whether it is time for a round, with such a share of the training done.
+    pub(crate) fn are_due(&self, done: f64) -> bool {
+        self.rounds < ROUNDS && done >= FIRST + (LAST - FIRST) * f64::from(self.rounds) / f64::from(ROUNDS)
+    }
+
+    /// Moves every camera; `exposure` has what the field's colours are to a photograph's.
+    pub(crate) fn step(
+        &mut self,
+        field: &dyn RayField,
+        done: f64,
+        background: f32,
+        exposure: impl Fn(usize) -> [f32; 3],
+    ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+        for (i, (camera, photograph)) in self.now.iter_mut().zip(&self.photographs).enumerate() {
+            let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE);
+            let options = Options { renderings: RENDERINGS, background, exposure: exposure(i) };
+            *camera = refine(field, camera, photograph, smaller.max(0.0).ceil() as u32, &options)?.camera;
+        }
+        take_back_common_motion(&mut self.now, &self.were);
+        self.rounds += 1;
+        Ok(())
+    }
+
+    /// All that a resumed training needs.
+    pub(crate) fn bytes(&self) -> Vec<u8> {
+        let poses = self.now.iter().flat_map(|camera| camera.camera_to_world.into_iter().flatten());
+        self.rounds.to_le_bytes().into_iter().chain(poses.flat_map(f64::to_le_bytes)).collect()
+    }
+
+    /// Length of that.
+    pub(crate) fn len(&self) -> usize {
+        4 + 12 * 8 * self.now.len()
+    }
+
+    /// Restores what [`MovingCameras::bytes`] gave.
+    pub(crate) fn restore(&mut self, bytes: &[u8]) {
+        let Some((rounds, poses)) = bytes.split_first_chunk::<4>() else { return };
+        self.rounds = u32::from_le_bytes(*rounds);
+        let numbers = poses.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b));
+        let places = self.now.iter_mut().flat_map(|camera| camera.camera_to_world.as_flattened_mut());
+        places.zip(numbers).for_each(|(place, number)| *place = number);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use radiance::{Architecture, Field};
+    use scene::{Bounds, Intrinsics};
+
+    /// Rounds come at their times, each once, and a checkpoint knows how many there were and where they led.
+    #[test]
+    fn rounds_are_counted_and_kept() {
+        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let field = Field::new(Architecture { finest: 32, levels: 4, log2_entries: 10, ..Architecture::default() }, bounds, 3);
+        let intrinsics = Intrinsics::from_angle_x(24, 24, 0.69);
+        let camera = |x: f64| Camera {
+            name: format!("at {x}"),
+            intrinsics,
+            camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
+        };
+        let picture = Picture::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
+        let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], [&picture, &picture].into_iter());
+        let mut moving = new();
+        assert!(!moving.are_due(0.01) && moving.are_due(0.02));
+        moving.step(&field, 0.02, 1.0, |_| [1.0; 3]).unwrap();
+        assert!(!moving.are_due(0.02) && moving.are_due(0.05));
+        let mut count = 1;
+        while moving.are_due(1.0) {
+            (moving.rounds, count) = (moving.rounds + 1, count + 1);
+        }
+        assert_eq!(count, ROUNDS);
+        moving.now[1].camera_to_world[2][3] = 4.25;
+        let mut other = new();
+        let bytes = moving.bytes();
+        assert_eq!(bytes.len(), other.len());
+        other.restore(&bytes);
+        assert_eq!((other.rounds, &other.now), (moving.rounds, &moving.now));
+    }
+}
