@@ -76,9 +76,9 @@ sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE
 SCENES ?= lego chair
 PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
-quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" OUT=FILE
+quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" SET="seed=1" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) $(if $(RAYS),--set rays=$(RAYS)) \
+	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --set $(if $(RAYS),rays=$(RAYS)) $(SET) \
 	  --out $(or $(OUT),out/quality.json)
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
@@ -87,8 +87,10 @@ table: build ## The paper's tables with every method: make table SCENES="lego" P
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(RAYS),--rays $(RAYS)) --kernel $(firstword $(KERNEL)) --out $(or $(OUT),out/table.md)
 
 REFERENCES ?= 1
+# Unless given: photographs, which references are for.
+given = $(if $(filter file,$(origin $(1))),$(2),$($(1)))
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
-	@python3 scripts/refine-table.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --references $(REFERENCES) \
+	@python3 scripts/refine-table.py --data $(DATA) --scenes $(call given,SCENES,fern) --protocols $(call given,PROTOCOLS,252x2 252x4) --references $(REFERENCES) \
 	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
 
 ablation: build ## What each part brings and costs, on withheld training views

@@ -21,7 +21,7 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
 use pixels::{DEGRADATION_FILE, Degradation, Filter};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
-use scene::{Photograph, Space, Views};
+use scene::{Intrinsics, Photograph, Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -76,16 +76,16 @@ pub struct CurvePoint {
     pub psnr: f64,
 }
 
-/// LR pixels across the field's cube, as the first view sees it.
+/// LR pixels across the field's cube, as the finest view sees it.
 fn pixels_across(views: &Views) -> f64 {
-    let k = &views.views[0].camera.intrinsics;
-    match views.bounds.space {
+    let across = |k: Intrinsics| match views.bounds.space {
         // The cube is about what a view sees.
         Space::Box => f64::from(k.width),
         Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
         // Half of it is, and the shell around it.
         Space::Contraction => 2.0 * f64::from(k.width),
-    }
+    };
+    views.views.iter().map(|view| across(view.camera.intrinsics)).fold(0.0, f64::max)
 }
 
 /// The stage.

@@ -4,13 +4,10 @@ use std::path::Path;
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
-use pixels::{Mask, PixelError, Rgba8, read_exr, sample_cubic, srgb_from_linear, to_u8};
+use pixels::{MAX_PIXELS, Mask, PixelError, Rgba8, exr_size, read_exr, sample_cubic, srgb_from_linear, to_u8};
 use scene::Intrinsics;
 
 use crate::{DatasetError, Frame, Lens};
-
-/// More pixels than any photograph has.
-const MAX_PIXELS: u64 = 1 << 28;
 
 /// Whether a file's name is that of a picture.
 pub(crate) fn is_picture(path: &Path) -> bool {
@@ -27,7 +24,7 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
     let io = |source| PixelError::Io { path: path.to_path_buf(), source };
     let mut reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(io)?;
     let mut limits = Limits::default();
-    limits.max_alloc = Some(8 * MAX_PIXELS);
+    limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg) => Ok(reader),
@@ -48,12 +45,12 @@ pub(crate) struct Stored {
 pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
-        let image = read_exr(path)?;
-        return Ok(Stored { size: (image.width as u32, image.height as u32), is_sideways: false });
+        let (width, height) = exr_size(path)?;
+        return Ok(Stored { size: (width as u32, height as u32), is_sideways: false });
     }
     let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
     let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > MAX_PIXELS || width == 0 || height == 0 {
+    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 || width == 0 || height == 0 {
         return Err(format(format!("{width}×{height} pixels")));
     }
     Ok(Stored { size: (width, height), is_sideways: decoder.orientation().is_ok_and(is_sideways) })

@@ -160,14 +160,28 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
     data
 }
 
+/// A file, and what is wrong with it.
+fn format(path: &Path, reason: &str) -> PixelError {
+    PixelError::Format { path: path.to_path_buf(), reason: reason.to_owned() }
+}
+
+fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
+    File::open(path).map(BufReader::new).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
+}
+
+/// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any view has is refused.
+pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
+    let meta = exr::meta::MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
+    if meta.headers.iter().any(|h| h.layer_size.area() > MAX_PIXELS) {
+        return Err(format(path, "its header asks for more pixels than any view has"));
+    }
+    let first = meta.headers.first().ok_or_else(|| format(path, "it has no layer"))?;
+    Ok((first.layer_size.width(), first.layer_size.height()))
+}
+
 /// Reads every channel of the first layer as f32.
 pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
-    let open = || File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source });
-    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
-    let meta = exr::meta::MetaData::read_from_buffered(BufReader::new(open()?), false).map_err(|e| exr_error(path, e))?;
-    if meta.headers.iter().any(|h| h.layer_size.area() > MAX_PIXELS) {
-        return Err(format("its header asks for more pixels than any view has".to_owned()));
-    }
+    exr_size(path)?;
     let image = exr::prelude::read()
         .no_deep_data()
         .largest_resolution_level()
@@ -175,9 +189,9 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .all_layers()
         .all_attributes()
         .non_parallel()
-        .from_buffered(BufReader::new(open()?))
+        .from_buffered(open(path)?)
         .map_err(|e| exr_error(path, e))?;
-    let layer = image.layer_data.into_iter().next().ok_or_else(|| format("it has no layer".to_owned()))?;
+    let layer = image.layer_data.into_iter().next().ok_or_else(|| format(path, "it has no layer"))?;
     let (width, height) = (layer.size.width(), layer.size.height());
     let channels =
         layer.channel_data.list.into_iter().map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect())).collect();
@@ -226,6 +240,7 @@ mod tests {
             write(&path, width, height);
             let image = read_exr(&path).unwrap();
             assert_eq!((image.width, image.height), (width, height));
+            assert_eq!(exr_size(&path).unwrap(), (width, height));
             let names: Vec<_> = image.channels.iter().map(|(n, _)| n.as_str()).collect();
             assert_eq!(names, ["A", "R", "Z"]);
             for (c, name) in ["R", "A", "Z"].into_iter().enumerate() {

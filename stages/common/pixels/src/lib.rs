@@ -34,7 +34,7 @@ mod srgb;
 
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
-pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr};
+pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr};
 pub use heat::{Palette, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
 pub use mask::Mask;
@@ -82,5 +82,5 @@ pub enum PixelError {
     },
 }
 
-/// More pixels than any view has; a header that says so is damaged or hostile.
-const MAX_PIXELS: usize = 1 << 28;
+/// More pixels than any picture has; a header that says so is damaged or hostile.
+pub const MAX_PIXELS: usize = 1 << 28;
