@@ -21,6 +21,7 @@ import argparse
 import csv
 import html
 import json
+import math
 import pathlib
 
 import cells
@@ -54,10 +55,10 @@ PAPER = {
 }
 # Where the paper's values of single scenes are known: SS at 200x4.
 PAPER_SCENES = {("lego", "200x4"): 29.13, ("chair", "200x4"): 30.16}
-# LPIPS's networks; `--set eval.lpips=alex` chooses another.
+# LPIPS's networks; each needs its heads, too.
 LPIPS = {"squeeze": "squeezenet1_1.safetensors", "alex": "alexnet.safetensors", "vgg": "vgg16.safetensors"}
-# Sub-rays of a pixel in our supersampling.
-SUB_RAYS = 4
+# All that eval may give; the first three stand in the main table.
+METRICS = ["psnr", "ssim", "lpips", "ssim_valid", "lpips_alex", "lpips_vgg"]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_synthetic/SCENE (or SCENE) and weights")
@@ -79,7 +80,7 @@ options = parser.parse_args()
 weights = options.weights or options.data / "weights"
 
 
-def blocks(method: str, protocol: str, rays: int) -> dict:
+def blocks(method: str, protocol: str, rays: int, sub_rays: int) -> dict:
     """The pipeline's blocks that a method needs besides those of pipeline.yaml; eval-METHOD scores it."""
     lr, scale = protocol.split("x")
     plain = {"supersample": 1, "supervision": "average"}
@@ -97,7 +98,7 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
     if method == "nerf":
         return field(method, plain)
     if method == "nerf-epochs":
-        return field(method, plain | {"rays": rays // SUB_RAYS})
+        return field(method, plain | {"rays": rays // sub_rays})
     if method == "ss":
         return field(method, {"supervision": "average", "rays": round(rays * protocols.AVERAGE_RAYS)})
     if method == "hr":
@@ -156,9 +157,11 @@ def cell(scene: str, protocol: str) -> list[dict]:
         del chosen["rehearsal-field.rays"]
     chosen |= dict(setting.split("=", 1) for setting in options.set)
     run = [method for method in options.methods if not missing(method, protocol)]
+    # Sub-rays of a pixel in our supersampling: train-ss's default is 2 a side.
+    sub_rays = math.ceil(float(chosen.get("supersample", 2))) ** 2
     made: dict = {}
     for method in run:
-        made |= blocks(method, protocol, int(chosen["rays"]))
+        made |= blocks(method, protocol, int(chosen["rays"]), sub_rays)
     scored = {method: SCORED_BY.get(method, f"eval-{method}") for method in run}
     inputs = {"run": scored[run[0]]} | {method: scored[method] for method in run[1:]}
     shown = {"compare": options.view} if options.view else {}
@@ -173,7 +176,7 @@ def cell(scene: str, protocol: str) -> list[dict]:
     command = [options.nerf_sr, "run", "table", "-j", "1", "--pipeline", page / "pipeline.yaml", "--store", store, "--out", page]
     folder = cells.dataset(options.data, scene).resolve()
     command += ["-i", f"dataset={folder}"] + (["-i", f"prep-hr.dataset={folder}"] if "hr" in run else [])
-    if (weights / LPIPS[chosen.get("eval.lpips", "squeeze")]).is_file():
+    if any((weights / net).is_file() and (weights / f"lpips_linear_{name}_v0.1.safetensors").is_file() for name, net in LPIPS.items()):
         command += ["-i", f"eval.weights={weights.resolve()}"]
     command += [word for name, value in chosen.items() for word in ("-p", f"{OF[name]}.{name}={value}" if name in OF else f"{name}={value}")]
     print("==", scene, protocol, flush=True)
@@ -190,7 +193,7 @@ def cell(scene: str, protocol: str) -> list[dict]:
         used.update({stage["folder"]: stage["seconds"] for stage in result["stages"].values()})
         metrics = json.loads((pathlib.Path(result["stages"][scored[method]]["folder"]) / "metrics.json").read_text())
         conventions.update(metrics["conventions"])
-        rows.append(row | {name: result["mean"].get(name) for name in ("psnr", "ssim", "lpips")} | {"train_s": train, "render_s": render})
+        rows.append(row | {name: result["mean"].get(name) for name in METRICS} | {"train_s": train, "render_s": render})
     return rows
 
 
@@ -242,6 +245,18 @@ if gains:
     gains.append(["the paper's", *(f"{float(a) - float(b):+.2f}" if a and b else "–" for a, b in published)])
     parts.append(("Gain, PSNR in dB", grid(["", *options.protocols], gains)))
 
+given = [name for name in METRICS[3:] if any(row.get(name) is not None for row in rows)]
+
+
+def others(method: str, protocol: str) -> str:
+    value = mean(method, protocol, options.scenes)
+    return " / ".join(f"{value[name]:.4f}" for name in given if name in value) if value else "–"
+
+
+if given:
+    lines = [[title(m), *(others(m, p) for p in options.protocols)] for m in options.methods]
+    parts.append((f"By other metrics: {' / '.join(given)}", grid(["method", *options.protocols], lines)))
+
 times = lambda m, p: f"{v['train_s'] / 60:.1f} min / {v['render_s']:.0f} s" if (v := mean(m, p, options.scenes)) else "–"
 parts.append(("Training / rendering", grid(["method", *options.protocols], [[title(m), *(times(m, p) for p in options.protocols)] for m in options.methods])))
 
@@ -259,7 +274,7 @@ heading = "# nerf-sr beside the paper\n\n"
 text = heading + "\n".join(f"## {name}\n\n{table}" for name, table in parts) + "\n" + "\n".join(f"* {note}" for note in notes) + "\n"
 options.out.write_text(text)
 with options.out.with_suffix(".csv").open("w", newline="") as file:
-    names = ["scene", "protocol", "method", "psnr", "ssim", "lpips", "train_s", "render_s", "missing"]
+    names = ["scene", "protocol", "method", *METRICS, "train_s", "render_s", "missing"]
     writer = csv.DictWriter(file, names, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)

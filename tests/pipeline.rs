@@ -57,14 +57,52 @@ fn equal_bytes_with_one_and_two_threads() {
 #[test]
 fn a_sweep_shares_what_it_can() {
     let project = Project::tiny();
-    let sweep = ["-p", "supersample=1,2", "-p", "ssim_border=reflect,valid"];
+    let sweep = ["-p", "supersample=1,2", "-p", "error_range=0.25,0.5"];
     let run = project.ok(&[&["run"][..], &sweep].concat());
     // demo-scene and prep once, training and rendering twice, eval four times.
     assert!(run.contains("10 of 10 stages ran"), "{run}");
-    assert!(run.contains("eval [supersample=2, ssim_border=valid]: PSNR"), "{run}");
+    assert!(run.contains("eval [supersample=2, error_range=0.5]: PSNR"), "{run}");
     assert_eq!(project.output_of("train-ss", &sweep).len(), 2);
     // A single point of it is cached.
     assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));
+}
+
+/// LPIPS stands for each network that is there with its heads, and what lacks for the others is said.
+#[test]
+fn every_network_given_scores() {
+    let project = Project::tiny();
+    let folder = project.path("weights");
+    std::fs::create_dir(&folder).unwrap();
+    let arguments = ["run", "-i", "eval.weights=./weights"];
+    project.run(&arguments).fails(3, &["input weights", "no network is there", "alexnet.safetensors"]);
+    let write = |file: &str, shapes: &[(String, Vec<usize>)]| {
+        let zeros = vec![0u8; 4 * shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max().unwrap()];
+        let view = |shape: &Vec<usize>| {
+            let length = 4 * shape.iter().product::<usize>();
+            safetensors::tensor::TensorView::new(safetensors::Dtype::F32, shape.clone(), &zeros[..length]).unwrap()
+        };
+        let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), view(shape)));
+        std::fs::write(folder.join(file), safetensors::serialize(tensors, None).unwrap()).unwrap();
+    };
+    let layers = [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)];
+    let network = layers.iter().flat_map(|&(i, outputs, inputs, size)| {
+        [(format!("features.{i}.weight"), vec![outputs, inputs, size, size]), (format!("features.{i}.bias"), vec![outputs])]
+    });
+    write("alexnet.safetensors", &network.collect::<Vec<_>>());
+    // Without its heads it isn't whole.
+    project.run(&arguments).fails(3, &["no network is there"]);
+    let heads = layers.iter().enumerate().map(|(k, layer)| (format!("lin{k}.model.1.weight"), vec![1, layer.1, 1, 1]));
+    write("lpips_linear_alex_v0.1.safetensors", &heads.collect::<Vec<_>>());
+    project.ok(&arguments);
+    let metrics = project.object(&project.output_of("eval", &arguments[1..])[0]).join("metrics.json");
+    let metrics: serde_json::Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+    assert!(metrics["mean"]["lpips"].is_null() && metrics["mean"]["lpips_vgg"].is_null(), "{}", metrics["mean"]);
+    // A network without weights sees no difference.
+    assert_eq!(metrics["mean"]["lpips_alex"], 0.0);
+    let said = metrics["conventions"]["lpips"].as_str().unwrap();
+    assert!(said.contains("by AlexNet (lpips_alex); weights not given for others") && said.contains("vgg16"), "{said}");
+    let ssim = |name: &str| metrics["mean"][name].as_f64().unwrap();
+    assert!(ssim("ssim") != ssim("ssim_valid") && (ssim("ssim") - ssim("ssim_valid")).abs() < 0.2);
 }
 
 #[test]

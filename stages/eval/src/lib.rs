@@ -1,8 +1,8 @@
 //! `eval`: scores views against ground truth, and says by which conventions.
 //!
 //! * [`psnr`]: of the mean squared error over all samples; predictions clamped to [0, 1].
-//! * [`ssim`]: Gaussian window, reflected at the border or valid pixels only.
-//! * `lpips`: by SqueezeNet, AlexNet or VGG-16, where its weights are given and the build has libtorch.
+//! * [`ssim`]: Gaussian window, reflected at the border and valid pixels only.
+//! * `lpips`: by SqueezeNet, AlexNet and VGG-16, each where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
 //! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
 //! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
@@ -14,6 +14,7 @@
 mod depth;
 #[cfg(feature = "torch")]
 mod lpips;
+mod perceptual;
 mod ssim;
 mod warp;
 
@@ -21,6 +22,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use perceptual::{MISSING, Perceptual};
 use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Mask, Palette, Picture, Resampling, Rgba8, heat, psnr_of, read_exr,
     read_premultiplied, write_png,
@@ -33,57 +35,22 @@ use serde::{Deserialize, Serialize};
 pub use depth::{DepthError, depth_error};
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
-pub use ssim::{Border, ssim};
+pub use perceptual::LpipsNetwork;
+pub use ssim::{Ssim, ssim};
 pub use warp::WarpScore;
 
 /// Parameters of `eval`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// What SSIM's window does at the border.
-    pub ssim_border: Border,
     /// The absolute error that error maps show in their brightest colour.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub error_range: f64,
-    /// The network behind LPIPS, where its weights are given.
-    pub lpips: LpipsNetwork,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { ssim_border: Border::Reflect, error_range: 0.25, lpips: LpipsNetwork::Squeeze }
-    }
-}
-
-/// Networks whose features LPIPS compares. Their distances differ: name the network beside the figure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum LpipsNetwork {
-    /// SqueezeNet 1.1.
-    Squeeze,
-    /// AlexNet, as torchvision has it; what most papers mean by LPIPS.
-    Alex,
-    /// VGG-16.
-    Vgg,
-}
-
-impl LpipsNetwork {
-    /// Names of the files with its weights (torchvision's names of tensors) and with the learned heads.
-    pub fn files(self) -> [&'static str; 2] {
-        match self {
-            Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
-            Self::Alex => ["alexnet.safetensors", "lpips_linear_alex_v0.1.safetensors"],
-            Self::Vgg => ["vgg16.safetensors", "lpips_linear_vgg_v0.1.safetensors"],
-        }
-    }
-
-    /// What it is called.
-    fn title(self) -> &'static str {
-        match self {
-            Self::Squeeze => "SqueezeNet 1.1",
-            Self::Alex => "AlexNet",
-            Self::Vgg => "VGG-16",
-        }
+        Self { error_range: 0.25 }
     }
 }
 
@@ -128,12 +95,21 @@ pub struct Scores {
     /// Peak signal-to-noise ratio in dB, where there is HR truth; higher is better.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// Structural similarity, where there is HR truth; higher is better.
+    /// Structural similarity, where there is HR truth; higher is better. Pictures are reflected at their borders, as PyTorch pads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
-    /// Learned perceptual distance; lower is better.
+    /// The same over pixels whose window is whole, as scikit-image has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ssim_valid: Option<f64>,
+    /// Learned perceptual distance by SqueezeNet 1.1, where its weights are given; lower is better.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
+    /// The same by AlexNet.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips_alex: Option<f64>,
+    /// The same by VGG-16.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lpips_vgg: Option<f64>,
     /// Depth errors, where there is true depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthError>,
@@ -186,7 +162,7 @@ impl Stage for Eval {
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "folder with a network and its heads, for LPIPS: by default squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors",
+                    "folder with networks and their heads, for LPIPS: squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, likewise alexnet and vgg16",
                 ),
             ),
         ]
@@ -199,7 +175,7 @@ impl Stage for Eval {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let (views_in, truth_in) = (context.input("views")?, context.input("truth")?);
         let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
-        let perceptual = Perceptual::new(context.optional_input("weights"), params.lpips)?;
+        let perceptual = Perceptual::new(context.optional_input("weights"))?;
         let is_known = truth_in.path(DEGRADATION_FILE).exists();
         let made: Option<Degradation> = if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
         let filter = made.map_or(Filter::Box, |d| d.kernel.filter());
@@ -289,18 +265,23 @@ impl Job<'_> {
         };
         let error_map = format!("errors/{name}.png");
         write_png(&self.context.output_path(&error_map)?, &draw_error(shown, against, self.params.error_range as f32))?;
-        let border = self.params.ssim_border;
         let warped = expected.as_ref().map(|e| self.warp(view, e)).transpose()?.flatten();
+        let similar = expected.as_ref().map(|e| ssim(&found, e));
+        let distances = expected.as_ref().map(|e| self.perceptual.distances(&found, e)).transpose()?;
+        let [lpips, lpips_alex, lpips_vgg] = distances.unwrap_or_default();
         let scores = Scores {
             psnr: expected.as_ref().map(|e| psnr(&found, e) + counted[0]),
-            ssim: expected.as_ref().map(|e| ssim(&found, e, border)),
-            lpips: expected.as_ref().map(|e| self.perceptual.distance(&found, e)).transpose()?.flatten(),
+            ssim: similar.map(|s| s.reflected),
+            ssim_valid: similar.map(|s| s.valid),
+            lpips,
+            lpips_alex,
+            lpips_vgg,
             depth: score_depth((views_in, view), (truth_in, true_view))?,
             warp: warped.as_ref().map(|(score, _)| *score),
             low_resolution: shrunk
                 .iter()
                 .zip(&low)
-                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low) + counted[1], ssim: ssim(shrunk, low, border) })
+                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low) + counted[1], ssim: ssim(shrunk, low).reflected })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
@@ -375,7 +356,10 @@ fn mean_of(views: &[ViewScores]) -> Scores {
     Scores {
         psnr: mean(&|s| s.psnr),
         ssim: mean(&|s| s.ssim),
+        ssim_valid: mean(&|s| s.ssim_valid),
         lpips: mean(&|s| s.lpips),
+        lpips_alex: mean(&|s| s.lpips_alex),
+        lpips_vgg: mean(&|s| s.lpips_vgg),
         depth: depth(&|d| d.mean_absolute).map(|mean_absolute| DepthError {
             mean_absolute,
             median_absolute: depth(&|d| d.median_absolute).unwrap_or_default(),
@@ -397,14 +381,12 @@ fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Op
         Background::White | Background::Alpha => "white",
         Background::Opaque => "none: the pictures are opaque",
     };
-    let border = match params.ssim_border {
-        Border::Reflect => "borders reflected",
-        Border::Valid => "pixels whose window is whole",
-    };
     MetricConventions {
         background: on.to_owned(),
         psnr: format!("-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in half precision, clamped; mean of per-view values{masked}"),
-        ssim: format!("Gaussian 11×11, σ 1.5, {border}, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels"),
+        ssim: "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels; borders reflected (ssim), or pixels \
+               whose window is whole (ssim_valid)"
+            .to_owned(),
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
         warp: "the true picture of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
@@ -422,8 +404,10 @@ fn summary(metrics: &Metrics) -> String {
     let mean = &metrics.mean;
     let mut parts = Vec::new();
     if let (Some(psnr), Some(ssim)) = (mean.psnr, mean.ssim) {
-        let lpips = mean.lpips.map_or_else(|| MISSING.to_owned(), |v| format!("{v:.4}"));
-        parts.push(format!("PSNR {psnr:.2} dB · SSIM {ssim:.4} · LPIPS {lpips}"));
+        parts.push(format!("PSNR {psnr:.2} dB · SSIM {ssim:.4}"));
+        let by = [("LPIPS", mean.lpips), ("LPIPS (AlexNet)", mean.lpips_alex), ("LPIPS (VGG-16)", mean.lpips_vgg)];
+        let known: Vec<String> = by.iter().filter_map(|(name, value)| Some(format!("{name} {:.4}", (*value)?))).collect();
+        parts.push(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") });
     }
     parts.extend(mean.depth.map(|d| format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)));
     if let (Some(low), None) = (mean.low_resolution, mean.psnr) {
@@ -431,80 +415,4 @@ fn summary(metrics: &Metrics) -> String {
     }
     parts.push(format!("{} views", metrics.views.len()));
     parts.join(" · ")
-}
-
-/// LPIPS, or the reason why there is none.
-struct Perceptual {
-    network: LpipsNetwork,
-    #[cfg(feature = "torch")]
-    given: Option<Given>,
-}
-
-/// Networks that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
-#[cfg(feature = "torch")]
-struct Given {
-    folder: std::path::PathBuf,
-    free: std::sync::Mutex<Vec<Lpips>>,
-}
-
-#[cfg(feature = "torch")]
-impl Perceptual {
-    fn new(weights: Option<&GivenInput>, network: LpipsNetwork) -> anyhow::Result<Self> {
-        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self { network, given: None }) };
-        let first = Lpips::read(folder, network).bad_input("weights")?;
-        let given = Given { folder: folder.to_path_buf(), free: std::sync::Mutex::new(vec![first]) };
-        Ok(Self { network, given: Some(given) })
-    }
-
-    fn distance(&self, found: &Picture, expected: &Picture) -> anyhow::Result<Option<f64>> {
-        let Some(Given { folder, free }) = &self.given else { return Ok(None) };
-        let pool = || free.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let waiting = pool().pop();
-        let lpips = match waiting {
-            Some(lpips) => lpips,
-            None => Lpips::read(folder, self.network).bad_input("weights")?,
-        };
-        let distance = lpips.distance(found, expected)?;
-        pool().push(lpips);
-        Ok(Some(distance))
-    }
-
-    fn is_given(&self) -> bool {
-        self.given.is_some()
-    }
-}
-
-#[cfg(not(feature = "torch"))]
-#[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
-impl Perceptual {
-    fn new(weights: Option<&GivenInput>, network: LpipsNetwork) -> anyhow::Result<Self> {
-        if weights.is_some() {
-            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
-            return Err(Failure::Usage(message.to_owned()).into());
-        }
-        Ok(Self { network })
-    }
-
-    fn distance(&self, _: &Picture, _: &Picture) -> anyhow::Result<Option<f64>> {
-        Ok(None)
-    }
-
-    fn is_given(&self) -> bool {
-        false
-    }
-}
-
-/// What stands where LPIPS would.
-const MISSING: &str = "weights not given";
-
-impl Perceptual {
-    fn convention(&self) -> String {
-        let [net, heads] = self.network.files();
-        if self.is_given() {
-            return format!("v0.1, {}, inputs in [-1, 1]", self.network.title());
-        }
-        format!(
-            "{MISSING}: -i eval.weights=FOLDER with {net} (torchvision's names) and {heads} (richzhang/PerceptualSimilarity); `lpips` has the network"
-        )
-    }
 }

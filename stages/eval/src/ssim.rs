@@ -1,30 +1,29 @@
 use pixels::Picture;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-/// What the window does at the border.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Border {
+/// Mean structural similarity, by what the window does at the border.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ssim {
     /// The picture is mirrored without repeating its edge, as PyTorch pads: every pixel counts.
-    Reflect,
-    /// Only pixels whose window lies inside count: scikit-image's scalar.
-    Valid,
+    pub reflected: f64,
+    /// Only pixels whose window lies inside count: scikit-image's scalar. Where there is none, all count.
+    pub valid: f64,
 }
 
 const RADIUS: usize = 5;
 
 /// Mean structural similarity (Wang et al. 2004): Gaussian window of 11×11 with σ 1.5, data range 1, in f64; mean over the
 /// channels. A picture narrower than the window is reflected as often as it takes.
-pub fn ssim(a: &Picture, b: &Picture, border: Border) -> f64 {
+pub fn ssim(a: &Picture, b: &Picture) -> Ssim {
     let channel = |c: usize| {
         let plane = |p: &Picture| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
-        of_planes(&plane(a), &plane(b), a.width, a.height, border)
+        of_planes(&plane(a), &plane(b), a.width, a.height)
     };
-    (0..a.channels).map(channel).sum::<f64>() / a.channels as f64
+    let channels: Vec<Ssim> = (0..a.channels).map(channel).collect();
+    let mean = |of: fn(&Ssim) -> f64| channels.iter().map(of).sum::<f64>() / a.channels as f64;
+    Ssim { reflected: mean(|s| s.reflected), valid: mean(|s| s.valid) }
 }
 
-fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize, border: Border) -> f64 {
+fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize) -> Ssim {
     let product = |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let blurred = |plane: &[f64]| blur(plane, width, height);
     let (mx, my) = (blurred(x), blurred(y));
@@ -34,11 +33,13 @@ fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize, border: Border) 
         let (vx, vy, cov) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
         ((2.0 * mx[i] * my[i] + c1) * (2.0 * cov + c2)) / ((mx[i] * mx[i] + my[i] * my[i] + c1) * (vx + vy + c2))
     };
-    // Pictures with no whole window have no valid pixel; all count then.
-    let margin = if border == Border::Valid && width > 2 * RADIUS && height > 2 * RADIUS { RADIUS } else { 0 };
-    let inside = (margin..height - margin).flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
-    let count = (width - 2 * margin) * (height - 2 * margin);
-    inside.map(at).sum::<f64>() / count as f64
+    let inside = |margin: usize| {
+        let pixels = (margin..height - margin).flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
+        pixels.map(at).sum::<f64>() / ((width - 2 * margin) * (height - 2 * margin)) as f64
+    };
+    let reflected = inside(0);
+    let valid = if width > 2 * RADIUS && height > 2 * RADIUS { inside(RADIUS) } else { reflected };
+    Ssim { reflected, valid }
 }
 
 /// Gaussian blur, reflected at the border.

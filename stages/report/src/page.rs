@@ -62,28 +62,34 @@ pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
 /// A table of means, one row a point, the best figure of each column in bold.
 fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
-    let columns: [(&str, &str, usize, bool); 8] = [
+    let mut columns: Vec<(&str, &str, usize, bool)> = vec![
         ("PSNR ↑ dB", "psnr", 2, true),
         ("SSIM ↑", "ssim", 4, true),
+        ("SSIM ↑ whole windows", "ssim_valid", 4, true),
         ("LPIPS ↓", "lpips", 4, false),
+        ("LPIPS ↓ AlexNet", "lpips_alex", 4, false),
+        ("LPIPS ↓ VGG-16", "lpips_vgg", 4, false),
         ("PSNR at LR ↑ dB", "low_resolution/psnr", 2, true),
         ("PSNR of neighbours by depth ↑ dB", "warp/psnr", 2, true),
         ("depth error ↓ mean", "depth/mean_absolute", 4, false),
         ("median", "depth/median_absolute", 4, false),
         ("missed", "depth/missed", 4, false),
     ];
+    // Variants that nothing was scored by only take room.
+    let is_variant = |path: &str| ["ssim_valid", "lpips_alex", "lpips_vgg"].contains(&path);
+    columns.retain(|(_, path, ..)| !is_variant(path) || points.iter().any(|point| mean(point, path).is_some()));
     let best = |path: &str, up: bool| {
         let values = points.iter().filter_map(|p| mean(p, path));
         if up { values.fold(f64::NEG_INFINITY, f64::max) } else { values.fold(f64::INFINITY, f64::min) }
     };
     html! {
         table id="scores" {
-            thead { tr { th { "point" } @for (name, ..) in columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
+            thead { tr { th { "point" } @for (name, ..) in &columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
             tbody {
                 @for point in points {
                     tr {
                         td { (label(points, point)) }
-                        @for (_, path, digits, up) in columns {
+                        @for &(_, path, digits, up) in &columns {
                             @match mean(point, path) {
                                 Some(value) => td class=(if points.len() > 1 && value == best(path, up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
                                 None if path == "lpips" && mean(point, "psnr").is_some() => td { "weights not given" },

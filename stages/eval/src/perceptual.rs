@@ -1,0 +1,149 @@
+use artifact::{Failure, GivenInput};
+use pixels::Picture;
+
+#[cfg(feature = "torch")]
+use crate::Lpips;
+
+/// Networks whose features LPIPS compares. Their distances differ: name the network beside the figure.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LpipsNetwork {
+    /// SqueezeNet 1.1.
+    Squeeze,
+    /// AlexNet, as torchvision has it; what most papers mean by LPIPS.
+    Alex,
+    /// VGG-16.
+    Vgg,
+}
+
+impl LpipsNetwork {
+    /// All of them, in the order in which their distances are given.
+    pub const ALL: [Self; 3] = [Self::Squeeze, Self::Alex, Self::Vgg];
+
+    /// Names of the files with its weights (torchvision's names of tensors) and with the learned heads.
+    pub fn files(self) -> [&'static str; 2] {
+        match self {
+            Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
+            Self::Alex => ["alexnet.safetensors", "lpips_linear_alex_v0.1.safetensors"],
+            Self::Vgg => ["vgg16.safetensors", "lpips_linear_vgg_v0.1.safetensors"],
+        }
+    }
+
+    /// What it is called, and its score.
+    fn title(self) -> &'static str {
+        match self {
+            Self::Squeeze => "SqueezeNet 1.1 (lpips)",
+            Self::Alex => "AlexNet (lpips_alex)",
+            Self::Vgg => "VGG-16 (lpips_vgg)",
+        }
+    }
+}
+
+/// LPIPS by every network whose weights are given.
+pub(crate) struct Perceptual {
+    given: Vec<LpipsNetwork>,
+    #[cfg(feature = "torch")]
+    readers: Vec<Reader>,
+}
+
+/// A network's files, and copies of it that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
+#[cfg(feature = "torch")]
+struct Reader {
+    folder: std::path::PathBuf,
+    network: LpipsNetwork,
+    free: std::sync::Mutex<Vec<Lpips>>,
+}
+
+#[cfg(feature = "torch")]
+impl Reader {
+    fn new(folder: &std::path::Path, network: LpipsNetwork) -> anyhow::Result<Self> {
+        let reader = Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
+        reader.keep(reader.take()?);
+        Ok(reader)
+    }
+
+    fn pool(&self) -> std::sync::MutexGuard<'_, Vec<Lpips>> {
+        self.free.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    fn take(&self) -> anyhow::Result<Lpips> {
+        use artifact::FailureExt as _;
+        let free = self.pool().pop();
+        free.map_or_else(|| Lpips::read(&self.folder, self.network).bad_input("weights"), Ok)
+    }
+
+    fn keep(&self, lpips: Lpips) {
+        self.pool().push(lpips);
+    }
+}
+
+#[cfg(feature = "torch")]
+impl Perceptual {
+    /// Those of a folder. One that has no whole network is refused.
+    pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self { given: Vec::new(), readers: Vec::new() }) };
+        let is_there = |network: &LpipsNetwork| network.files().iter().all(|file| folder.join(file).is_file());
+        let given: Vec<LpipsNetwork> = LpipsNetwork::ALL.into_iter().filter(is_there).collect();
+        if given.is_empty() {
+            let message = format!("input weights: {}: no network is there; {}", folder.display(), wanted(&LpipsNetwork::ALL));
+            return Err(Failure::BadInput(message).into());
+        }
+        let readers = given.iter().map(|&network| Reader::new(folder, network)).collect::<anyhow::Result<_>>()?;
+        Ok(Self { given, readers })
+    }
+
+    /// Distances by each network, in the order of [`LpipsNetwork::ALL`].
+    pub(crate) fn distances(&self, found: &Picture, expected: &Picture) -> anyhow::Result<[Option<f64>; 3]> {
+        let mut distances = [None; 3];
+        for reader in &self.readers {
+            let lpips = reader.take()?;
+            distances[reader.network as usize] = Some(lpips.distance(found, expected)?);
+            reader.keep(lpips);
+        }
+        Ok(distances)
+    }
+}
+
+#[cfg(not(feature = "torch"))]
+#[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
+impl Perceptual {
+    pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
+        if weights.is_some() {
+            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
+            return Err(Failure::Usage(message.to_owned()).into());
+        }
+        Ok(Self { given: Vec::new() })
+    }
+
+    pub(crate) fn distances(&self, _: &Picture, _: &Picture) -> anyhow::Result<[Option<f64>; 3]> {
+        Ok([None; 3])
+    }
+}
+
+/// What stands where LPIPS would.
+pub(crate) const MISSING: &str = "weights not given";
+
+impl Perceptual {
+    /// Which networks there are, and what is lacking for the others.
+    pub(crate) fn convention(&self) -> String {
+        let lacking: Vec<LpipsNetwork> = LpipsNetwork::ALL.into_iter().filter(|network| !self.given.contains(network)).collect();
+        if self.given.is_empty() {
+            return format!("{MISSING}: {}", wanted(&lacking));
+        }
+        let by: Vec<&str> = self.given.iter().map(|network| network.title()).collect();
+        let missing = if lacking.is_empty() { String::new() } else { format!("; {MISSING} for others: {}", wanted(&lacking)) };
+        format!("v0.1, inputs in [-1, 1], by {}{missing}", by.join(", "))
+    }
+}
+
+/// The files that would be needed.
+fn wanted(networks: &[LpipsNetwork]) -> String {
+    let pair = |network: &LpipsNetwork| {
+        let [net, heads] = network.files();
+        format!("{net} with {heads}")
+    };
+    let pairs: Vec<String> = networks.iter().map(pair).collect();
+    format!(
+        "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as safetensors)",
+        pairs.join(", or ")
+    )
+}
