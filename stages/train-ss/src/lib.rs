@@ -14,6 +14,7 @@ mod field_trainer;
 mod member;
 mod memory;
 mod moving_cameras;
+mod order;
 mod params;
 mod supervision;
 

@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use crate::exposure::Exposures;
 use crate::memory::{Kernel, Memory};
 use crate::moving_cameras::MovingCameras;
+use crate::order::{Focus, detailed, shuffled};
 
 /// What an LR pixel is compared with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -56,58 +57,6 @@ pub struct Supersampling {
     memory: Option<Memory>,
     exposures: Option<Exposures>,
     moving: Option<MovingCameras>,
-}
-
-/// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
-/// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
-struct Focus {
-    /// Numbers of the pixels with detail, among those of all views.
-    detailed: Vec<u64>,
-    /// Share of the draws that are even, over all pixels; the others are among the detailed ones.
-    even: f32,
-    /// Weights of a flat and of a detailed pixel's loss.
-    weights: [f32; 2],
-}
-
-/// Range of a channel over 3×3 pixels below which they are flat.
-const FLAT: f32 = 8.0 / 255.0;
-
-impl Focus {
-    /// Detailed pixels are drawn `detail` times as often as flat ones.
-    fn new(detail: f64, pixels: u64, detailed: Vec<u64>) -> Self {
-        let share = detailed.len() as f64 / pixels.max(1) as f64;
-        let even = if detail > 1.0 && share > 0.0 { 1.0 / (detail - 1.0).mul_add(share, 1.0) } else { 1.0 };
-        let weights = [1.0 / even, 1.0 / (even * detail)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
-        Self { detailed, even: even as f32, weights }
-    }
-
-    /// Draws the number of a pixel.
-    fn draw(&self, pixels: u64, draws: &mut Draws) -> u64 {
-        if self.even == 1.0 || draws.uniform() < self.even {
-            draws.below(pixels)
-        } else {
-            self.detailed[draws.below(self.detailed.len() as u64) as usize]
-        }
-    }
-
-    /// Weight of a pixel's loss.
-    fn weight(&self, pixel: u64) -> f32 {
-        self.weights[usize::from(self.even < 1.0 && self.detailed.binary_search(&pixel).is_ok())]
-    }
-}
-
-/// Which pixels aren't flat, in order.
-fn detailed(picture: &Picture) -> impl Iterator<Item = usize> + '_ {
-    let near = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
-    (0..picture.width * picture.height).filter(move |&pixel| {
-        let (x, y) = (pixel % picture.width, pixel / picture.width);
-        (0..picture.channels).any(|c| {
-            let around = near(y, picture.height).flat_map(|j| near(x, picture.width).map(move |i| (i, j)));
-            let value = |(i, j): (usize, usize)| picture.data[(j * picture.width + i) * picture.channels + c];
-            let (low, high) = around.map(value).fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
-            high - low > FLAT
-        })
-    })
 }
 
 struct TrainingView {
@@ -167,8 +116,6 @@ pub struct SupersamplingOptions {
 /// Purposes of draws.
 const PIXEL: u64 = 100;
 const BACKGROUND: u64 = 101;
-/// The first of four.
-const ORDER: u64 = 110;
 
 /// Draws until one is of a pixel that counts; after so many the last is taken, and has no residual.
 const REDRAWS: usize = 64;
@@ -348,25 +295,6 @@ impl Supersampling {
             [0, 1, 2].map(|_| draws.uniform())
         } else {
             [self.background.shown(); 3]
-        }
-    }
-}
-
-/// Where the i-th of n numbers comes in an epoch's random order: a Feistel cipher over the next power of four, which is gone
-/// through again from what lies beyond n. So the order needs no memory, and any thread may ask for any place.
-fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
-    let bits = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
-    let mask = (1u64 << bits) - 1;
-    let mut at = i;
-    loop {
-        let (mut left, mut right) = (at >> bits, at & mask);
-        for round in 0..4 {
-            let mixed = Draws::new(seed, ORDER + round, (epoch << 32) ^ right).below(mask + 1);
-            (left, right) = (right, left ^ mixed);
-        }
-        at = left << bits | right;
-        if at < n {
-            return at;
         }
     }
 }
@@ -633,27 +561,6 @@ mod tests {
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
-    /// Pixels with detail are drawn as often as asked for, and the weighted loss expects what even draws do.
-    #[test]
-    fn focus_keeps_the_expectation() {
-        let mut flat = Picture::new(20, 10, 3, vec![0.5; 600]);
-        flat.data[3 * (3 * 20 + 4)] = 0.9;
-        assert!(detailed(&flat).eq((2..5).flat_map(|y| (3..6).map(move |x| 20 * y + x))), "what is around a dot");
-        let focus = Focus::new(7.0, 200, detailed(&flat).map(|p| p as u64).collect());
-        let (mut counts, draws) = ([0u32; 200], 400_000);
-        (0..draws).for_each(|k| counts[focus.draw(200, &mut Draws::new(1, 2, k)) as usize] += 1);
-        for (pixel, &count) in (0..200).zip(&counts) {
-            let mean = f64::from(count) * 200.0 / draws as f64 * f64::from(focus.weight(pixel));
-            assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");
-        }
-        let (dot, elsewhere) = (counts[3 * 20 + 4], counts[6 * 20..].iter().sum::<u32>());
-        let often = f64::from(dot) / (f64::from(elsewhere) / 80.0);
-        assert!((often - 7.0).abs() < 0.6, "{often}");
-        for even in [Focus::new(1.0, 200, vec![3]), Focus::new(5.0, 200, Vec::new())] {
-            assert!(even.weight(3) == 1.0 && even.even == 1.0);
-        }
-    }
-
     /// 1, 2, 4 … sub-rays a side, each for an equal part of the coarse share, and then all.
     #[test]
     fn sub_rays_double_until_all_are_cast() {
@@ -681,11 +588,6 @@ mod tests {
         for epoch in [&mut first, &mut second] {
             epoch.sort_unstable();
             assert_eq!(*epoch, (0..20).collect::<Vec<_>>());
-        }
-        for n in [1, 2, 3, 17, 1000] {
-            let mut order: Vec<u64> = (0..n).map(|i| shuffled(7, 3, i, n)).collect();
-            order.sort_unstable();
-            assert!(order.iter().copied().eq(0..n));
         }
     }
 
