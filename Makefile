@@ -16,7 +16,7 @@ NERF_SR := target/release/nerf-sr
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality table refine-table ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build setup test lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -92,6 +92,10 @@ given = $(if $(filter file,$(origin $(1))),$(2),$($(1)))
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
 	@python3 scripts/refine-table.py --data $(DATA) --scenes $(call given,SCENES,fern) --protocols $(call given,PROTOCOLS,252x2 252x4) --references $(REFERENCES) \
 	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
+
+refine-ablation: build ## What each part of refinement brings, on views that its rehearsal leaves out
+	@python3 scripts/refine-ablation.py --data $(DATA) --scenes $(call given,SCENES,fern) $(if $(SPLIT),--split $(SPLIT)) \
+	  $(if $(VARIANTS),--variants $(VARIANTS)) --out $(or $(OUT),out/refine-ablation.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) \

@@ -313,6 +313,14 @@ fn tables_have_rendered_and_refined_rows() {
     assert!(made.stdout.contains("| 24x2 | demo | kernel, refined |"), "{}", made.stdout);
     let refined: Vec<bool> = read("out/quality.json").iter().map(|r| r["refined"].as_bool().unwrap()).collect();
     assert_eq!(refined, [false, true]);
+
+    let parts = ["--scenes", "demo", "--protocol", "24x2", "--variants", "3", "--steps", "40", "--out", "out/ablation.json"];
+    let made = project.script("refine-ablation.py", &[&parts[..], &["--set", "rehearsal-field.rays=30000"]].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert!(made.stdout.contains("| one reference, no occlusion test |"), "{}", made.stdout);
+    let rows = read("out/ablation.json");
+    let refined: Vec<f64> = rows.iter().map(|r| r["refined"].as_f64().unwrap()).collect();
+    assert!(refined.len() == 3 && refined[0] != refined[1] && refined.iter().all(|r| r.is_finite()), "{refined:?}");
 }
 
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.

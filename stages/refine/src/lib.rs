@@ -17,7 +17,7 @@ use std::path::Path;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use paper_refiner::PaperRefiner;
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
-use refinement::{KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
+use refinement::{Architecture, KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -90,8 +90,8 @@ impl Stage for Refine {
             references,
             photographs,
         };
-        if job.network.is_guided() && !job.references.is_empty() {
-            job.leave_out(&views, LITTLE * file.trusted.unwrap_or(1.0))?;
+        if let Some(guidance) = job.network.guidance().filter(|_| !job.references.is_empty()) {
+            job.leave_out(&views, guidance, LITTLE * file.trusted.unwrap_or(1.0))?;
         }
         let mut agreed = 0;
         let mut uses = vec![Use::default(); job.references.len()];
@@ -154,6 +154,13 @@ fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Ren
     Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
 }
 
+/// How a network takes references.
+#[derive(Clone, Copy)]
+struct Guidance {
+    /// Whether they show only what they see by their own depth.
+    occlusion: bool,
+}
+
 /// Either network.
 enum AnyRefiner {
     Compact(Refiner),
@@ -171,13 +178,15 @@ impl AnyRefiner {
         .bad_input("input refiner")
     }
 
-    /// Whether it is ours, and knows references.
-    fn is_guided(&self) -> bool {
-        matches!(self, Self::Compact(network) if network.architecture().guided)
+    /// How it takes references, where it is ours and does.
+    fn guidance(&self) -> Option<Guidance> {
+        let Self::Compact(network) = self else { return None };
+        let Architecture { guided, occlusion, .. } = network.architecture();
+        guided.then_some(Guidance { occlusion })
     }
 
     fn takes_references(&self) -> bool {
-        self.is_guided() || matches!(self, Self::Paper(..))
+        self.guidance().is_some() || matches!(self, Self::Paper(..))
     }
 }
 
@@ -222,12 +231,14 @@ impl Job<'_> {
     fn redraw(&self, rendered: &Rendered, uses: &mut [Use]) -> anyhow::Result<Picture> {
         let references: Vec<&KnownView> = self.references.iter().collect();
         match &self.network {
-            AnyRefiner::Compact(network) if self.network.is_guided() => {
-                let guided = guided(rendered, &references);
+            AnyRefiner::Compact(network) => {
+                let Some(Guidance { occlusion }) = self.network.guidance() else {
+                    return Ok(network.refine_by(&rendered.view, self.strength, self.turns)?);
+                };
+                let guided = guided(rendered, &references, occlusion);
                 uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
                 Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
             }
-            AnyRefiner::Compact(network) => Ok(network.refine_by(&rendered.view, self.strength, self.turns)?),
             AnyRefiner::Paper(network, patches) => {
                 let mut drawn = network.refine(rendered, &references, *patches).bad_input("input views")?;
                 for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
@@ -239,12 +250,12 @@ impl Job<'_> {
     }
 
     /// Leaves references out that are trusted with less than a share of what they see: they look otherwise than what is rendered.
-    fn leave_out(&mut self, views: &Views, least: f64) -> anyhow::Result<()> {
+    fn leave_out(&mut self, views: &Views, Guidance { occlusion }: Guidance, least: f64) -> anyhow::Result<()> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); self.references.len()];
         let references: Vec<&KnownView> = self.references.iter().collect();
         for view in views.views.iter().step_by(every) {
-            let guided = guided(&read(self.input, view, self.background)?.0, &references);
+            let guided = guided(&read(self.input, view, self.background)?.0, &references, occlusion);
             uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
         let mut uses = uses.iter();
@@ -270,7 +281,7 @@ impl Job<'_> {
         if count == 0 {
             return String::new();
         }
-        if !self.network.is_guided() {
+        if self.network.guidance().is_none() {
             return format!(" by {count} references");
         }
         let mut all = Use::default();

@@ -54,6 +54,8 @@ pub struct Params {
     /// `compact`: references that each view will have when it is refined; 0 trains a network that does without.
     #[schemars(range(min = 0, max = 64))]
     pub references: u32,
+    /// `compact`: whether a reference shows only what it sees by its own depth; without it also what something stands before (to be compared with).
+    pub occlusion: bool,
     /// `paper`: reference patches that a patch gets.
     #[schemars(range(min = 1, max = 64))]
     pub patches: u32,
@@ -72,6 +74,7 @@ impl Default for Params {
             channels: None,
             blocks: 4,
             references: 0,
+            occlusion: true,
             patches: 8,
             seed: 0,
         }
@@ -130,8 +133,12 @@ impl Stage for TrainRefine {
         if params.references > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
-        let architecture =
-            Architecture { channels: params.channels.unwrap_or(32), blocks: params.blocks, guided: params.references > 0 };
+        let architecture = Architecture {
+            channels: params.channels.unwrap_or(32),
+            blocks: params.blocks,
+            guided: params.references > 0,
+            occlusion: params.occlusion,
+        };
         let options = RefinerTraining {
             steps: params.steps.unwrap_or(4000),
             batch: params.batch.unwrap_or(8) as usize,

@@ -71,12 +71,17 @@ struct Shown {
 }
 
 impl Guide {
-    /// What references know of a part.
-    pub(crate) fn new<'a>(rendered: &Rendered, references: impl Iterator<Item = &'a KnownView>, part: Part) -> Self {
+    /// What references know of a part; without `occlusion` as if nothing stood before anything.
+    pub(crate) fn new<'a>(
+        rendered: &Rendered,
+        references: impl Iterator<Item = &'a KnownView>,
+        part: Part,
+        occlusion: bool,
+    ) -> Self {
         let mut sums = vec![([0.0f32; 3], 0.0f32, 0.0f32); part.0.len() * part.1.len()];
         let mut uses = Vec::new();
         for reference in references {
-            let trusted = trusted(rendered, reference, &part);
+            let trusted = trusted(rendered, reference, &part, occlusion);
             let mut of_use = Use::default();
             for ((sum, weights, confidence), Shown { difference, sight, trust, .. }) in sums.iter_mut().zip(trusted) {
                 of_use.add(&Use { seen: usize::from(sight > 0.0), sight: f64::from(sight), trust: f64::from(trust) });
@@ -104,13 +109,15 @@ impl Guide {
 
 /// What a reference shows of a part, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
 /// highlight) or comes from here and there (noisy depth, an edge).
-fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part) -> Vec<Shown> {
+fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part, occlusion: bool) -> Vec<Shown> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let grown = |range: &Range<usize>, size: usize| range.start.saturating_sub(AROUND)..(range.end + AROUND).min(size);
     let (wide, high) = (grown(columns, width), grown(rows, height));
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
     let show = |column: usize, row: usize| {
-        let Some(sight) = surface.sight(column, row, &theirs) else { return Shown::default() };
+        let sight =
+            if occlusion { surface.sight(column, row, &theirs) } else { surface.sight_through(column, row, theirs.camera) };
+        let Some(sight) = sight else { return Shown::default() };
         let colour = reference.truth.colour_at(sight.place);
         let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
@@ -183,13 +190,13 @@ impl Sums {
     }
 }
 
-/// A view with what references know of it, as a guided refiner takes it.
-pub fn guided(rendered: &Rendered, references: &[&KnownView]) -> Guided {
+/// A view with what references know of it, as a guided refiner takes it: with its [`crate::Architecture::occlusion`].
+pub fn guided(rendered: &Rendered, references: &[&KnownView], occlusion: bool) -> Guided {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * GUIDED_INPUTS];
     let band = |(i, out): (usize, &mut [f32])| {
         let rows = i * BAND..(i * BAND + BAND).min(height);
-        let guide = Guide::new(rendered, references.iter().copied(), (0..width, rows.clone()));
+        let guide = Guide::new(rendered, references.iter().copied(), (0..width, rows.clone()), occlusion);
         let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&guide.known);
         for (out, (pixel, known)) in out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels) {
             out[..INPUTS].copy_from_slice(pixel);
@@ -241,7 +248,7 @@ mod tests {
 
     /// Share of the view that is known of, trust there, and how far what is shown there is from the truth, weighted by the trust.
     fn judged(view: &KnownView, reference: &KnownView) -> (f64, f64, f64) {
-        let Guided { view: guided, uses } = guided(&view.rendered, &[reference]);
+        let Guided { view: guided, uses } = guided(&view.rendered, &[reference], true);
         let (seen, trust) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].trust / uses[0].seen.max(1) as f64);
         let (mut sum, mut all) = (0.0, 0.0);
         for (pixel, truth) in guided.data.chunks_exact(GUIDED_INPUTS).zip(view.truth.data.chunks_exact(3)) {
@@ -274,12 +281,23 @@ mod tests {
         assert_eq!(judged(&view, &wall(500, |_| 2.0)).0, 0.0);
     }
 
+    /// What something stands before is shown only by references that needn't see it.
+    #[test]
+    fn what_is_hidden_is_not_shown() {
+        // The reference has a plate before the middle third of its picture.
+        let plate = |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
+        let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
+        let seen = |occlusion: bool| guided(&view.rendered, &[&reference], occlusion).uses[0].seen;
+        let hidden = (seen(false) - seen(true)) as f64 / (WIDTH * HEIGHT) as f64;
+        assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
+    }
+
     /// Parts have what the whole has.
     #[test]
     fn parts_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let whole = guided(&view.rendered, &[&reference]).view;
-        let part = Guide::new(&view.rendered, [&reference].into_iter(), (30..50, 7..41));
+        let whole = guided(&view.rendered, &[&reference], true).view;
+        let part = Guide::new(&view.rendered, [&reference].into_iter(), (30..50, 7..41), true);
         for row in 7..41 {
             for column in 30..50 {
                 let expected = &whole.data[(row * WIDTH + column) * GUIDED_INPUTS + INPUTS..][..4];

@@ -22,7 +22,7 @@
 //! use pixels::Picture;
 //! use refinement::{Architecture, Refiner};
 //! nets::deterministic();
-//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided: false }, 7)?;
+//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided: false, occlusion: true }, 7)?;
 //! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);

@@ -20,6 +20,13 @@ pub struct Architecture {
     pub blocks: u32,
     /// Whether it sees what references know, too.
     pub guided: bool,
+    /// Whether a reference shows only what it sees by its own depth; without it also what something stands before.
+    #[serde(default = "yes")]
+    pub occlusion: bool,
+}
+
+fn yes() -> bool {
+    true
 }
 
 impl Architecture {
@@ -277,7 +284,7 @@ mod tests {
     #[test]
     fn tiles_leave_no_seams() {
         nets::deterministic();
-        let architecture = Architecture { channels: 6, blocks: 2, guided: false };
+        let architecture = Architecture { channels: 6, blocks: 2, guided: false, occlusion: true };
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = picture(width, height);
@@ -303,7 +310,7 @@ mod tests {
     #[test]
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
-        let refiner = random(Architecture { channels: 6, blocks: 1, guided: false });
+        let refiner = random(Architecture { channels: 6, blocks: 1, guided: false, occlusion: true });
         let view = picture(150, 10);
         let mirrored = |p: &Picture| {
             let data =
@@ -323,7 +330,7 @@ mod tests {
     fn what_is_written_is_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
-        let architecture = Architecture { channels: 6, blocks: 1, guided: true };
+        let architecture = Architecture { channels: 6, blocks: 1, guided: true, occlusion: true };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();

@@ -10,7 +10,7 @@ use tch::{Kind, TchError, Tensor, no_grad};
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
 use crate::guide::{Guide, Use, guided};
-use crate::refiner::{OUTPUTS, Refiner};
+use crate::refiner::{Architecture, OUTPUTS, Refiner};
 use crate::view::KnownView;
 
 /// A training, step by step, that can be interrupted.
@@ -96,12 +96,13 @@ impl RefinerTrainer {
     pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Picture {
-            if !self.refiner.architecture().guided {
+            let Architecture { guided: is_guided, occlusion, .. } = self.refiner.architecture();
+            if !is_guided {
                 return example.rendered.view.clone();
             }
             let mut draws = Draws::new(self.options.seed, SCORES, i as u64);
             let drawn = (0..self.options.references).map(|_| draws.below(references.len() as u64) as usize);
-            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>());
+            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), occlusion);
             guided.uses.iter().for_each(|of_use| uses.add(of_use));
             guided.view
         };
@@ -253,10 +254,8 @@ impl<'a> Drawn<'a> {
         let KnownView { rendered, truth } = self.example;
         let view = &rendered.view;
         let around = self.square.grown(refiner.reach());
-        let guide = refiner.architecture().guided.then(|| {
-            let references = self.references.iter().copied();
-            Guide::new(rendered, references, around.part(view))
-        });
+        let Architecture { guided, occlusion, .. } = refiner.architecture();
+        let guide = guided.then(|| Guide::new(rendered, self.references.iter().copied(), around.part(view), occlusion));
         around.fold(|x, y| {
             let (x, y) = self.turn.source(around, x, y);
             let pixel = around.of(view, x, y);
@@ -316,7 +315,7 @@ mod tests {
     fn trained(guided: bool) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
         let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided }, 3).unwrap();
+        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided, occlusion: true }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
@@ -337,7 +336,7 @@ mod tests {
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
-        let pixels = guided(&view.rendered, &[&other]).view;
+        let pixels = guided(&view.rendered, &[&other], true).view;
         let (mut seen, mut worst) = (0, 0.0f32);
         for (i, pixel) in pixels.data.chunks_exact(8).enumerate() {
             let column = i % 32;
@@ -352,6 +351,6 @@ mod tests {
             assert!(pixel[7] > if (5..20).contains(&column) { 0.9 } else { 0.7 }, "column {column}: {}", pixel[7]);
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
-        assert!(guided(&view.rendered, &[]).view.data.chunks_exact(8).all(|p| p[4..] == [0.0; 4]));
+        assert!(guided(&view.rendered, &[], true).view.data.chunks_exact(8).all(|p| p[4..] == [0.0; 4]));
     }
 }

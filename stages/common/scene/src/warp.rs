@@ -42,6 +42,20 @@ impl Surface<'_> {
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
     pub fn sight(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Sight> {
+        let (sight, at) = self.look(column, row, other.camera)?;
+        other.has_near(at).then_some(sight)
+    }
+
+    /// The same, were nothing between: how a camera would see it through whatever stands there.
+    ///
+    /// # Panics
+    /// Where a list hasn't one number a pixel, or the pixel lies outside.
+    pub fn sight_through(&self, column: usize, row: usize, other: &Camera) -> Option<Sight> {
+        self.look(column, row, other).map(|(sight, _)| sight)
+    }
+
+    /// How a camera would see what this view sees at a pixel, and where it would: x, y and depth.
+    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Sight, (f64, f64, f64))> {
         let i = row * self.camera.intrinsics.width as usize + column;
         if self.opacity[i] < 0.5 {
             return None;
@@ -49,24 +63,22 @@ impl Surface<'_> {
         let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
         let distance = f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray);
         let point = ray.at(distance);
-        let (x, y, depth) = other.camera.project(point)?;
-        other.has_near(x, y, depth).then(|| {
-            let way = point - other.camera.centre();
-            Sight {
-                place: [x as f32, y as f32],
-                cosine: (ray.direction.dot(way) / way.length()) as f32,
-                detail: (other.camera.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
-            }
-        })
+        let (x, y, depth) = other.project(point)?;
+        let size = [other.intrinsics.width, other.intrinsics.height].map(f64::from);
+        // NaN lies nowhere.
+        let is_inside = (0.0..=size[0]).contains(&x) && (0.0..=size[1]).contains(&y);
+        let way = point - other.centre();
+        let sight = Sight {
+            place: [x as f32, y as f32],
+            cosine: (ray.direction.dot(way) / way.length()) as f32,
+            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
+        };
+        is_inside.then_some((sight, (x, y, depth)))
     }
 
     /// Whether there is a surface of that depth at one of the four pixels around a position. All four lie in the picture or at its border.
-    fn has_near(&self, x: f64, y: f64, depth: f64) -> bool {
+    fn has_near(&self, (x, y, depth): (f64, f64, f64)) -> bool {
         let (width, height) = (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
-        // NaN lies nowhere.
-        if !(0.0..=width as f64).contains(&x) || !(0.0..=height as f64).contains(&y) {
-            return false;
-        }
         let around = |v: f64, size: usize| {
             let low = (v - 0.5).floor().max(0.0) as usize;
             [low.min(size - 1), (low + 1).min(size - 1)]
@@ -124,6 +136,8 @@ mod tests {
                 let at_plate = b.centre() + way * ((1.0 - b.centre().z) / way.z);
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
+                let through = from_a.sight_through(i % 64, i / 64, &b).map(|sight| sight.place);
+                assert!(through.is_some() == inside && (place.is_none() || place == through), "pixel {i} through what hides it");
                 match place {
                     Some([px, py]) => {
                         assert!((f64::from(px) - x).abs() < 1e-3 && (f64::from(py) - y).abs() < 1e-3);

@@ -1,0 +1,74 @@
+#!/usr/bin/env python3
+"""What each part of refinement brings: `make refine-ablation`.
+
+A refiner is trained for each row, and scored as its training ends, by views of the rehearsal that it left out: at LR size, where LR pictures are the
+truth, so that choices made by this table look at no HR picture and at no test view. References are other views of the rehearsal. What is in
+the store isn't run again. After every row OUT (one JSON array) is written anew; at the end a Markdown table is printed.
+"""
+
+import argparse
+import json
+import pathlib
+import subprocess
+import sys
+
+import cells
+import protocols
+
+# A part, and the parameters of train-refine that take it away or put something else in its place.
+PARTS = [
+    ("one reference", ["references=1"]),
+    ("no reference", ["references=0"]),
+    ("one reference, no occlusion test", ["references=1", "occlusion=false"]),
+    ("two references", ["references=2"]),
+    ("four references", ["references=4"]),
+    ("eight references", ["references=8"]),
+    ("one reference, 16 features", ["references=1", "channels=16"]),
+    ("one reference, two blocks", ["references=1", "blocks=2"]),
+]
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_llff_data/SCENE, nerf_synthetic/SCENE (or SCENE)")
+parser.add_argument("--scenes", nargs="+", default=["fern"])
+parser.add_argument("--protocol", default="252x4", help="LR width x scale")
+parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
+parser.add_argument("--steps", type=int, default=2000, help="steps of each training")
+parser.add_argument("--variants", type=int, help="only the first so many rows")
+parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/refine-ablation.json"))
+parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further parameters for every row")
+parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
+options = parser.parse_args()
+
+
+def trained(scene: str, settings: list[str]) -> dict:
+    """What a refiner's training says of it."""
+    chosen = protocols.settings(options.protocol, "kernel", refined=True)
+    chosen |= {"train-refine.steps": options.steps} | ({"split": options.split} if options.split else {})
+    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *(f"train-refine.{setting}" for setting in settings)])
+    wanted = ["train-refine", "-i", f"dataset={cells.dataset(options.data, scene)}"]
+    # Those of the field that isn't trained here mean nothing.
+    wanted += [word for name, value in chosen.items() if name not in ("rays", "members") for word in ("-p", f"{name}={value}")]
+    cells.call([options.nerf_sr, "run", *wanted])
+    status = subprocess.run([options.nerf_sr, "status", *map(str, wanted)], check=True, capture_output=True, text=True).stdout
+    line = next(line for line in status.splitlines() if line.split()[:1] == ["train-refine"])
+    start = line.split("cached")[1].split()[0]
+    (folder,) = pathlib.Path(".nerf-sr/objects").glob(f"{start}*")
+    return json.loads((folder / "refiner.json").read_text())
+
+
+rows: list[dict] = []
+for name, settings in PARTS[: options.variants]:
+    for scene in options.scenes:
+        print("==", scene, name, flush=True)
+        file = trained(scene, settings)
+        rows.append({"variant": name, "scene": scene, "rendered": file["rendered_psnr"], "refined": file["refined_psnr"], "trusted": file["trusted"]})
+        cells.write(options.out, rows)
+
+print(f"Views of the rehearsal left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")
+print("| variant | rendered | refined | gain | against the first |")
+print("| --- | --- | --- | --- | --- |")
+of = lambda name: [row for row in rows if row["variant"] == name]
+gain = lambda name: sum(row["refined"] - row["rendered"] for row in of(name)) / len(of(name))
+for name, _ in PARTS[: options.variants]:
+    mean = cells.mean(of(name))
+    print(f"| {name} | {mean['rendered']:.2f} | {mean['refined']:.2f} | {gain(name):+.2f} | {gain(name) - gain(PARTS[0][0]):+.2f} |")
