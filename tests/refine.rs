@@ -323,6 +323,33 @@ fn tables_have_rendered_and_refined_rows() {
     assert!(refined.len() == 3 && refined[0] != refined[1] && refined.iter().all(|r| r.is_finite()), "{refined:?}");
 }
 
+/// HR references that join the training: what they show is learnt.
+#[test]
+fn references_join_a_training() {
+    let project = Project::tiny();
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    let joined = "  train-joined:
+    like: train-ss
+    inputs: {scene: prep/train, references: prep/references}
+  joined-views:
+    like: render-depth
+    inputs: {field: train-joined, cameras: prep/cameras}
+  eval-joined:
+    like: eval
+    inputs: {views: joined-views, truth: prep/truth}
+";
+    project.write("pipeline.yaml", &(text + joined));
+    let arguments = ["eval", "eval-joined", "-p", "prep.references=6", "-p", "train-ss.rays=200000"];
+    project.ok(&[&["run"], &arguments[..]].concat());
+    let psnr = |stage: &str| {
+        let metrics = project.object(&project.output_of(stage, &arguments)[0]).join("metrics.json");
+        let metrics: serde_json::Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+        metrics["mean"]["psnr"].as_f64().unwrap()
+    };
+    println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
+    assert!(psnr("eval-joined") > psnr("eval") + 0.3);
+}
+
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
 fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'static str) {
     project.ok(&["run", "rehearsal-views"]);

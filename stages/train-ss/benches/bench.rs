@@ -11,7 +11,7 @@ use artifact::GivenInput;
 use radiance::{Architecture, Field, Passes, Ray, Trainer};
 use scene::{Bounds, Camera, Views};
 use serde::Serialize;
-use train_ss::Params;
+use train_ss::{Params, Photographs};
 
 #[derive(Serialize)]
 struct Row {
@@ -200,8 +200,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &scene.join("train"))?;
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
-        let pictures = train_ss::read_photographs(&input, &views)?;
-        let mut supervision = train_ss::supervision(&input, params, &views, pictures)?;
+        let mut supervision = train_ss::supervision(&input, params, Photographs::read(&input)?, None)?;
         let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width), &views.bounds.space);
         let training = params.grid_training(params.rays(0));
         let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
@@ -260,7 +259,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     let params =
         Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
     nets::deterministic();
-    let mut supervision = train_ss::supervision(input, &params, views, train_ss::read_photographs(input, views)?)?;
+    let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None)?;
     let architecture = params.mlp();
     let field = torch_field::Mlp::new(architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;

@@ -100,7 +100,13 @@ impl Stage for TrainSs {
     const ENVIRONMENT: &'static [&'static str] = &[nets::TF32_VARIABLE];
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("scene", Input::required(&["scene/train"], "LR images with cameras and bounds"))]
+        vec![
+            ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
+            (
+                "references",
+                Input::optional(&["scene/references"], "HR pictures of some views, to be trained on beside the LR ones"),
+            ),
+        ]
     }
 
     fn output() -> Output {
@@ -110,6 +116,7 @@ impl Stage for TrainSs {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         params.check().map_err(Failure::Usage)?;
         let input = context.input("scene")?;
+        let references = context.optional_input("references");
         let views = Views::read(input)?;
         let epoch = epoch(&views, params);
         let params = &params.published(&views.bounds.space, epoch);
@@ -122,7 +129,7 @@ impl Stage for TrainSs {
         let mut log = TrainingLog::default();
         for index in 0..params.members {
             let member = Member::new(context, params.member(index, all), model, index, log.rays)?;
-            log.add(member.run(input, &views, &progress)?);
+            log.add(member.run(input, references, &views, &progress)?);
             progress.set(log.rays, "");
         }
         let file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
@@ -145,15 +152,33 @@ pub fn epoch(views: &Views, params: &Params) -> u64 {
     views.views.iter().map(pixels).sum::<u64>() * sub_rays * sub_rays
 }
 
-/// LR photographs as the supervision wants them: over the background, or premultiplied RGBA where it is open.
-pub fn read_photographs(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
+/// Photographs to train on, each with its view: over the background, or premultiplied RGBA where that is open.
+#[derive(Clone, Debug)]
+pub struct Photographs {
+    /// Where they were taken from.
+    pub views: Views,
+    /// One for each view, of its camera's size.
+    pub pictures: Vec<Photograph>,
+}
+
+impl Photographs {
+    /// Reads those of an input.
+    pub fn read(input: &artifact::GivenInput) -> anyhow::Result<Self> {
+        let views = Views::read(input)?;
+        let pictures = read_pictures(input, &views)?;
+        Ok(Self { views, pictures })
+    }
+}
+
+fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
     let read = |view: &scene::View| -> anyhow::Result<Photograph> {
         let (name, k) = (&view.camera.name, view.camera.intrinsics);
-        let photograph = view.read_photograph(input).bad_input("scene")?;
-        let photograph = photograph.with_context(|| format!("view {name}: it has no image")).bad_input("scene")?;
+        let place = input.folder().display();
+        let photograph = view.read_photograph(input).bad_input(&place)?;
+        let photograph = photograph.with_context(|| format!("view {name}: it has no image")).bad_input(&place)?;
         let (width, height) = (photograph.picture.width, photograph.picture.height);
         if (width, height) != (k.width as usize, k.height as usize) {
-            let message = format!("view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
+            let message = format!("{place}: view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
             return Err(Failure::BadInput(message).into());
         }
         let is_open = views.background == scene::Background::Alpha;
@@ -166,15 +191,20 @@ pub fn read_photographs(input: &artifact::GivenInput, views: &Views) -> anyhow::
 pub fn supervision(
     input: &artifact::GivenInput,
     params: &Params,
-    views: &Views,
-    photographs: Vec<Photograph>,
+    photographs: Photographs,
+    references: Option<Photographs>,
 ) -> anyhow::Result<Supersampling> {
-    if photographs.iter().all(|p| p.mask.as_ref().is_some_and(|mask| mask.share() == 0.0)) {
+    let background = photographs.views.background;
+    if references.as_ref().is_some_and(|references| references.views.background != background) {
+        let message = "input references: another background than the scene's; have one prep make both";
+        return Err(Failure::BadInput(message.to_owned()).into());
+    }
+    if photographs.pictures.iter().all(|p| p.mask.as_ref().is_some_and(|mask| mask.share() == 0.0)) {
         return Err(Failure::BadInput("scene: masks leave no pixel of any photograph; white is what counts".to_owned()).into());
     }
     let known = input.path(DEGRADATION_FILE).exists();
     let made: Option<Degradation> = if known { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
-    let is_open = views.background == scene::Background::Alpha;
+    let is_open = background == scene::Background::Alpha;
     let ours = params.field == FieldKind::Grid && made.is_some() && !is_open;
     let best = if ours { Supervision::Kernel } else { Supervision::Average };
     let supervision = params.supervision.unwrap_or(best);
@@ -208,7 +238,7 @@ pub fn supervision(
         pose_refinement: params.pose_refinement,
         seed: params.seed,
     };
-    Ok(Supersampling::new(views, photographs, &options))
+    Ok(Supersampling::new(photographs, references, &options))
 }
 
 fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {

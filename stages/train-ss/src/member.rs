@@ -7,7 +7,7 @@ use scene::Views;
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, start};
-use crate::{Params, TrainingLog, epoch, read_hull, read_photographs, supervision};
+use crate::{Params, Photographs, TrainingLog, epoch, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
@@ -33,7 +33,13 @@ impl<'a> Member<'a> {
     }
 
     /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
-    pub(crate) fn run(&self, input: &GivenInput, views: &Views, progress: &Progress) -> anyhow::Result<TrainingLog> {
+    pub(crate) fn run(
+        &self,
+        input: &GivenInput,
+        references: Option<&GivenInput>,
+        views: &Views,
+        progress: &Progress,
+    ) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.finished() {
             self.context.say("going on from a field that an earlier run has trained");
             return Ok(log);
@@ -46,7 +52,7 @@ impl<'a> Member<'a> {
             }
             // A folder each, so that a checkpoint goes on with the seed it began with.
             let work = self.work.as_ref().map(|w| if restart == 0 { w.clone() } else { w.join(format!("restart-{restart}")) });
-            match self.train(&params, work.as_deref(), input, views, progress) {
+            match self.train(&params, work.as_deref(), (input, references), views, progress) {
                 Err(error) => match error.downcast_ref() {
                     Some(Collapsed(message)) => said.clone_from(message),
                     None => return Err(error),
@@ -70,12 +76,13 @@ impl<'a> Member<'a> {
         &self,
         params: &Params,
         work: Option<&Path>,
-        input: &GivenInput,
+        (input, references): (&GivenInput, Option<&GivenInput>),
         views: &Views,
         progress: &Progress,
     ) -> anyhow::Result<TrainingLog> {
         let context = self.context;
-        let mut supervision = supervision(input, params, views, read_photographs(input, views)?)?;
+        let references = references.map(Photographs::read).transpose()?;
+        let mut supervision = supervision(input, params, Photographs::read(input)?, references)?;
         let epoch = epoch(views, params);
         let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
         if total < group as u64 {

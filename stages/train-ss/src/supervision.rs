@@ -4,10 +4,11 @@ use std::sync::Arc;
 
 use pixels::{Filter, Picture, Resampling};
 use radiance::{Draws, Ray, RayField};
-use scene::{Background, Camera, Photograph, Views};
+use scene::{Background, Camera, Photograph};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::Photographs;
 use crate::exposure::Exposures;
 use crate::memory::{Kernel, Memory};
 use crate::moving_cameras::MovingCameras;
@@ -43,7 +44,10 @@ pub enum Order {
 /// rendered, those around it remembered ([`Memory`]), so that the whole footprint costs no more rays than the average. Each
 /// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
 pub struct Supersampling {
+    /// LR photographs, then references.
     views: Vec<TrainingView>,
+    /// How many of them are LR photographs.
+    low: usize,
     pixels: u64,
     background: Background,
     /// Sub-rays along x and y, when all are cast and now.
@@ -124,25 +128,31 @@ const REDRAWS: usize = 64;
 const SATURATED: f32 = 254.5 / 255.0;
 
 impl Supersampling {
-    /// Supervision by LR photographs that match the views, over the background or premultiplied where that is open. Pixels that don't count are
+    /// Supervision by LR photographs, and by HR ones that join them: of those, the mean of sub-rays is a pixel. Pixels that don't count are
     /// neither drawn nor compared with.
-    pub fn new(views: &Views, photographs: Vec<Photograph>, options: &SupersamplingOptions) -> Self {
+    pub fn new(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Self {
+        let (background, low) = (photographs.views.background, photographs.pictures.len());
         let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
         let operator = |picture: &Picture| {
             let (low, high) = ((picture.width, picture.height), (fine(picture.width, 0), fine(picture.height, 1)));
             (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
         };
-        let smallest =
-            |i: usize, length: fn(&Picture) -> usize| photographs.iter().map(|p| fine(length(&p.picture), i)).min().unwrap_or(1);
+        let smallest = |i: usize, length: fn(&Picture) -> usize| {
+            photographs.pictures.iter().map(|p| fine(length(&p.picture), i)).min().unwrap_or(1)
+        };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
         let mut memory = None;
         let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut with_detail = Vec::new();
-        let mut ready = Vec::with_capacity(photographs.len());
-        for (view, Photograph { mut picture, mask }) in views.views.iter().zip(photographs) {
+        let mut ready = Vec::new();
+        let mut cameras = Vec::new();
+        let all = [Some(photographs), references].into_iter().flatten();
+        for (view, Photograph { mut picture, mask }) in all.flat_map(|p| p.views.views.into_iter().zip(p.pictures)) {
             match options.supervision {
+                // References are what they are: nothing has shrunk them.
+                _ if ready.len() >= low => {}
                 Supervision::Average => {}
                 Supervision::Refiltered => {
                     let (enlarge, shrink) = operator(&picture);
@@ -165,14 +175,29 @@ impl Supersampling {
             let picture = Photograph { picture, mask }.known();
             pixels += (picture.width * picture.height) as u64;
             ready.push(TrainingView::new(picture, before, &view.camera));
+            cameras.push(view.camera);
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
-        let (background, focus) = (views.background, Focus::new(detail, pixels, with_detail));
+        let focus = Focus::new(detail, pixels, with_detail);
         let exposures = exposure.then(|| Exposures::new(ready.len()));
-        let cameras = || views.views.iter().map(|view| view.camera.clone()).collect();
-        let moving = options.pose_refinement.then(|| MovingCameras::new(cameras(), ready.iter().map(|view| &view.picture)));
+        let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(|view| &view.picture)));
         let side = full;
-        Self { views: ready, pixels, background, full, side, coarse, order, crop_groups, focus, seed, memory, exposures, moving }
+        Self {
+            views: ready,
+            low,
+            pixels,
+            background,
+            full,
+            side,
+            coarse,
+            order,
+            crop_groups,
+            focus,
+            seed,
+            memory,
+            exposures,
+            moving,
+        }
     }
 
     /// Sub-rays of an LR pixel along x and y, once all are cast.
@@ -180,9 +205,9 @@ impl Supersampling {
         self.full
     }
 
-    /// The memory, where the kernel is what counts by now.
-    fn kernel(&self) -> Option<&Memory> {
-        self.memory.as_ref().filter(|_| self.side == self.full)
+    /// The memory, where the kernel is what counts for a view by now.
+    fn kernel(&self, view: usize) -> Option<&Memory> {
+        self.memory.as_ref().filter(|_| self.side == self.full && view < self.low)
     }
 
     /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
@@ -239,12 +264,12 @@ impl Supersampling {
 
     /// Where the photographs were taken from, where that was asked for.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.moving.as_ref().map_or(&[], MovingCameras::cameras)
+        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.low])
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
-        self.exposures.as_ref().map_or(&[], Exposures::factors)
+        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.low])
     }
 
     /// The view and pixel that a group trains on.
@@ -342,7 +367,7 @@ impl radiance::Supervision for Supersampling {
         let background = self.behind(group);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
         // Where the sub-rays begin, and how far apart they are, in LR pixels.
-        let (start, apart) = match self.kernel() {
+        let (start, apart) = match self.kernel(index) {
             Some(memory) => memory.block_in_pixels(index, x, y),
             None => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
         };
@@ -365,7 +390,7 @@ impl radiance::Supervision for Supersampling {
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
         let is_cropped = group < self.crop_groups;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
-        if let Some(memory) = self.kernel() {
+        if let Some(memory) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
             let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
             let own = memory.pull(index, at, colours, picture, residual, gradients);
@@ -386,7 +411,7 @@ impl radiance::Supervision for Supersampling {
     }
 
     fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
-        if self.kernel().is_none() && self.exposures.is_none() {
+        if self.memory.is_none() && self.exposures.is_none() {
             return;
         }
         let (index, pixel) = self.pixel(group);
@@ -398,7 +423,7 @@ impl radiance::Supervision for Supersampling {
             let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
-        let is_remembered = self.side == self.full;
+        let is_remembered = self.side == self.full && index < self.low;
         if let Some(memory) = self.memory.as_mut().filter(|_| is_remembered) {
             memory.remember(index, pixel % picture.width, pixel / picture.width, colours);
         }
@@ -408,7 +433,7 @@ impl radiance::Supervision for Supersampling {
 #[cfg(test)]
 mod tests {
     use radiance::Supervision as _;
-    use scene::{Bounds, Camera, Intrinsics, View};
+    use scene::{Bounds, Camera, Intrinsics, View, Views};
 
     use super::*;
 
@@ -441,7 +466,8 @@ mod tests {
         let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0, ..Default::default() };
         let views = Views::new(Background::White, bounds, vec![View::camera_only(camera.clone())]);
         let picture = picture.unwrap_or_else(|| Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
-        (Supersampling::new(&views, vec![picture.into()], &options(supervision, scale)), camera)
+        let photographs = Photographs { views, pictures: vec![picture.into()] };
+        (Supersampling::new(photographs, None, &options(supervision, scale)), camera)
     }
 
     /// The sub-rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
@@ -600,7 +626,8 @@ mod tests {
             let picture = Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
             let photograph = Photograph { picture, mask: Some(mask) };
-            let masked = Supersampling::new(&views, vec![photograph], &options(kind, [2.0, 2.0]));
+            let masked = Photographs { views, pictures: vec![photograph] };
+            let masked = Supersampling::new(masked, None, &options(kind, [2.0, 2.0]));
             let mut drawn = [false; 20];
             (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
@@ -620,6 +647,40 @@ mod tests {
         }
         assert_eq!(residual(0.2, f32::NAN), 0.0);
         assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
+    }
+
+    /// References join LR pictures as they are: whatever made those, the mean of its sub-rays is a reference's pixel.
+    #[test]
+    fn references_are_compared_with_themselves() {
+        let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
+        let given = |name: &str, scale: usize| {
+            let camera = Camera { name: name.into(), ..camera.resized(5 * scale as u32, 4 * scale as u32) };
+            let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
+            Photographs { views, pictures: vec![fine_picture(5 * scale, 4 * scale).into()] }
+        };
+        let alone = Supersampling::new(given("a", 2), None, &options(Supervision::Average, [2.0, 2.0]));
+        for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
+            let mut joined = Supersampling::new(given("a", 1), Some(given("a", 2)), &options(kind, [2.0, 2.0]));
+            let drawn = |of: &Supersampling, view: usize, pixel: usize| (0..).find(|&g| of.pixel(g) == (view, pixel)).unwrap();
+            let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
+            for pixel in [0, 33, 79] {
+                let (group, other) = (drawn(&joined, 1, pixel), drawn(&alone, 0, pixel));
+                let mut rays = [[Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4]; 2];
+                let mut gradients = [[[0.0; 3]; 4]; 2];
+                joined.cast(group, &mut rays[0]);
+                alone.cast(other, &mut rays[1]);
+                assert_eq!(rays[0].map(|r| r.direction), rays[1].map(|r| r.direction), "{kind:?}");
+                let losses = [joined.judge(group, &colours, &mut gradients[0]), alone.judge(other, &colours, &mut gradients[1])];
+                assert!(losses[0] == losses[1] && gradients[0] == gradients[1], "{kind:?}");
+                joined.remember(group, &colours);
+            }
+            // LR pictures have what they had.
+            let (low, plain) = (drawn(&joined, 0, 7), Supersampling::new(given("a", 1), None, &options(kind, [2.0, 2.0])));
+            let mut gradients = [[[0.0; 3]; 4]; 2];
+            joined.judge(low, &colours, &mut gradients[0]);
+            plain.judge(drawn(&plain, 0, 7), &colours, &mut gradients[1]);
+            assert_eq!(gradients[0], gradients[1], "{kind:?}");
+        }
     }
 
     #[test]
