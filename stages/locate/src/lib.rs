@@ -7,7 +7,7 @@
 
 use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::PixelError;
-use poses::{Options, Pyramid, refine};
+use poses::{Moved, Options, Pyramid, refine};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -98,14 +98,7 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
 
 /// How far cameras went, and what it was good for.
 fn summary(given: &Views, cameras: &[Camera], located: u32, errors: [f64; 2]) -> String {
-    let share = 1.0 / f64::from(located.max(1));
-    let (mut turn, mut shift) = (0.0, 0.0);
-    for (view, camera) in given.views.iter().zip(cameras) {
-        let by = poses::apart(&view.camera, camera);
-        (turn, shift) = (turn + share * by.angle.to_degrees(), shift + share * by.distance);
-    }
-    let [before, after] = errors.map(|e| (share * e).sqrt());
-    format!(
-        "{located} cameras turned by {turn:.3}° and moved by {shift:.4} in the mean; error (Huber's) {before:.4} before, {after:.4} after"
-    )
+    let moved = Moved::between(given.views.iter().map(|view| &view.camera).zip(cameras));
+    let [before, after] = errors.map(|e| (e / f64::from(located.max(1))).sqrt());
+    format!("{located} of {} cameras located: {moved}; error (Huber's) {before:.4} before, {after:.4} after", cameras.len())
 }

@@ -114,9 +114,14 @@ impl<'a> Member<'a> {
             progress.set(self.before + rays, &curve.note());
             checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
         }
+        let refined = supervision.refined_cameras();
+        if !refined.is_empty() {
+            let moved = poses::Moved::between(views.views.iter().map(|view| &view.camera).zip(refined));
+            context.say(format!("cameras have {moved}"));
+        }
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         log.exposures = supervision.exposures().to_vec();
-        log.poses = supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
+        log.poses = refined.iter().map(|camera| camera.camera_to_world).collect();
         trainer.finish(&self.output)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;

@@ -2,6 +2,7 @@
 //!
 //! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
 //! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
+//! * [`Moved`]: how far cameras have gone, in words for a log.
 //! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
 //!
 //! A photograph's own gradient says how each of its pixels would change if what it shows moved in the picture, and the rendered depth how
@@ -27,6 +28,7 @@
 //! ```
 
 use std::error::Error;
+use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix6, Vector6};
@@ -290,18 +292,33 @@ fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
     Camera { camera_to_world: [row(0), row(1), row(2)], ..camera.clone() }
 }
 
-/// How far one camera is from another.
+/// How far cameras have moved, in the mean.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Apart {
-    /// Angle between the two, in radians.
+pub struct Moved {
+    /// Angle by which they have turned, in radians.
     pub angle: f64,
-    /// Distance between their centres, in scene units.
+    /// Distance of their centres from where they were, in scene units.
     pub distance: f64,
 }
 
-/// How far two cameras are apart.
-pub fn apart(a: &Camera, b: &Camera) -> Apart {
-    Apart { angle: rotation(a).angle_between(rotation(b)), distance: a.centre().distance(b.centre()) }
+impl Moved {
+    /// From the first to the second of each pair.
+    pub fn between<'a>(pairs: impl Iterator<Item = (&'a Camera, &'a Camera)>) -> Self {
+        let (mut count, mut sum) = (0.0f64, Self { angle: 0.0, distance: 0.0 });
+        for (from, to) in pairs {
+            count += 1.0;
+            sum.angle += rotation(from).angle_between(rotation(to));
+            sum.distance += from.centre().distance(to.centre());
+        }
+        let count = count.max(1.0);
+        Self { angle: sum.angle / count, distance: sum.distance / count }
+    }
+}
+
+impl fmt::Display for Moved {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "turned by {:.3}° and moved by {:.4} in the mean", self.angle.to_degrees(), self.distance)
+    }
 }
 
 /// Moves all cameras back together so that in the mean they have neither turned nor shifted nor spread from where they were: a motion that all

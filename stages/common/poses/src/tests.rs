@@ -160,6 +160,16 @@ fn what_says_nothing_moves_nothing() {
 }
 
 #[test]
+fn motions_are_told() {
+    let camera = camera(2);
+    let moved = motion([0.0, 0.01, 0.0], [0.3, 0.0, -0.4]).applied_to(&camera);
+    let told = Moved::between([(&camera, &moved), (&camera, &camera)].into_iter());
+    assert!((told.angle - 0.005).abs() < 1e-6 && (told.distance - 0.25).abs() < 1e-9, "{told:?}");
+    assert_eq!(told.to_string(), "turned by 0.286° and moved by 0.2500 in the mean");
+    assert_eq!(Moved::between(std::iter::empty()).distance, 0.0);
+}
+
+#[test]
 fn common_motion_is_taken_back() {
     let were: Vec<Camera> = (0..7).map(camera).collect();
     let (turn, shift) = (DQuat::from_scaled_axis(DVec3::new(0.1, -0.05, 0.07)), DVec3::new(0.3, -0.2, 0.1));
