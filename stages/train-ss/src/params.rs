@@ -103,6 +103,8 @@ pub struct Params {
     /// `mlp`: octaves of the directions' encoding.
     #[schemars(range(min = 0, max = 16))]
     pub direction_octaves: u32,
+    /// `mlp` in NDC: colours depend on the ray's direction there, as in the reference's code, instead of on its direction in the world.
+    pub ndc_directions: bool,
     /// `mlp`: layers before density and colour part.
     #[schemars(range(min = 1, max = 32))]
     pub layers: u32,
@@ -155,6 +157,7 @@ impl Default for Params {
             steps: None,
             position_octaves: mlp.position_octaves,
             direction_octaves: mlp.direction_octaves,
+            ndc_directions: mlp.ndc_directions,
             layers: mlp.depth,
             coarse_samples: mlp.coarse_samples,
             fine_samples: mlp.fine_samples,
@@ -208,6 +211,7 @@ impl Params {
                 ("schedule", self.schedule != default.schedule),
                 ("position_octaves", self.position_octaves != default.position_octaves),
                 ("direction_octaves", self.direction_octaves != default.direction_octaves),
+                ("ndc_directions", self.ndc_directions != default.ndc_directions),
                 ("layers", self.layers != default.layers),
                 ("coarse_samples", self.coarse_samples != default.coarse_samples),
                 ("fine_samples", self.fine_samples != default.fine_samples),
@@ -308,6 +312,7 @@ impl Params {
         MlpArchitecture {
             position_octaves: self.position_octaves,
             direction_octaves: self.direction_octaves,
+            ndc_directions: self.ndc_directions,
             depth: self.layers,
             width: self.or(self.hidden, 64, MlpArchitecture::default().width),
             coarse_samples: self.coarse_samples,

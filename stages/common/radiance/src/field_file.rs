@@ -67,11 +67,22 @@ pub struct MlpArchitecture {
     pub coarse_samples: u32,
     /// Samples that the fine network has besides those.
     pub fine_samples: u32,
+    /// In NDC: colours depend on the ray's direction there, from the near to the far plane and not of unit length, as the reference's code has
+    /// it; without it on its direction in the world.
+    pub ndc_directions: bool,
 }
 
 impl Default for MlpArchitecture {
     fn default() -> Self {
-        Self { position_octaves: 10, direction_octaves: 4, depth: 8, width: 256, coarse_samples: 64, fine_samples: 64 }
+        Self {
+            position_octaves: 10,
+            direction_octaves: 4,
+            depth: 8,
+            width: 256,
+            coarse_samples: 64,
+            fine_samples: 64,
+            ndc_directions: false,
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 pub(crate) struct Courses {
     origin: Tensor,
     direction: Tensor,
-    /// The direction in the world: n × 3.
+    /// What colours depend on: n × 3. The direction in the world, of unit length, or that in NDC, of which z goes from -1 to 1.
     pub(crate) view: Tensor,
     /// Where they enter and leave, by their parameter t: n × 1. Equal where they meet nothing.
     pub(crate) enter: Tensor,
@@ -18,7 +18,7 @@ pub(crate) struct Courses {
 }
 
 impl Courses {
-    pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device) -> Result<Self, TchError> {
+    pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device, ndc_directions: bool) -> Result<Self, TchError> {
         let rays: Vec<UnitRay> = rays.iter().map(|r| clip(bounds, r)).collect();
         let columns = |width: i64, of: &dyn Fn(&UnitRay, &mut Vec<f32>)| {
             let mut values = Vec::with_capacity(rays.len() * width as usize);
@@ -33,12 +33,14 @@ impl Courses {
                 Course::Contracted { start, scale, reach } => [start, scale, reach][k],
             })
         };
+        let is_ndc = ndc_directions && matches!(bounds.space, Space::Ndc(_));
+        let in_ndc = |r: &UnitRay| r.direction.map(|d| 2.0 * d / r.direction[2]);
         // What isn't finite meets nothing; its view must not spoil the others' sums.
         let tame = |v: [f32; 3]| if v.iter().all(|x| x.is_finite()) { v } else { [0.0; 3] };
         Ok(Self {
             origin: three(|r| r.origin)?,
             direction: three(|r| r.direction)?,
-            view: columns(3, &|r, to| to.extend(tame(r.view)))?,
+            view: columns(3, &|r, to| to.extend(tame(if is_ndc { in_ndc(r) } else { r.view })))?,
             enter: one(&|r| r.enter)?,
             leave: one(&|r| r.leave.max(r.enter))?,
             distance: [of_course(0)?, of_course(1)?, of_course(2)?],
@@ -84,4 +86,33 @@ pub(crate) fn fused(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchErr
 /// sinh(4t).
 fn sinh4(t: &Tensor) -> Result<Tensor, TchError> {
     t.f_mul_scalar(4.0)?.f_sinh()
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+    use scene::Frustum;
+
+    use super::*;
+
+    /// In NDC a direction goes from the near to the far plane, as the reference computes it: d' = to - from with z from -1 to 1.
+    #[test]
+    fn ndc_directions_are_the_references() {
+        let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
+        let frustum = Frustum { camera_to_world, min: [-0.5, -0.4], max: [0.5, 0.4], near: 1.0, far: 1e9 };
+        let bounds = Bounds { min: [-9.; 3], max: [9.; 3], near: 0.0, far: 1e9, space: Space::Ndc(frustum) };
+        let (origin, direction) = (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
+        let ray = Ray { origin: origin.as_vec3().to_array(), direction: direction.as_vec3().to_array(), background: [1.0; 3] };
+        let view = |ndc: bool| {
+            let courses = Courses::new(&bounds, &[ray], Device::Cpu, ndc).unwrap();
+            [0, 1, 2].map(|i| courses.view.double_value(&[0, i]))
+        };
+        // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W / 2) is 1 / 0.5, which our NDC, as wide as high, has
+        // for y, too.
+        let start = origin + direction * ((-1.0 - origin.z) / direction.z);
+        let slope = [direction.x / direction.z - start.x / start.z, direction.y / direction.z - start.y / start.z];
+        let expected = [-slope[0] / 0.5, -slope[1] / 0.5, 2.0];
+        assert!(view(true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{:?} {expected:?}", view(true));
+        assert!(view(false).iter().zip(direction.to_array()).all(|(a, b)| (a - b).abs() < 1e-6));
+    }
 }

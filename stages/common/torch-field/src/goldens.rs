@@ -62,8 +62,15 @@ fn published_size_forward_in_f32() {
 
 /// The small field, its rays and draws.
 fn small() -> (Mlp, Batch, SampleDraws) {
-    let architecture =
-        MlpArchitecture { position_octaves: 4, direction_octaves: 2, depth: 6, width: 16, coarse_samples: 8, fine_samples: 8 };
+    let architecture = MlpArchitecture {
+        position_octaves: 4,
+        direction_octaves: 2,
+        depth: 6,
+        width: 16,
+        coarse_samples: 8,
+        fine_samples: 8,
+        ndc_directions: false,
+    };
     let bounds = Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Default::default() };
     let [coarse, fine] = [2000, 3000].map(|purpose| network(architecture, purpose, Kind::Double));
     let field = Mlp { architecture, bounds, coarse, fine, device: Device::Cpu };

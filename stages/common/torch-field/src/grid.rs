@@ -201,7 +201,7 @@ impl TorchGrid {
     /// What rays see, with samples `offsets` (n) of a step along.
     pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
-        let courses = Courses::new(&self.bounds, rays, self.device)?;
+        let courses = Courses::new(&self.bounds, rays, self.device, false)?;
         let longest = courses.leave.f_sub(&courses.enter)?.f_max()?.f_double_value(&[])?;
         let count = ((longest / self.step()).ceil() as i64).max(1);
         let k = Tensor::f_arange(count, (Kind::Float, self.device))?.f_add(&offsets.f_unsqueeze(-1)?)?;

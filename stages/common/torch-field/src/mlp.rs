@@ -82,7 +82,9 @@ impl SampleDraws {
 }
 
 impl Batch {
-    pub(crate) fn new(rays: &[Ray], bounds: &Bounds, device: Device) -> Result<Self, TchError> {
+    /// Rays as a field sees them.
+    pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
+        let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } = *field;
         let rows = |of: &dyn Fn(&Ray) -> [f32; 3]| {
             let values: Vec<f32> = rays.iter().flat_map(of).collect();
             Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, 3])?.f_to_device(device)
@@ -91,7 +93,7 @@ impl Batch {
             origin: rows(&|r| r.origin)?,
             direction: rows(&|r| r.direction)?,
             background: rows(&|r| r.background)?,
-            courses: (bounds.space != Space::Box).then(|| Courses::new(bounds, rays, device)).transpose()?,
+            courses: (bounds.space != Space::Box).then(|| Courses::new(&bounds, rays, device, ndc_directions)).transpose()?,
         })
     }
 }
@@ -236,7 +238,7 @@ impl Mlp {
         let usable = |r: &Ray| r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3];
         let tame: Vec<Ray> =
             rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
-        let batch = Batch::new(&tame, &self.bounds, self.device)?;
+        let batch = Batch::new(&tame, self)?;
         let hits = batch.courses.as_ref().map(|c| host(&c.hits()?)).transpose()?;
         let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
@@ -302,7 +304,7 @@ mod tests {
         for space in [Space::Ndc(frustum), Space::Contraction] {
             let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space };
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
-            let seen = no_grad(|| field.see(&Batch::new(&rays, &bounds, Device::Cpu).unwrap(), None)).unwrap();
+            let seen = no_grad(|| field.see(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
             for (i, distances) in host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
                 let course = clip(&bounds, &rays[i]);
                 let ends = [course.distance(course.enter), course.distance(course.leave)];

@@ -200,7 +200,7 @@ impl Plan {
     fn run(self, field: &Mlp, supervision: &impl Supervision, range: std::ops::Range<usize>) -> Result<Piece, TchError> {
         let rays = self.step.cast(supervision, &range);
         let draws = SampleDraws::new(field, self.seed, self.step.first_ray(&range), rays.len(), self.noise)?;
-        let seen = field.see(&Batch::new(&rays, &field.bounds, field.device)?, Some(&draws))?;
+        let seen = field.see(&Batch::new(&rays, field)?, Some(&draws))?;
         let coarse = self.step.judge(supervision, &range, &seen.coarse.colour)?;
         let fine = self.step.judge(supervision, &range, &seen.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
