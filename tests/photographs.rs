@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use common::{Project, stage};
 use glam::{DMat3, DQuat, DVec3};
+use scene::{Distortion, Intrinsics};
 use serde_json::{Value, json};
 
 const WIDTH: u32 = 32;
@@ -236,6 +237,56 @@ fn exposures_are_found() {
     assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
     let open = ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
+}
+
+/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets fog.
+#[test]
+fn lenses_are_followed_or_undone() {
+    let project = Project::tiny();
+    let folder = as_transforms(&project);
+    let file = folder.join("transforms.json");
+    let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let distortion = Distortion { radial: [3.0, 0.0, 0.0], tangential: [0.0, 0.05] };
+    let lens = Intrinsics { distortion, ..Intrinsics::from_angle_x(WIDTH, WIDTH, ANGLE) };
+    (transforms["k1"], transforms["p2"]) = (json!(distortion.radial[0]), json!(distortion.tangential[1]));
+    std::fs::write(&file, transforms.to_string()).unwrap();
+    let size = WIDTH as usize;
+    for frame in transforms["frames"].as_array().unwrap() {
+        let path = folder.join(frame["file_path"].as_str().unwrap());
+        let pinhole = pixels::read_png(&path).unwrap();
+        let pixel = |column: usize, row: usize| [0, 1, 2, 3].map(|c| f64::from(pinhole.data[4 * (row * size + column) + c]));
+        let seen = |i: usize| {
+            let at = lens.undistort([(i % size) as f64 + 0.5, (i / size) as f64 + 0.5]);
+            pixels::sample_cubic((size, size), at, pixel).map(|v| (v + 0.5) as u8)
+        };
+        pixels::write_png(&path, &pixels::Rgba8::new(size, size, (0..size * size).flat_map(seen).collect())).unwrap();
+    }
+    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("rays: 60000", "rays: 400000");
+    let psnr = |lens: &str| {
+        let settings = ["-i", "dataset=./transforms", "-p", lens];
+        project.ok(&[&["run"], &settings[..]].concat());
+        let metrics = project.object(&project.output_of("eval", &settings)[0]).join("metrics.json");
+        let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+        metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+    };
+    let [followed, undone, ignored] = ["lens=follow", "lens=undo", "lens=ignore"].map(psnr);
+    println!("{followed:.2} dB followed, {undone:.2} dB undone, {ignored:.2} dB ignored");
+    assert!(
+        followed > ignored + 1.0 && undone > ignored + 1.0,
+        "{followed} dB followed, {undone} dB undone, {ignored} dB ignored"
+    );
+    // Cameras say so, and films don't.
+    let scene = project.object(&project.output_of("prep", &["-i", "dataset=./transforms"])[0]).join("cameras");
+    let film = project.path("film");
+    assert_eq!(stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &scene)], &film, &[]).code, 0);
+    let is_bent = |folder: &Path| views(folder)[0]["camera"]["intrinsics"].get("distortion").is_some();
+    assert!(is_bent(&scene) && !is_bent(&film));
+    // Beyond 0.55 of the focal length nothing is seen by such a lens: the corners have no ray.
+    transforms["k1"] = json!(-1.1);
+    std::fs::write(&file, transforms.to_string()).unwrap();
+    project.run(&["run", "-i", "dataset=./transforms"]).fails(3, &["frame r_0", "k1 -1.1", "lens: undo"]);
+    project.ok(&["run", "prep", "-i", "dataset=./transforms", "-p", "lens=undo"]);
 }
 
 /// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those that it is tested by are found by it.

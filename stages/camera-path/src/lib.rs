@@ -74,7 +74,9 @@ impl Stage for CameraPath {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let input = context.input("cameras")?;
         let given = Views::read(input)?;
-        let first = &given.views[0].camera;
+        let mut first = given.views[0].camera.clone();
+        // Films are taken without lens distortion.
+        first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
         let is_scene = input.path(DEGRADATION_FILE).exists();
         let made: Option<Degradation> = if is_scene { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
         let width = params.size.or(made.map(|d| d.hr[0])).unwrap_or(first.intrinsics.width);

@@ -64,7 +64,15 @@ mod tests {
     fn camera(name: &str, x: f64) -> Camera {
         Camera {
             name: name.into(),
-            intrinsics: Intrinsics { width: 40, height: 4, fx: 40.0, fy: 40.0, cx: 20.0, cy: 2.0 },
+            intrinsics: Intrinsics {
+                width: 40,
+                height: 4,
+                fx: 40.0,
+                fy: 40.0,
+                cx: 20.0,
+                cy: 2.0,
+                distortion: Default::default(),
+            },
             camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 0.]],
         }
     }

@@ -74,7 +74,7 @@ fn frustum(sights: &[Sight]) -> Result<Frustum, SpaceError> {
     for (camera, depths) in sights {
         let [nearest, farthest] = depths.ok_or(SpaceError::NoDepths)?;
         // Known depths are those of points that were found; twice as far may be more.
-        for corner in corners(camera, [0.9 * nearest, 2.0 * farthest]) {
+        for corner in border(camera, [0.9 * nearest, 2.0 * farthest]) {
             let p = frustum.to_camera(corner);
             if p.z <= 0.0 {
                 return Err(SpaceError::NotForward);
@@ -106,11 +106,10 @@ fn contracted(boxed: Bounds, sights: &[Sight]) -> Bounds {
     Bounds { near, far, space: Space::Contraction, ..boxed }
 }
 
-/// The corners of what a camera sees between two depths.
-fn corners(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_ {
-    let (width, height) = (f64::from(camera.intrinsics.width), f64::from(camera.intrinsics.height));
-    let rays = [(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)].map(|(x, y)| camera.ray(x, y));
-    rays.into_iter().flat_map(move |ray| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray))))
+/// The border of what a camera sees between two depths.
+fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_ {
+    let rays = camera.intrinsics.border().map(|[x, y]| camera.ray(x, y));
+    rays.flat_map(move |ray| depths.map(|depth| ray.at(depth / camera.depth_per_distance(&ray))))
 }
 
 /// A box around what all cameras look at, from the cameras alone where they say enough.
@@ -164,7 +163,7 @@ fn around_frusta(sights: &[Sight]) -> Option<Bounds> {
     for (camera, depths) in sights {
         let [nearest, farthest] = (*depths)?;
         near = near.min(0.9 * nearest);
-        for corner in corners(camera, [0.9 * nearest, 1.1 * farthest]) {
+        for corner in border(camera, [0.9 * nearest, 1.1 * farthest]) {
             (min, max) = (min.min(corner), max.max(corner));
             far = far.max((corner - camera.centre()).length());
         }
@@ -277,7 +276,7 @@ mod tests {
             let Space::Ndc(frustum) = bounds.space else { panic!("{bounds:?}") };
             assert!(bounds.is_valid() && frustum.near > 1.5 * scale && frustum.far < 21.0 * scale, "{frustum:?}");
             for camera in &row {
-                for corner in corners(camera, [2.0 * scale, 15.0 * scale]) {
+                for corner in border(camera, [2.0 * scale, 15.0 * scale]) {
                     let p = frustum.to_cube(frustum.to_camera(corner)).to_array();
                     assert!(p.iter().all(|x| (-1e-9..=1.0 + 1e-9).contains(x)), "{p:?}");
                 }

@@ -50,6 +50,8 @@ pub struct Params {
     pub degrade: Option<Degrade>,
     /// How LR images are made from HR ones; where nothing is made, what is taken to have made them. Without it: `lanczos`, there `box`.
     pub kernel: Option<Kernel>,
+    /// What is done about lenses that aren't pinholes.
+    pub lens: LensHandling,
     /// What lies behind the scene; `alpha` keeps it open, `opaque` says that there is nothing behind. Without it: `opaque` where the
     /// space holds all that is seen (`ndc`, `contraction`) and pictures aren't transparent, else `white`.
     pub background: Option<Background>,
@@ -82,6 +84,7 @@ impl Default for Params {
             scale: None,
             degrade: None,
             kernel: None,
+            lens: LensHandling::Follow,
             background: None,
             near: None,
             far: None,
@@ -92,6 +95,18 @@ impl Default for Params {
             references: 1,
         }
     }
+}
+
+/// What is done about lens distortion, where the data say what it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum LensHandling {
+    /// Rays follow it: photographs stay as they were taken, to the last pixel, and so do rendered views.
+    Follow,
+    /// Photographs are resampled to what pinhole cameras would have taken, and lose a border.
+    Undo,
+    /// Photographs are taken for a pinhole's: the habit with LLFF's scenes, whose files don't speak of lenses. To compare with.
+    Ignore,
 }
 
 /// How LR images come about.
@@ -203,6 +218,20 @@ impl Stage for Prep {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let mut set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
+        set = match params.lens {
+            LensHandling::Follow => {
+                for frame in &set.frames {
+                    let ask = "parameter lens: undo keeps what has its ray";
+                    frame
+                        .camera()
+                        .check()
+                        .map_err(|e| Failure::BadInput(format!("dataset: {}: {e} ({ask})", frame_name(frame))))?;
+                }
+                set
+            }
+            LensHandling::Undo => set.undistorted().bad_input("dataset")?,
+            LensHandling::Ignore => set.without_distortion(),
+        };
         if matches!(params.split, Some(SplitKind::Holdout | SplitKind::Paper)) {
             set = set.merged();
         }
@@ -213,7 +242,7 @@ impl Stage for Prep {
                 split.test = (0..most).map(|i| split.test[i * all / most]).collect();
             }
         }
-        let first = set.frames[split.train[0]].pinhole().bad_input("dataset")?;
+        let first = set.frames[split.train[0]].intrinsics();
         let native = (first.width, first.height);
         let making = Making::new(&set, params).map_err(Failure::Usage)?;
         let sizes = if making.has_truth {
@@ -225,8 +254,8 @@ impl Stage for Prep {
         let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
         notes.iter().for_each(|note| context.say(note));
         if making.kernel == Kernel::Average {
-            let all = split.train.iter().chain(&split.test).map(|&i| set.frames[i].pinhole().map(|k| job.sizes_of(&k)));
-            if let Some(odd) = all.collect::<Result<Vec<_>, _>>().bad_input("dataset")?.iter().find(|s| !s.is_integer()) {
+            let mut all = split.train.iter().chain(&split.test).map(|&i| job.sizes_of(&set.frames[i].intrinsics()));
+            if let Some(odd) = all.find(|s| !s.is_integer()) {
                 let message =
                     format!("parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box", odd.hr, odd.lr);
                 return Err(Failure::Usage(message).into());
@@ -242,7 +271,7 @@ fn background_of(space: &Space, frame: &Frame) -> anyhow::Result<Background> {
     if *space == Space::Box {
         return Ok(Background::White);
     }
-    let (picture, _) = frame.photograph().bad_input(frame_name(frame))?;
+    let picture = frame.photograph().bad_input(frame_name(frame))?;
     let is_opaque = picture.data.chunks_exact(4).all(|p| p[3] == 255);
     Ok(if is_opaque { Background::Opaque } else { Background::White })
 }
@@ -259,7 +288,7 @@ fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
             let most = (params.references as usize).min(count.saturating_sub(1));
-            let chosen = references::choose(set.frames.iter().map(|f| f.camera(f.lens.intrinsics).centre()), most);
+            let chosen = references::choose(set.frames.iter().map(|f| f.camera().centre()), most);
             split.test.retain(|i| !chosen.contains(i));
             Ok(split)
         }
@@ -344,11 +373,8 @@ struct Job<'a> {
 impl Job<'_> {
     fn run(&self, set: &Dataset, mut notes: Vec<String>, train: &[&Frame], test: &[&Frame]) -> anyhow::Result<()> {
         let progress = self.context.progress("preparing", (train.len() + test.len()) as u64);
-        let cameras = |frames: &[&Frame]| -> anyhow::Result<Vec<Camera>> {
-            frames.iter().map(|f| Ok(f.camera(f.pinhole().bad_input("dataset")?))).collect()
-        };
-        let train_cameras = cameras(train)?;
-        let test_cameras = cameras(test)?;
+        let cameras = |frames: &[&Frame]| -> Vec<Camera> { frames.iter().map(|f| f.camera()).collect() };
+        let (train_cameras, test_cameras) = (cameras(train), cameras(test));
         // What the user says of all views stands in for what isn't known of each.
         let given =
             self.params.near.zip(self.params.far).map(|(near, far)| [near, far]).filter(|[near, far]| 0.0 < *near && near < far);
@@ -529,11 +555,11 @@ impl Job<'_> {
 
     /// The HR picture, where there is one, and the LR picture.
     fn pictures(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LowResolution)> {
-        let (image, pinhole) = frame.photograph().bad_input(frame_name(frame))?;
+        let image = frame.photograph().bad_input(frame_name(frame))?;
         if !self.making.has_truth {
             return Ok((None, LowResolution::Bytes(image)));
         }
-        let (hr, lr) = degrade(&image, &self.sizes_of(&pinhole), self.making.kernel);
+        let (hr, lr) = degrade(&image, &self.sizes_of(&frame.intrinsics()), self.making.kernel);
         Ok((Some(hr), lr))
     }
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use pixels::{Filter, Picture, Resampling};
 use radiance::{Draws, Ray, RayField};
-use scene::{Background, Camera, Photograph};
+use scene::{Background, Camera, Intrinsics, Photograph};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -68,8 +68,9 @@ struct TrainingView {
     picture: Picture,
     /// Number of pixels in the views before this one.
     before: u64,
+    intrinsics: Intrinsics,
     origin: [f32; 3],
-    /// Direction of image position (0, 0), and what one pixel to the right or down adds; not of unit length.
+    /// Of a pinhole: direction of image position (0, 0), and what one pixel to the right or down adds; not of unit length.
     corner: [f64; 3],
     right: [f64; 3],
     down: [f64; 3],
@@ -77,7 +78,9 @@ struct TrainingView {
 
 impl TrainingView {
     fn new(picture: Picture, before: u64, camera: &Camera) -> Self {
-        let mut view = Self { picture, before, origin: [0.0; 3], corner: [0.0; 3], right: [0.0; 3], down: [0.0; 3] };
+        let none = [0.0; 3];
+        let mut view =
+            Self { picture, before, intrinsics: camera.intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
         view.place(camera);
         view
     }
@@ -375,6 +378,7 @@ impl radiance::Supervision for Supersampling {
             let (a, b) = (k % self.side[0], k / self.side[0]);
             let u = start[0] + (a as f64 + 0.5) * apart[0];
             let v = start[1] + (b as f64 + 0.5) * apart[1];
+            let [u, v] = view.intrinsics.undistort([u, v]);
             let d: [f64; 3] = std::array::from_fn(|i| view.corner[i] + u * view.right[i] + v * view.down[i]);
             let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
             *ray = Ray { origin: view.origin, direction: d.map(|x| (x / length) as f32), background };
@@ -433,7 +437,7 @@ impl radiance::Supervision for Supersampling {
 #[cfg(test)]
 mod tests {
     use radiance::Supervision as _;
-    use scene::{Bounds, Camera, Intrinsics, View, Views};
+    use scene::{Bounds, Camera, Distortion, View, Views};
 
     use super::*;
 
@@ -458,9 +462,10 @@ mod tests {
     }
 
     fn example(supervision: Supervision, scale: [f64; 2], picture: Option<Picture>) -> (Supersampling, Camera) {
+        let distortion = Distortion { radial: [0.1, -0.02, 0.01], tangential: [0.005, -0.003] };
         let camera = Camera {
             name: "a".into(),
-            intrinsics: Intrinsics { width: 5, height: 4, fx: 6.0, fy: 7.0, cx: 2.4, cy: 2.1 },
+            intrinsics: Intrinsics { width: 5, height: 4, fx: 6.0, fy: 7.0, cx: 2.4, cy: 2.1, distortion },
             camera_to_world: [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]],
         };
         let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0, ..Default::default() };

@@ -3,17 +3,17 @@ use std::path::{Path, PathBuf};
 
 use artifact::relative_path;
 use glam::{DMat3, DQuat, DVec3};
-use scene::Intrinsics;
+use scene::{Distortion, Intrinsics};
 
 use crate::bytes::Bytes;
 use crate::frame::{names, pose_from_world_to_camera};
 use crate::photograph::{fitted, look};
-use crate::{Dataset, DatasetError, Distortion, Format, Frame, Lens, read_text};
+use crate::{Dataset, DatasetError, Format, Frame, read_text};
 
 /// A reconstruction as COLMAP writes it (its documentation, "Output format").
 #[derive(Debug, Default)]
 struct Model {
-    cameras: BTreeMap<u32, Lens>,
+    cameras: BTreeMap<u32, Intrinsics>,
     images: Vec<Image>,
     points: BTreeMap<u64, DVec3>,
 }
@@ -38,6 +38,28 @@ pub(crate) fn models(folder: &Path) -> Option<Vec<PathBuf>> {
     let is_model = |p: &PathBuf| ["bin", "txt"].iter().any(|e| p.join("images").with_extension(e).is_file());
     found.retain(is_model);
     (!found.is_empty()).then_some(found)
+}
+
+/// The camera of the first model below `sparse`, where that has one alone. What images the model has isn't looked at.
+pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetError> {
+    let sparse = folder.join("sparse");
+    let mut folders: Vec<PathBuf> = std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    folders.sort();
+    folders.insert(0, sparse);
+    for folder in folders {
+        let mut model = Model::default();
+        let (binary, text) = (folder.join("cameras.bin"), folder.join("cameras.txt"));
+        if let Ok(bytes) = std::fs::read(&binary) {
+            model.binary_cameras(&mut Bytes::new(&binary, &bytes))?;
+        } else if text.is_file() {
+            model.text_cameras(&text)?;
+        } else {
+            continue;
+        }
+        let mut cameras = model.cameras.into_values();
+        return Ok(cameras.next().filter(|_| cameras.next().is_none()));
+    }
+    Ok(None)
 }
 
 /// Reads the model with most images, the first of several, and the pictures that it names.
@@ -123,8 +145,9 @@ impl Model {
                 return Err(bytes.error(format!("camera {id} has model {model}, which COLMAP doesn't have")));
             };
             let parameters = (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
-            let lens = lens(name, width, height, &parameters).map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
-            self.cameras.insert(id, lens);
+            let intrinsics =
+                intrinsics(name, width, height, &parameters).map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
+            self.cameras.insert(id, intrinsics);
         }
         end(bytes, "cameras")
     }
@@ -163,8 +186,8 @@ impl Model {
             let name = line.words.get(1).copied().unwrap_or_default();
             let (width, height) = (line.number(2, "width")?, line.number(3, "height")?);
             let parameters = (4..line.words.len()).map(|i| line.number(i, "parameter")).collect::<Result<Vec<f64>, _>>()?;
-            let lens = lens(name, width, height, &parameters).map_err(|reason| line.error(reason))?;
-            self.cameras.insert(id, lens);
+            let intrinsics = intrinsics(name, width, height, &parameters).map_err(|reason| line.error(reason))?;
+            self.cameras.insert(id, intrinsics);
         }
         Ok(())
     }
@@ -210,13 +233,23 @@ impl Model {
     }
 
     fn frame(&self, image: &Image, picture: PathBuf) -> Result<Frame, String> {
-        let lens = self.cameras.get(&image.camera).ok_or_else(|| format!("there is no camera {}", image.camera))?;
+        let camera = self.cameras.get(&image.camera).ok_or_else(|| format!("there is no camera {}", image.camera))?;
         let stored = look(&picture).map_err(|e| e.to_string())?;
-        let (lens, turned) = fitted(*lens, stored).map_err(|reason| format!("{reason} (camera {})", image.camera))?;
+        let (taken_with, turned) = fitted(*camera, stored).map_err(|reason| format!("{reason} (camera {})", image.camera))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let depths = depths(image, &self.points);
-        let frame = Frame { name: String::new(), image: picture, turned, mask: None, depth: None, lens, camera_to_world, depths };
-        frame.check().map(|()| frame)
+        let frame = Frame {
+            name: String::new(),
+            image: picture,
+            turned,
+            mask: None,
+            depth: None,
+            taken_with,
+            pinhole: None,
+            camera_to_world,
+            depths,
+        };
+        frame.check().map(|()| frame).map_err(|e| e.to_string())
     }
 }
 
@@ -247,7 +280,7 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens, String> {
+fn intrinsics(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Intrinsics, String> {
     let size = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0).ok_or_else(|| format!("its size is {width}×{height}"));
     let (columns, rows) = (size(width)?, size(height)?);
     let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) = match (model, parameters) {
@@ -264,8 +297,8 @@ fn lens(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Lens
             None => return Err(format!("camera model {model:?} is none of COLMAP's")),
         },
     };
-    let intrinsics = Intrinsics { width: columns, height: rows, fx: focal[0], fy: focal[1], cx: centre[0], cy: centre[1] };
-    Ok(Lens { intrinsics, distortion: Distortion { radial, tangential } })
+    let ([fx, fy], [cx, cy], distortion) = (focal, centre, Distortion { radial, tangential });
+    Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
 }
 
 /// The rotation of a quaternion (w, x, y, z), which needn't have unit length.
@@ -372,6 +405,8 @@ mod tests {
         files.iter().for_each(|(name, bytes)| std::fs::write(sparse.join(name), bytes).unwrap());
     }
 
+    const SIMPLE: Distortion = Distortion { radial: [-0.1, 0.0, 0.0], tangential: [0.0; 2] };
+
     fn text<'a>(cameras: &'a str, images: &'a str, points: &'a str) -> [(&'static str, &'a [u8]); 3] {
         [("cameras.txt", cameras.as_bytes()), ("images.txt", images.as_bytes()), ("points3D.txt", points.as_bytes())]
     }
@@ -383,7 +418,7 @@ mod tests {
         let text = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
         let (one, other) = (Dataset::read(binary.path()).unwrap(), Dataset::read(text.path()).unwrap());
         assert_eq!(one.notes, other.notes);
-        assert!(one.notes.contains(&"2 photographs have lens distortion, which is undone".to_owned()), "{:?}", one.notes);
+        assert!(one.notes.contains(&"2 photographs have lens distortion".to_owned()), "{:?}", one.notes);
         let relative = |set: &Dataset| -> Vec<Frame> {
             set.frames.iter().map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() }).collect()
         };
@@ -391,11 +426,13 @@ mod tests {
         let [a, b] = &one.frames[..] else { panic!("two frames") };
         assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
         // Pictures of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0, 1) at depth 1 + 3.
-        assert_eq!(b.lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0 });
-        assert_eq!(b.lens.distortion.radial, [-0.1, 0.0, 0.0]);
+        assert_eq!(
+            b.taken_with,
+            Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0, distortion: SIMPLE }
+        );
         assert_eq!(b.depths, Some([4.0, 5.0]));
         assert_eq!(b.camera_to_world, [[1., 0., 0., 0.], [0., -1., 0., 0.], [0., 0., -1., -3.]]);
-        assert_eq!(a.lens.distortion, Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] });
+        assert_eq!(a.taken_with.distortion, Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] });
         assert_eq!(a.depths, None);
         assert!((a.camera_to_world[0][3] - 1.0).abs() < 1e-12 && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12);
     }
@@ -422,7 +459,7 @@ mod tests {
             ("80 60 70 40", "0 60 70 40", "its size is 0×60"),
             ("80 60 70 40", "80 80 70 40", "another shape"),
             ("70 40 30 -0.1", "nan 40 30 -0.1", "fx is NaN"),
-            ("30 -0.1", "30 inf", "a coefficient of distortion is inf"),
+            ("30 -0.1", "30 inf", "lens distortion (k1 inf,"),
             ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
         ] {
             let message = reads(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();

@@ -2,9 +2,9 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
-use scene::{Camera, CameraError, Intrinsics};
+use scene::{Camera, CameraError, Distortion, Intrinsics};
 
-use crate::{DatasetError, Lens};
+use crate::DatasetError;
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,8 +19,10 @@ pub struct Frame {
     pub mask: Option<PathBuf>,
     /// True depth (EXR, channels `Z` and `A`), where the data has it.
     pub depth: Option<PathBuf>,
-    /// What it was taken with; its size is the picture's.
-    pub lens: Lens,
+    /// What it was taken with; its size is the stored picture's.
+    pub taken_with: Intrinsics,
+    /// Where distortion is to be undone, the pinhole camera as whose picture it is read.
+    pub pinhole: Option<Intrinsics>,
     /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
     pub camera_to_world: [[f64; 4]; 3],
     /// Depth of the nearest and of the farthest point that it is known to see, along its axis, where the data says so.
@@ -28,15 +30,25 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The camera with these intrinsics: those of the lens, of [`Frame::pinhole`], or resized ones.
-    pub fn camera(&self, intrinsics: Intrinsics) -> Camera {
-        Camera { name: self.name.clone(), intrinsics, camera_to_world: self.camera_to_world }
+    /// The inside of its camera.
+    pub fn intrinsics(&self) -> Intrinsics {
+        self.pinhole.unwrap_or(self.taken_with)
     }
 
-    /// Refuses what no camera can be.
-    pub(crate) fn check(&self) -> Result<(), String> {
-        self.camera(self.lens.intrinsics).check().map_err(|e: CameraError| e.to_string())?;
-        self.lens.distortion.check()
+    /// Its camera; [`Frame::photograph`] reads what that sees.
+    pub fn camera(&self) -> Camera {
+        Camera { name: self.name.clone(), intrinsics: self.intrinsics(), camera_to_world: self.camera_to_world }
+    }
+
+    /// Refuses what no camera can be. Whether each place in a distorted picture has its ray is asked where that matters.
+    pub(crate) fn check(&self) -> Result<(), CameraError> {
+        let distortion = self.taken_with.distortion;
+        if !distortion.is_finite() {
+            return Err(CameraError::Distortion(distortion));
+        }
+        let mut camera = self.camera();
+        camera.intrinsics.distortion = Distortion::default();
+        camera.check()
     }
 }
 
@@ -108,7 +120,8 @@ mod tests {
         let translation = DVec3::new(0.2, -0.4, 3.0);
         let point = DVec3::new(0.3, 0.1, -0.2);
         let seen = rotation * point + translation;
-        let intrinsics = scene::Intrinsics { width: 100, height: 80, fx: 90.0, fy: 95.0, cx: 48.0, cy: 41.0 };
+        let intrinsics =
+            scene::Intrinsics { width: 100, height: 80, fx: 90.0, fy: 95.0, cx: 48.0, cy: 41.0, distortion: Default::default() };
         let camera = Camera { name: "c".into(), intrinsics, camera_to_world: pose_from_world_to_camera(rotation, translation) };
         let (x, y, depth) = camera.project(point).unwrap();
         assert!((x - (48.0 + 90.0 * seen.x / seen.z)).abs() < 1e-9);

@@ -5,8 +5,9 @@
 //! * **LLFF**: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …);
 //! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
 //!
-//! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and a [`Lens`];
-//! [`Frame::photograph`] reads its picture, upright as its poses have it and with the lens's distortion undone.
+//! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and its
+//! lens's distortion; [`Frame::photograph`] reads its picture, upright as its poses have it. [`Dataset::undistorted`] has pictures read as
+//! pinhole cameras would have taken them.
 //!
 //! Units: lengths are those of the poses; pixels count from the stored picture's top left corner, whose first pixel has its centre
 //! at (0.5, 0.5). Everything a file says is checked: sizes before anything is allocated, paths before anything is opened.
@@ -22,7 +23,6 @@ mod blender;
 mod bytes;
 mod colmap;
 mod frame;
-mod lens;
 mod llff;
 mod photograph;
 mod split;
@@ -33,7 +33,6 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 pub use frame::Frame;
-pub use lens::{Distortion, Lens};
 pub use split::Split;
 
 /// Posed photographs.
@@ -159,14 +158,37 @@ impl Dataset {
         self
     }
 
+    /// Has pictures read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same size, with a
+    /// border cut off where the lens saw no more.
+    pub fn undistorted(mut self) -> Result<Self, DatasetError> {
+        for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
+            let pinhole = frame.taken_with.pinhole().ok_or_else(|| {
+                let reason = format!(
+                    "lens distortion {} leaves no pinhole's picture; are its coefficients right?",
+                    frame.taken_with.distortion
+                );
+                DatasetError::format(&frame.image, reason)
+            })?;
+            frame.pinhole = Some(pinhole);
+        }
+        Ok(self)
+    }
+
+    /// Takes all lenses for free of distortion.
+    #[must_use]
+    pub fn without_distortion(mut self) -> Self {
+        self.frames.iter_mut().for_each(|f| f.taken_with.distortion = scene::Distortion::default());
+        self
+    }
+
     /// Says what is done to pictures that aren't all alike, upright and from a pinhole.
     fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
-        let (distorted, turned) = (count(&|f| !f.lens.distortion.is_none()), count(&|f| f.turned));
-        let size = |f: &Frame| (f.lens.intrinsics.width, f.lens.intrinsics.height);
+        let (distorted, turned) = (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turned));
+        let size = |f: &Frame| (f.taken_with.width, f.taken_with.height);
         let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
         if distorted > 0 {
-            self.notes.push(format!("{distorted} photographs have lens distortion, which is undone"));
+            self.notes.push(format!("{distorted} photographs have lens distortion"));
         }
         if turned > 0 {
             self.notes.push(format!("{turned} photographs are turned upright, as their EXIF data ask"));

@@ -2,11 +2,11 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use glam::DVec3;
-use scene::Intrinsics;
+use scene::{Distortion, Intrinsics};
 
 use crate::frame::{names, pose};
 use crate::photograph::{Stored, fitted, is_picture, look};
-use crate::{Dataset, DatasetError, Format, Frame, Lens};
+use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal length), near and far.
 const NUMBERS: usize = 17;
@@ -18,21 +18,46 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let (pictures, from) = pictures(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
     let files: Vec<PathBuf> = pictures.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
     let names = names(&path, &files)?;
+    let (distortion, note) = distortion(folder, &rows);
     let mut frames = Vec::with_capacity(rows.len());
     for (index, ((row, image), name)) in rows.iter().zip(pictures).zip(names).enumerate() {
         let file = name.clone();
         let of_frame = |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
         let frame = look(&image)
             .map_err(|e| e.to_string())
-            .and_then(|stored| frame(row, stored, name, image))
-            .and_then(|frame| frame.check().map(|()| frame));
+            .and_then(|stored| frame(row, distortion, stored, name, image))
+            .and_then(|frame| frame.check().map(|()| frame).map_err(|e| e.to_string()));
         frames.push(frame.map_err(of_frame)?);
     }
-    let notes = vec![format!("LLFF (poses_bounds.npy): {} photographs from {from}", frames.len())];
+    let mut notes = vec![format!("LLFF (poses_bounds.npy): {} photographs from {from}", frames.len())];
+    notes.extend(note);
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
 
-fn frame(row: &[f64; NUMBERS], stored: Stored, name: String, image: PathBuf) -> Result<Frame, String> {
+/// The lens's distortion, which the file doesn't have: the poses come from COLMAP, and hold for the lens that it found. Where its model lies
+/// beside them, with one camera of their focal length, that says it.
+fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
+    let camera = match colmap::only_camera(folder) {
+        Ok(Some(camera)) if !camera.distortion.is_none() => camera,
+        Ok(_) => return (Distortion::default(), None),
+        Err(e) => return (Distortion::default(), Some(format!("lens distortion is not known: {e}"))),
+    };
+    let is_theirs = |row: &[f64; NUMBERS]| {
+        let (width, focal) = (row[9], row[14]);
+        (camera.fx * width / (f64::from(camera.width) * focal) - 1.0).abs() < 1e-3
+    };
+    if rows.iter().all(is_theirs) {
+        (camera.distortion, None)
+    } else {
+        let note = format!(
+            "lens distortion is not known: the model in sparse has another focal length ({} of {} pixels)",
+            camera.fx, camera.width
+        );
+        (Distortion::default(), Some(note))
+    }
+}
+
+fn frame(row: &[f64; NUMBERS], distortion: Distortion, stored: Stored, name: String, image: PathBuf) -> Result<Frame, String> {
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
     let (down, right, back, centre, inside) = (column(0), column(1), column(2), column(3), column(4));
     let [height, width, focal] = inside.to_array();
@@ -41,13 +66,23 @@ fn frame(row: &[f64; NUMBERS], stored: Stored, name: String, image: PathBuf) -> 
     };
     let (width, height) = (whole(width, "width")?, whole(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-    let (lens, turned) = fitted(Lens::pinhole(Intrinsics { width, height, fx: focal, fy: focal, cx, cy }), stored)?;
+    let (taken_with, turned) = fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
         return Err(format!("its bounds are {near} and {far}; 0 < near < far is expected"));
     }
     let camera_to_world = pose([right, -down, back], centre);
-    Ok(Frame { name, image, turned, mask: None, depth: None, lens, camera_to_world, depths: Some([near, far]) })
+    Ok(Frame {
+        name,
+        image,
+        turned,
+        mask: None,
+        depth: None,
+        taken_with,
+        pinhole: None,
+        camera_to_world,
+        depths: Some([near, far]),
+    })
 }
 
 /// All pictures of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
@@ -133,8 +168,40 @@ mod tests {
         let frame = &set.frames[1];
         assert_eq!(frame.name, "IMG_1");
         assert_eq!(frame.camera_to_world, [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.]]);
-        assert_eq!(frame.lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0 });
+        assert_eq!(
+            frame.taken_with,
+            Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0, distortion: Default::default() }
+        );
         assert_eq!(frame.depths, Some([1.5, 9.0]));
+    }
+
+    /// The file can't say what its poses' lens does to lines; the model that they come from can.
+    #[test]
+    fn distortion_is_that_of_the_model_beside_them() {
+        let dir = folder(&npy(&[ROW]), &[("images", 1)]);
+        let distortion = || {
+            let set = Dataset::read(dir.path()).unwrap();
+            (set.frames[0].taken_with.distortion.radial[0], set.notes.join("; "))
+        };
+        assert_eq!(distortion().0, 0.0);
+        std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
+        let cameras = |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
+        // Its pictures are twice as large.
+        cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
+        assert_eq!(
+            distortion(),
+            (0.02, "LLFF (poses_bounds.npy): 1 photographs from images; 1 photographs have lens distortion".into())
+        );
+        for (text, words) in [
+            ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "another focal length"),
+            ("1 SIMPLE_RADIAL 160 120 nothing\n", "distortion is not known"),
+            ("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n2 PINHOLE 160 120 140 140 80 60\n", "LLFF"),
+            ("1 SIMPLE_PINHOLE 160 120 140 80 60\n", "LLFF"),
+        ] {
+            cameras(text);
+            let (found, notes) = distortion();
+            assert!(found == 0.0 && notes.contains(words), "{text}: {found} {notes}");
+        }
     }
 
     #[test]

@@ -7,7 +7,7 @@ use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
 use pixels::{MAX_PIXELS, Mask, PixelError, Rgba8, exr_size, read_exr, sample_cubic, srgb_from_linear, to_u8};
 use scene::Intrinsics;
 
-use crate::{DatasetError, Frame, Lens};
+use crate::{DatasetError, Frame};
 
 /// Whether a file's name is that of a picture.
 pub(crate) fn is_picture(path: &Path) -> bool {
@@ -61,11 +61,10 @@ fn is_sideways(turn: Orientation) -> bool {
     matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// The lens for the stored picture, whose size may differ from what was said of it, but not in shape; and whether the picture has to be
+/// The intrinsics for the stored picture, whose size may differ from what was said of it, but not in shape; and whether the picture has to be
 /// turned as its EXIF data ask. Poses are commonly found for pictures as they are stored, so it is turned only where its shape fits no
 /// other way.
-pub(crate) fn fitted(lens: Lens, stored: Stored) -> Result<(Lens, bool), String> {
-    let k = lens.intrinsics;
+pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let (width, height) = stored.size;
     let fits = |(width, height): (u32, u32)| {
         let (across, down) = (f64::from(width) / f64::from(k.width.max(1)), f64::from(height) / f64::from(k.height.max(1)));
@@ -73,11 +72,11 @@ pub(crate) fn fitted(lens: Lens, stored: Stored) -> Result<(Lens, bool), String>
         (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
     };
     if (k.width, k.height) == stored.size {
-        Ok((lens, false))
+        Ok((k, false))
     } else if fits((width, height)) {
-        Ok((lens.resized(width, height), false))
+        Ok((k.resized(width, height), false))
     } else if stored.is_sideways && fits((height, width)) {
-        Ok((lens.resized(height, width), true))
+        Ok((k.resized(height, width), true))
     } else {
         Err(format!("the picture has {width}×{height} pixels, its camera {}×{}: another shape", k.width, k.height))
     }
@@ -116,44 +115,34 @@ fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
 }
 
 impl Frame {
-    /// The picture with its lens's distortion undone, as sharp as it was, and the pinhole camera that would have taken it: of the same
-    /// size, with a border cut off where the lens saw no more.
-    pub fn photograph(&self) -> Result<(Rgba8, Intrinsics), DatasetError> {
-        Ok((self.seen_as_pinhole(&self.image)?, self.pinhole()?))
+    /// The picture that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as sharp as it was.
+    pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
+        self.seen(&self.image)
     }
 
     /// Which of [`Frame::photograph`]'s pixels count, where the data say so.
     pub fn mask(&self) -> Result<Option<Mask>, DatasetError> {
-        self.mask.as_ref().map(|path| Ok(Mask::of(&self.seen_as_pinhole(path)?))).transpose()
+        self.mask.as_ref().map(|path| Ok(Mask::of(&self.seen(path)?))).transpose()
     }
 
-    /// A picture of the photograph's pixels as a pinhole camera would have taken it.
-    fn seen_as_pinhole(&self, path: &Path) -> Result<Rgba8, DatasetError> {
+    /// A picture of the photograph's pixels as the camera sees it.
+    fn seen(&self, path: &Path) -> Result<Rgba8, DatasetError> {
         let image = read(path, self.turned)?;
-        let k = self.lens.intrinsics;
+        let k = self.taken_with;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
             let reason = format!("{}×{} pixels where its photograph has {}×{}", image.width, image.height, k.width, k.height);
             return Err(PixelError::Format { path: path.to_path_buf(), reason }.into());
         }
-        let has_distortion = !self.lens.distortion.is_none();
-        Ok(if has_distortion { undistorted(&image, &self.lens, &self.pinhole()?) } else { image })
-    }
-
-    /// The pinhole camera of [`Frame::photograph`], without looking at the picture.
-    pub fn pinhole(&self) -> Result<Intrinsics, DatasetError> {
-        self.lens.undistorted().ok_or_else(|| {
-            let reason = format!("its distortion {:?} can't be undone; are the coefficients right?", self.lens.distortion);
-            DatasetError::format(&self.image, reason)
-        })
+        Ok(self.pinhole.map(|pinhole| undistorted(&image, &k, &pinhole)).unwrap_or(image))
     }
 }
 
 /// The picture that a pinhole camera would have taken, by cubic interpolation.
-fn undistorted(image: &Rgba8, lens: &Lens, pinhole: &Intrinsics) -> Rgba8 {
+fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> Rgba8 {
     let mut data = Vec::with_capacity(image.data.len());
     for y in 0..image.height {
         for x in 0..image.width {
-            let at = lens.source(pinhole, x as f64 + 0.5, y as f64 + 0.5);
+            let at = taken_with.source(pinhole, [x as f64 + 0.5, y as f64 + 0.5]);
             let pixel = |column: usize, row: usize| {
                 let at = 4 * (row * image.width + column);
                 [0, 1, 2, 3].map(|c| f64::from(image.data[at + c]))
@@ -167,7 +156,7 @@ fn undistorted(image: &Rgba8, lens: &Lens, pinhole: &Intrinsics) -> Rgba8 {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::Distortion;
+    use scene::Distortion;
 
     /// A picture whose red says the column and whose green says the row.
     fn ramp(width: usize, height: usize) -> Rgba8 {
@@ -205,11 +194,11 @@ pub(crate) mod tests {
         std::fs::write(&path, &turned).unwrap();
         let stored = look(&path).unwrap();
         assert_eq!(stored, Stored { size: (32, 16), is_sideways: true });
-        let lens = |width, height| Lens::pinhole(Intrinsics::from_angle_x(width, height, 0.5));
-        assert_eq!(fitted(lens(32, 16), stored).unwrap(), (lens(32, 16), false));
-        assert_eq!(fitted(lens(64, 32), stored).unwrap(), (lens(64, 32).resized(32, 16), false));
-        assert_eq!(fitted(lens(16, 32), stored).unwrap(), (lens(16, 32), true));
-        assert!(fitted(lens(32, 32), stored).unwrap_err().contains("another shape"));
+        let of = |width, height| Intrinsics::from_angle_x(width, height, 0.5);
+        assert_eq!(fitted(of(32, 16), stored).unwrap(), (of(32, 16), false));
+        assert_eq!(fitted(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), false));
+        assert_eq!(fitted(of(16, 32), stored).unwrap(), (of(16, 32), true));
+        assert!(fitted(of(32, 32), stored).unwrap_err().contains("another shape"));
         let upright = super::read(&path, true).unwrap();
         assert_eq!((upright.width, upright.height), (16, 32));
         assert!(upright.data[0] < 20 && upright.data[1] > 200, "its bottom left corner is now its top left one");
@@ -223,9 +212,8 @@ pub(crate) mod tests {
     /// A pinhole picture seen through a lens and undone is the pinhole picture again.
     #[test]
     fn distortion_is_undone() {
-        let intrinsics = Intrinsics { width: 120, height: 90, fx: 110.0, fy: 108.0, cx: 61.0, cy: 44.0 };
         let distortion = Distortion { radial: [-0.12, 0.02, 0.0], tangential: [0.002, -0.001] };
-        let lens = Lens { intrinsics, distortion };
+        let intrinsics = Intrinsics { width: 120, height: 90, fx: 110.0, fy: 108.0, cx: 61.0, cy: 44.0, distortion };
         // Smooth in the direction of the ray, so that what each lens sees is known exactly.
         let colour = |[u, v]: [f64; 2]| [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255];
         // Where a distorted position comes from, by fixed-point iteration.
@@ -242,10 +230,10 @@ pub(crate) mod tests {
             let pixel = |i: usize| colour(of((i % 120) as f64 + 0.5, (i / 120) as f64 + 0.5));
             Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
         };
-        let pinhole = lens.undistorted().unwrap();
+        let pinhole = intrinsics.pinhole().unwrap();
         assert!(pinhole.fx != intrinsics.fx);
         let expected = picture(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
-        let found = undistorted(&picture(&ray), &lens, &pinhole);
+        let found = undistorted(&picture(&ray), &intrinsics, &pinhole);
         let worst = found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{worst}");
     }

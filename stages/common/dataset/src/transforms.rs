@@ -1,12 +1,12 @@
 use std::path::{Path, PathBuf};
 
 use artifact::relative_path;
-use scene::Intrinsics;
+use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
 use crate::frame::names;
 use crate::photograph::{Stored, fitted, is_exr, look};
-use crate::{Dataset, DatasetError, Distortion, Format, Frame, Lens, Split, read_text};
+use crate::{Dataset, DatasetError, Format, Frame, Split, read_text};
 
 /// `transforms.json`. What a frame doesn't say for itself holds for all.
 #[derive(Deserialize)]
@@ -177,10 +177,14 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
     let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
     // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
     let depth = depth.filter(|path| is_exr(path));
-    let (lens, turned) = lens(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
-    let frame = Frame { name: String::new(), image, turned, mask, depth, lens, camera_to_world, depths: None };
-    frame.check().map_err(|reason| format!("transform_matrix: {reason}"))?;
-    Ok(frame)
+    let (taken_with, turned) = intrinsics(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
+    let frame =
+        Frame { name: String::new(), image, turned, mask, depth, taken_with, pinhole: None, camera_to_world, depths: None };
+    match frame.check() {
+        Ok(()) => Ok(frame),
+        Err(e @ (CameraError::NotFinite { .. } | CameraError::NotRigid { .. })) => Err(format!("transform_matrix: {e}")),
+        Err(e) => Err(e.to_string()),
+    }
 }
 
 impl LensEntry {
@@ -193,8 +197,8 @@ impl LensEntry {
     }
 }
 
-/// The lens of a picture, and whether that has to be turned.
-fn lens(entry: &LensEntry, stored: Stored) -> Result<(Lens, bool), String> {
+/// What a picture was taken with, and whether it has to be turned.
+fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
     if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model) {
         return Err(format!("camera_model {model:?} is not supported; undistort the pictures first (colmap image_undistorter)"));
@@ -226,14 +230,11 @@ fn lens(entry: &LensEntry, stored: Stored) -> Result<(Lens, bool), String> {
         return Err("no focal length: neither fl_x nor camera_angle_x is given".to_owned());
     };
     let (cx, cy) = (entry.cx.unwrap_or(0.5 * f64::from(width)), entry.cy.unwrap_or(0.5 * f64::from(height)));
-    let said = Lens {
-        intrinsics: Intrinsics { width, height, fx, fy, cx, cy },
-        distortion: Distortion {
-            radial: [entry.k1, entry.k2, entry.k3].map(Option::unwrap_or_default),
-            tangential: [entry.p1, entry.p2].map(Option::unwrap_or_default),
-        },
+    let distortion = Distortion {
+        radial: [entry.k1, entry.k2, entry.k3].map(Option::unwrap_or_default),
+        tangential: [entry.p1, entry.p2].map(Option::unwrap_or_default),
     };
-    fitted(said, stored)
+    fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)
 }
 
 #[cfg(test)]
@@ -265,9 +266,10 @@ mod tests {
         let head =
             r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1, "p2": 0.01, "camera_model": "OPENCV""#;
         let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
-        let of = |i: usize| set.frames[i].lens;
-        assert_eq!(of(0).intrinsics, Intrinsics { width: 40, height: 30, fx: 60.0, fy: 52.0, cx: 21.0, cy: 14.0 });
-        assert_eq!(of(1).intrinsics.fx, 50.0);
+        let of = |i: usize| set.frames[i].taken_with;
+        let distortion = Distortion { radial: [0.0; 3], tangential: [0.0, 0.01] };
+        assert_eq!(of(0), Intrinsics { width: 40, height: 30, fx: 60.0, fy: 52.0, cx: 21.0, cy: 14.0, distortion });
+        assert_eq!(of(1).fx, 50.0);
         assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
         assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
         assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
@@ -282,7 +284,10 @@ mod tests {
     #[test]
     fn smaller_copies_keep_their_angle() {
         let set = set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
-        assert_eq!(set.frames[0].lens.intrinsics, Intrinsics { width: 40, height: 30, fx: 50.0, fy: 50.0, cx: 20.0, cy: 15.0 });
+        assert_eq!(
+            set.frames[0].taken_with,
+            Intrinsics { width: 40, height: 30, fx: 50.0, fy: 50.0, cx: 20.0, cy: 15.0, distortion: Default::default() }
+        );
     }
 
     #[test]

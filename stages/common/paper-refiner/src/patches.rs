@@ -147,7 +147,7 @@ mod tests {
         let (width, height) = (160, 96);
         let camera = Camera {
             name: format!("{pixels}"),
-            intrinsics: Intrinsics { width, height, fx: 100.0, fy: 100.0, cx: 80.0, cy: 48.0 },
+            intrinsics: Intrinsics { width, height, fx: 100.0, fy: 100.0, cx: 80.0, cy: 48.0, distortion: Default::default() },
             camera_to_world: [[1.0, 0.0, 0.0, pixels / 50.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
         let (view, count) = (picture(width as usize, height as usize, 4), (width * height) as usize);

@@ -182,7 +182,15 @@ mod tests {
         let truth = (0..48 * 40).flat_map(|i| [level(i); 3]).collect();
         let camera = Camera {
             name: "stripes".into(),
-            intrinsics: Intrinsics { width: 48, height: 40, fx: 48.0, fy: 48.0, cx: 24.0, cy: 20.0 },
+            intrinsics: Intrinsics {
+                width: 48,
+                height: 40,
+                fx: 48.0,
+                fy: 48.0,
+                cx: 24.0,
+                cy: 20.0,
+                distortion: Default::default(),
+            },
             camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
         let view = Picture::new(48, 40, 4, view);

@@ -253,15 +253,18 @@ fn huber(error: f64) -> f64 {
 /// and by so many scene units.
 fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [Vector6<f64>; 2] {
     let k = &camera.intrinsics;
+    let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
+    let [by_x, by_both, by_y] = k.distortion.slope([x, -y]);
     let place = depth * DVec3::new(x, y, -1.0);
     let axes = [DVec3::X, DVec3::Y, DVec3::Z];
     // In camera space a point goes the other way: by place × turn, and by -shift.
     let moves = axes.map(|axis| place.cross(axis)).into_iter().chain(axes.map(|axis| -unit * axis));
     let (mut right, mut down) = (Vector6::zeros(), Vector6::zeros());
     for (i, by) in moves.enumerate() {
-        right[i] = k.fx * (by.x + x * by.z) / depth;
-        down[i] = -k.fy * (by.y + y * by.z) / depth;
+        let (along_x, along_y) = ((by.x + x * by.z) / depth, -(by.y + y * by.z) / depth);
+        right[i] = k.fx * (by_x * along_x + by_both * along_y);
+        down[i] = k.fy * (by_both * along_x + by_y * along_y);
     }
     [right, down]
 }

@@ -1,5 +1,5 @@
 use radiance::Pixel;
-use scene::Intrinsics;
+use scene::{Distortion, Intrinsics};
 
 use super::*;
 
@@ -38,9 +38,10 @@ impl RayField for BallAndWall {
 fn camera(i: usize) -> Camera {
     let angle = 0.5 * i as f64;
     let rotation = DQuat::from_euler(glam::EulerRot::YXZ, 0.12 * angle.sin(), 0.1 * angle.cos(), 0.05 * i as f64);
+    let distortion = Distortion { radial: [-0.1, 0.03, 0.0], tangential: [0.002, -0.004] };
     let bare = Camera {
         name: format!("r_{i}"),
-        intrinsics: Intrinsics { width: 64, height: 48, fx: 70.0, fy: 72.0, cx: 31.0, cy: 25.0 },
+        intrinsics: Intrinsics { width: 64, height: 48, fx: 70.0, fy: 72.0, cx: 31.0, cy: 25.0, distortion },
         camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]],
     };
     placed(&bare, rotation, DVec3::new(0.5 * angle.sin(), 0.4 * angle.cos(), 4.0))

@@ -237,7 +237,15 @@ mod tests {
         let view = pixels().flat_map(|(x, y)| [blurred(x, y, 0), blurred(x, y, 1), blurred(x, y, 2), 1.0]).collect();
         let camera = Camera {
             name: right.to_string(),
-            intrinsics: Intrinsics { width: WIDTH as u32, height: HEIGHT as u32, fx: 300.0, fy: 300.0, cx: 48.0, cy: 24.0 },
+            intrinsics: Intrinsics {
+                width: WIDTH as u32,
+                height: HEIGHT as u32,
+                fx: 300.0,
+                fy: 300.0,
+                cx: 48.0,
+                cy: 24.0,
+                distortion: Default::default(),
+            },
             camera_to_world: [[1.0, 0.0, 0.0, right as f64 * 2.0 / 300.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
         let view = Picture::new(WIDTH, HEIGHT, 4, view);

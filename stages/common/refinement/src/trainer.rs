@@ -303,7 +303,15 @@ mod tests {
         let truth = (0..32 * 32).flat_map(|i| [level(i, false); 3]).collect();
         let camera = Camera {
             name: phase.to_string(),
-            intrinsics: Intrinsics { width: 32, height: 32, fx: 32.0, fy: 32.0, cx: 16.0, cy: 16.0 },
+            intrinsics: Intrinsics {
+                width: 32,
+                height: 32,
+                fx: 32.0,
+                fy: 32.0,
+                cx: 16.0,
+                cy: 16.0,
+                distortion: Default::default(),
+            },
             // A wall at distance 2, along which the camera moves by a pixel a phase.
             camera_to_world: [[1.0, 0.0, 0.0, phase as f64 / 16.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };

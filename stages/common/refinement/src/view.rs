@@ -160,7 +160,15 @@ mod tests {
         let (width, height) = (96, 64);
         let camera = Camera {
             name: "patches".into(),
-            intrinsics: Intrinsics { width: 96, height: 64, fx: 96.0, fy: 96.0, cx: 48.0, cy: 32.0 },
+            intrinsics: Intrinsics {
+                width: 96,
+                height: 64,
+                fx: 96.0,
+                fy: 96.0,
+                cx: 48.0,
+                cy: 32.0,
+                distortion: Default::default(),
+            },
             camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
         let mut draws = Draws::new(1, 2, 3);

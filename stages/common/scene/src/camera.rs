@@ -2,7 +2,9 @@ use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A pinhole camera's inside, in pixels.
+use crate::Distortion;
+
+/// A camera's inside, in pixels: a pinhole, and how its lens isn't one.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Intrinsics {
@@ -18,20 +20,24 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Principal point, y; the image's top edge is 0.
     pub cy: f64,
+    /// The lens's distortion; without it a pinhole.
+    #[serde(default, skip_serializing_if = "Distortion::is_none")]
+    pub distortion: Distortion,
 }
 
 impl Intrinsics {
     /// A centred camera with square pixels that sees `angle_x` radians from left to right edge.
     pub fn from_angle_x(width: u32, height: u32, angle_x: f64) -> Self {
         let focal = 0.5 * f64::from(width) / (0.5 * angle_x).tan();
-        Self { width, height, fx: focal, fy: focal, cx: 0.5 * f64::from(width), cy: 0.5 * f64::from(height) }
+        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
+        Self { width, height, fx: focal, fy: focal, cx, cy, distortion: Distortion::default() }
     }
 
     /// The same camera with another number of pixels on the same sensor. The scale may differ per axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
         let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
-        Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy }
+        Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..*self }
     }
 }
 
@@ -84,6 +90,9 @@ pub enum CameraError {
         /// The number.
         value: f64,
     },
+    /// Distortion by which a place in the picture would belong to no ray, or to several.
+    #[error("lens distortion {0} can't be undone within the picture; are its coefficients right?")]
+    Distortion(Distortion),
     /// An image without pixels.
     #[error("image size {width}×{height}; both must be at least 1")]
     Empty {
@@ -130,16 +139,31 @@ impl Camera {
     /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j + 0.5) is a pixel's centre.
     pub fn ray(&self, x: f64, y: f64) -> Ray {
         let k = &self.intrinsics;
+        let [x, y] = k.undistort([x, y]);
         let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
         Ray { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
     }
 
-    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane.
+    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and where the lens's distortion says nothing of
+    /// what lies so far aside.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64, f64)> {
         let k = &self.intrinsics;
         let p = self.rotation().transpose() * (point - self.centre());
         let depth = -p.z;
-        (depth > 0.0).then(|| (k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth, depth))
+        if depth <= 0.0 {
+            return None;
+        }
+        let straight = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
+        let [x, y] = k.distort(straight);
+        if !k.distortion.is_none() {
+            // A distortion may fold back into the picture what lies outside.
+            let [u, v] = k.undistort([x, y]);
+            let off = (u - straight[0]).hypot(v - straight[1]);
+            if off.is_nan() || off > 1e-3 {
+                return None;
+            }
+        }
+        Some((x, y, depth))
     }
 
     /// Depth per distance along a ray of this camera: multiply a distance by it to get z-depth.
@@ -171,6 +195,9 @@ impl Camera {
                 }
             }
         }
+        if !k.has_rays() {
+            return Err(CameraError::Distortion(k.distortion));
+        }
         let r = self.rotation();
         let error = (r * r.transpose() - DMat3::IDENTITY).to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
         // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far off.
@@ -188,7 +215,15 @@ mod tests {
         let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
         Camera {
             name: "c".into(),
-            intrinsics: Intrinsics { width: 37, height: 23, fx: 40.0, fy: 44.0, cx: 18.0, cy: 12.5 },
+            intrinsics: Intrinsics {
+                width: 37,
+                height: 23,
+                fx: 40.0,
+                fy: 44.0,
+                cx: 18.0,
+                cy: 12.5,
+                distortion: Distortion::default(),
+            },
             camera_to_world: [row(0), row(1), row(2)],
         }
     }
@@ -197,13 +232,33 @@ mod tests {
         -1.0..1.0f64
     }
 
+    #[test]
+    fn what_a_distortion_would_fold_into_the_picture_is_not_seen() {
+        let mut camera = camera(DVec3::Z, 0.0, DVec3::ZERO);
+        camera.intrinsics.distortion.radial[0] = -0.4;
+        camera.check().unwrap();
+        // Out to a slope of 0.91 places move outwards; 1.6 would be seen near the centre, from the other side.
+        let at = |slope: f64| camera.project(DVec3::new(slope, 0.0, -1.0));
+        assert!(at(0.4).is_some());
+        let folded = camera.intrinsics.distort([18.0 + 40.0 * 1.6, 12.5]);
+        assert!((0.0..37.0).contains(&folded[0]), "{folded:?}");
+        assert_eq!(at(1.6), None);
+    }
+
+    fn mild() -> impl Strategy<Value = Distortion> {
+        let radial = (-0.2..0.2f64, -0.05..0.05f64, -0.02..0.02f64);
+        (radial, -0.01..0.01f64, -0.01..0.01f64)
+            .prop_map(|((k1, k2, k3), p1, p2)| Distortion { radial: [k1, k2, k3], tangential: [p1, p2] })
+    }
+
     proptest! {
         #[test]
         fn projecting_a_ray_gives_its_pixel_back(
             a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64, c in (unit(), unit(), unit()),
-            x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64,
+            x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64, distortion in prop_oneof![Just(Distortion::default()), mild()],
         ) {
-            let camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
+            let mut camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
+            camera.intrinsics.distortion = distortion;
             camera.check().unwrap();
             let ray = camera.ray(x, y);
             prop_assert!((ray.direction.length() - 1.0).abs() < 1e-12);
