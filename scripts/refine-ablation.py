@@ -15,16 +15,19 @@ import sys
 import cells
 import protocols
 
-# A part, and the parameters of train-refine that take it away or put something else in its place.
+# A part, and the parameters that take it away or put something else in its place.
+ONE = "train-refine.references=1"
 PARTS = [
-    ("one reference", ["references=1"]),
-    ("no reference", ["references=0"]),
-    ("one reference, no occlusion test", ["references=1", "occlusion=false"]),
-    ("two references", ["references=2"]),
-    ("four references", ["references=4"]),
-    ("eight references", ["references=8"]),
-    ("one reference, 16 features", ["references=1", "channels=16"]),
-    ("one reference, two blocks", ["references=1", "blocks=2"]),
+    ("one reference", [ONE]),
+    ("no reference", ["train-refine.references=0"]),
+    ("one reference, no occlusion test", [ONE, "train-refine.occlusion=false"]),
+    ("one reference, expected depth", [ONE, "rehearsal-views.depth=expected"]),
+    ("one reference, lens ignored", [ONE, "prep.lens=ignore"]),
+    ("two references", ["train-refine.references=2"]),
+    ("four references", ["train-refine.references=4"]),
+    ("eight references", ["train-refine.references=8"]),
+    ("one reference, 16 features", [ONE, "train-refine.channels=16"]),
+    ("one reference, two blocks", [ONE, "train-refine.blocks=2"]),
 ]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -44,7 +47,7 @@ def trained(scene: str, settings: list[str]) -> dict:
     """What a refiner's training says of it."""
     chosen = protocols.settings(options.protocol, "kernel", refined=True)
     chosen |= {"train-refine.steps": options.steps} | ({"split": options.split} if options.split else {})
-    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *(f"train-refine.{setting}" for setting in settings)])
+    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
     wanted = ["train-refine", "-i", f"dataset={cells.dataset(options.data, scene)}"]
     # Those of the field that isn't trained here mean nothing.
     wanted += [word for name, value in chosen.items() if name not in ("rays", "members") for word in ("-p", f"{name}={value}")]

@@ -186,8 +186,7 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     project.replace("  eval:", "  report:\n    inputs: {run: eval}\n  eval:");
     project.replace("rays: 60000", "rays: 500000");
     project.ok(&["run", "-i", "dataset=./colmap"]);
-    let metrics = project.object(&project.output_of("eval", &["-i", "dataset=./colmap"])[0]).join("metrics.json");
-    let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+    let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./colmap"]);
     let mean = &metrics["mean"];
     assert!(mean.get("psnr").is_none() && mean.get("ssim").is_none(), "{mean}");
     // What is far above a page of the mean colour's; wrong poses end there.
@@ -219,10 +218,7 @@ fn exposures_are_found() {
     let scored = |exposure: &str| {
         let settings = ["-i", "dataset=./transforms", "-p", exposure];
         project.ok(&[&["run"], &settings[..]].concat());
-        let read = |stage: &str, file: &str| -> Value {
-            let artifact = project.object(&project.output_of(stage, &settings)[0]);
-            serde_json::from_slice(&std::fs::read(artifact.join(file)).unwrap()).unwrap()
-        };
+        let read = |stage: &str, file: &str| project.json(stage, file, &settings);
         (read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(), read("train-ss", "training.json"))
     };
     let ((found, training), (ignored, _)) = (scored("exposure=true"), scored("exposure=false"));
@@ -266,8 +262,7 @@ fn lenses_are_followed_or_undone() {
     let psnr = |lens: &str| {
         let settings = ["-i", "dataset=./transforms", "-p", lens];
         project.ok(&[&["run"], &settings[..]].concat());
-        let metrics = project.object(&project.output_of("eval", &settings)[0]).join("metrics.json");
-        let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+        let metrics = project.json("eval", "metrics.json", &settings);
         metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
     };
     let [followed, undone, ignored] = ["lens=follow", "lens=undo", "lens=ignore"].map(psnr);
@@ -277,7 +272,7 @@ fn lenses_are_followed_or_undone() {
         "{followed} dB followed, {undone} dB undone, {ignored} dB ignored"
     );
     // Cameras say so, and films don't.
-    let scene = project.object(&project.output_of("prep", &["-i", "dataset=./transforms"])[0]).join("cameras");
+    let scene = project.artifact("prep", &["-i", "dataset=./transforms"]).join("cameras");
     let film = project.path("film");
     assert_eq!(stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &scene)], &film, &[]).code, 0);
     let is_bent = |folder: &Path| views(folder)[0]["camera"]["intrinsics"].get("distortion").is_some();
@@ -324,8 +319,7 @@ fn poses_are_refined_and_test_views_located() {
         let settings = ["eval", "eval-located", "-i", "dataset=./transforms", "-p", refined];
         project.ok(&[&["run"], &settings[..]].concat());
         ["eval", "eval-located"].map(|stage| {
-            let metrics = project.object(&project.output_of(stage, &settings)[0]).join("metrics.json");
-            let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+            let metrics = project.json(stage, "metrics.json", &settings);
             metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
         })
     };
@@ -333,8 +327,7 @@ fn poses_are_refined_and_test_views_located() {
     println!("{as_given:.2} dB as given, {only_located:.2} located, {only_refined:.2} refined, {both:.2} both");
     assert!(both > only_located + 1.0 && both > only_refined + 1.0 && both > as_given + 3.0);
     let settings = ["-i", "dataset=./transforms", "-p", "pose_refinement=true"];
-    let training = project.object(&project.output_of("train-ss", &settings)[0]).join("training.json");
-    let training: Value = serde_json::from_slice(&std::fs::read(training).unwrap()).unwrap();
+    let training = project.json("train-ss", "training.json", &settings);
     assert_eq!(training["poses"].as_array().unwrap().len(), 17);
     let open = ["run", "-i", "dataset=./transforms", "-p", "pose_refinement=true", "-p", "background=alpha"];
     project.run(&open).fails(2, &["parameter pose_refinement", "open background"]);
@@ -370,17 +363,16 @@ fn what_masks_leave_out_is_not_learnt() {
         }
         std::fs::write(&file, transforms.to_string()).unwrap();
         project.ok(&["run", "-i", "dataset=./transforms"]);
-        let metrics = project.object(&project.output_of("eval", &["-i", "dataset=./transforms"])[0]).join("metrics.json");
-        let metrics: Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+        let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./transforms"]);
         metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
     };
     let masked = scored(true);
     // With HR truth: PSNR is that of the pixels that count.
     let small = ["-i", "dataset=./transforms", "-p", "lr=16", "-p", "train-ss.rays=20000"];
     project.ok(&[&["run", "eval"], &small[..]].concat());
-    let object = |stage: &str| project.object(&project.output_of(stage, &small)[0]);
+    let object = |stage: &str| project.artifact(stage, &small);
     let (rendered, truth) = (object("render-depth"), object("prep").join("truth"));
-    let metrics: Value = serde_json::from_slice(&std::fs::read(object("eval").join("metrics.json")).unwrap()).unwrap();
+    let metrics = project.json("eval", "metrics.json", &small);
     let list: scene::Views = serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
     let shown = list.background.shown();
     for (view, scores) in list.views.iter().zip(metrics["views"].as_array().unwrap()) {
@@ -445,8 +437,7 @@ fn worlds_without_end_have_a_space_of_their_own() {
         let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
         let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
         project.ok(&[&["run"], &all[..]].concat());
-        let metrics = project.object(&project.output_of("eval", &all)[0]).join("metrics.json");
-        let mean = serde_json::from_slice::<Value>(&std::fs::read(metrics).unwrap()).unwrap()["mean"].clone();
+        let mean = project.json("eval", "metrics.json", &all)["mean"].take();
         (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
     };
     for (layout, space, least, depth_error) in

@@ -94,8 +94,7 @@ fn every_network_given_scores() {
     let heads = layers.iter().enumerate().map(|(k, layer)| (format!("lin{k}.model.1.weight"), vec![1, layer.1, 1, 1]));
     write("lpips_linear_alex_v0.1.safetensors", &heads.collect::<Vec<_>>());
     project.ok(&arguments);
-    let metrics = project.object(&project.output_of("eval", &arguments[1..])[0]).join("metrics.json");
-    let metrics: serde_json::Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+    let metrics = project.json("eval", "metrics.json", &arguments[1..]);
     assert!(metrics["mean"]["lpips"].is_null() && metrics["mean"]["lpips_vgg"].is_null(), "{}", metrics["mean"]);
     // A network without weights sees no difference.
     assert_eq!(metrics["mean"]["lpips_alex"], 0.0);
@@ -219,7 +218,7 @@ fn every_option_goes_through() {
 #[test]
 fn members_are_fields_of_their_own_and_average() {
     let project = Project::tiny();
-    let of = |stage: &str, more: &[&str]| project.object(&project.output_of(stage, more)[0]);
+    let of = |stage: &str, more: &[&str]| project.artifact(stage, more);
     let both = ["-p", "train-ss.seed=4", "-p", "members=2", "-p", "rays=60000"];
     let singles = [["-p", "train-ss.seed=4", "-p", "rays=30000"], ["-p", "train-ss.seed=5", "-p", "rays=30000"]];
     project.ok(&[&["run"], &both[..]].concat());
@@ -288,7 +287,7 @@ fn any_size_and_shape() {
     project.ok(&["run", "render-depth", "-p", "render-depth.size=1"]);
     project.ok(&["run", "render-depth", "-p", "render-depth.size=100"]);
     // Cut the data set's pictures to 48×30: the same focal length, the same centre.
-    let dataset = project.object(&project.output_of("demo-scene", &[])[0]);
+    let dataset = project.artifact("demo-scene", &[]);
     for split in ["train", "test"] {
         let text = std::fs::read_to_string(dataset.join(format!("transforms_{split}.json"))).unwrap();
         let file = project.path(&format!("cut/transforms_{split}.json"));
@@ -303,7 +302,7 @@ fn any_size_and_shape() {
     }
     let run = project.ok(&["run", "-i", "dataset=cut"]);
     assert!(run.contains("eval: PSNR") && !run.contains("depth error"), "{run}");
-    let scene = project.object(&project.output_of("prep", &["-i", "dataset=cut"])[0]);
+    let scene = project.artifact("prep", &["-i", "dataset=cut"]);
     let image = pixels::read_png(&scene.join("train/images/r_0.png")).unwrap();
     assert_eq!((image.width, image.height), (24, 15));
 }

@@ -16,7 +16,7 @@ const REFINED: &str = "
     like: render-depth
     inputs: {field: rehearsal-field, cameras: prep/train}
   train-refine:
-    inputs: {views: rehearsal-views, truth: prep/train}
+    inputs: {views: rehearsal-views, truth: prep/train, photographs: prep/rehearsal, cameras: prep/cameras}
     parameters: {steps: 60, batch: 4, square: 16, channels: 8, blocks: 1}
   refine:
     inputs: {views: render-depth, refiner: train-refine, photographs: prep/train}
@@ -74,7 +74,7 @@ fn refined_views_stand_beside_rendered_ones() {
     assert_eq!(stages, ["eval", "eval-refined"]);
 
     // Colours change, opacity and depth don't.
-    let folder = |stage: &str| project.object(&project.output_of(stage, &["refined"])[0]);
+    let folder = |stage: &str| project.artifact(stage, &["refined"]);
     let (rendered, refined) = (folder("render-depth"), folder("refine"));
     for file in std::fs::read_dir(rendered.join("images")).unwrap() {
         let name = file.unwrap().file_name();
@@ -136,21 +136,31 @@ fn views_agree_with_their_own_photographs() {
         rows.as_array().unwrap().iter().map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap()).collect()
     };
     let said = |more: &[&str]| {
-        let folder = project.object(&project.output_of("refine", &[&["refined"], more].concat())[0]);
+        let folder = project.artifact("refine", &[&["refined"], more].concat());
         std::fs::read_to_string(folder.join("summary.txt")).unwrap()
+    };
+    let is_trained_so = |more: &[&str]| -> bool {
+        project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"].as_bool().unwrap()
     };
     let given = at_low_resolution(&[]);
     assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
     let papers = at_low_resolution(&["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
     assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
+    // The network has learnt on views that agree, too; what hasn't is said to be another task.
+    assert!(is_trained_so(&["-p", "split=paper"]) && !is_trained_so(&[]));
+    let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
+    let (views, refiner) = (folder("render-depth"), folder("train-refine"));
+    let alone = stage("refine", "{}", &[("views", &views), ("refiner", &refiner)], &project.path("alone"), &[]);
+    assert_eq!(alone.code, 0, "{}", alone.stderr);
+    assert!(alone.stderr.contains("trained on views that agree with LR photographs of their own"), "{}", alone.stderr);
 }
 
 #[test]
 fn references_are_used_by_a_network_that_knows_how() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
-    let folder = |stage: &str| project.object(&project.output_of(stage, &target)[0]);
+    let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner) = (folder("render-depth"), folder("train-referenced"));
     let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
@@ -175,7 +185,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     // A network that can't use them says so.
     let plain_target = [&["train-refine"], &target[1..]].concat();
     project.ok(&[&["run"], &plain_target[..]].concat());
-    let plain = project.object(&project.output_of("train-refine", &plain_target)[0]);
+    let plain = project.artifact("train-refine", &plain_target);
     let both = [("references", references.as_path()), ("reference-views", reference_views.as_path())];
     let (left_out, _) = refine("plain", &plain, &both);
     assert!(left_out.code == 0 && left_out.stderr.contains("trained without references"), "{}", left_out.stderr);
@@ -233,9 +243,10 @@ fn noise(seed: u64, pixel: usize) -> f32 {
 fn bad_references_do_no_harm() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
-    let folder = |stage: &str| project.object(&project.output_of(stage, &target)[0]);
+    let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner, prep, reference_views) =
         (folder("render-depth"), folder("train-referenced"), folder("prep"), folder("reference-views"));
+    println!("{}", project.json("train-referenced", "refiner.json", &target));
     let references = prep.join("references");
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
         changed(&project, name, of, "exr", &|path| change_depth(path, change))
@@ -261,7 +272,8 @@ fn bad_references_do_no_harm() {
         command.args(inputs.map(|(input, folder)| format!("--input={input}={}", folder.display())));
         let finished = Finished::of(command.output().unwrap());
         assert_eq!(finished.code, 0, "{}", finished.stderr);
-        println!("{name}: {:.2} dB, rendered {rendered:.2}; {}", psnr(&project.path(name)), finished.stderr);
+        let summary = std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap();
+        println!("{name}: {:.2} dB, rendered {rendered:.2}; {summary}; {}", psnr(&project.path(name)), finished.stderr);
         assert!(psnr(&project.path(name)) > rendered - 0.05, "{name}: {} of {rendered}", psnr(&project.path(name)));
         finished.stderr
     };
@@ -342,8 +354,7 @@ fn references_join_a_training() {
     let arguments = ["eval", "eval-joined", "-p", "prep.references=6", "-p", "train-ss.rays=200000"];
     project.ok(&[&["run"], &arguments[..]].concat());
     let psnr = |stage: &str| {
-        let metrics = project.object(&project.output_of(stage, &arguments)[0]).join("metrics.json");
-        let metrics: serde_json::Value = serde_json::from_slice(&std::fs::read(metrics).unwrap()).unwrap();
+        let metrics = project.json(stage, "metrics.json", &arguments);
         metrics["mean"]["psnr"].as_f64().unwrap()
     };
     println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
@@ -353,7 +364,7 @@ fn references_join_a_training() {
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
 fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'static str) {
     project.ok(&["run", "rehearsal-views"]);
-    let folder = |stage: &str| project.object(&project.output_of(stage, &["rehearsal-views"])[0]);
+    let folder = |stage: &str| project.artifact(stage, &["rehearsal-views"]);
     (
         folder("rehearsal-views"),
         folder("prep").join("train"),
@@ -402,7 +413,7 @@ fn the_paper_s_network_refines_by_references() {
     project.replace("parameters: {size: 48,", "parameters: {size: 72,");
     project.replace("{lr: 24, scale: 2}", "{lr: 36, scale: 2}");
     project.ok(&["run", "eval-paper"]);
-    let folder = |stage: &str| project.object(&project.output_of(stage, &["eval-paper"])[0]);
+    let folder = |stage: &str| project.artifact(stage, &["eval-paper"]);
     let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
     assert!(summary.contains("3 views by 1 references"), "{summary}");
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));

@@ -77,7 +77,7 @@ fn artifacts_fit_their_schemas() {
         let errors: Vec<String> = validator.iter_errors(&read(file)).map(|e| e.to_string()).collect();
         assert!(errors.is_empty(), "{}: {errors:?}", file.display());
     };
-    let object = |stage: &str| project.object(&project.output_of(stage, &[])[0]);
+    let object = |stage: &str| project.artifact(stage, &[]);
     let (scene, field, views, metrics) = (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
     for folder in [&scene, &field, &views, &metrics] {
         check("artifact.json", &folder.join("artifact.json"));

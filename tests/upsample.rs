@@ -35,7 +35,7 @@ fn goldens() -> std::path::PathBuf {
 fn views_are_enlarged_and_scored() {
     let project = project();
     project.ok(&["run", "eval-upsampled"]);
-    let folder = |stage: &str| project.object(&project.output_of(stage, &["eval-upsampled"])[0]);
+    let folder = |stage: &str| project.artifact(stage, &["eval-upsampled"]);
     let (low, large) = (folder("views-low"), folder("upsample"));
     for file in std::fs::read_dir(low.join("images")).unwrap() {
         let name = file.unwrap().file_name();

@@ -94,6 +94,19 @@ impl Project {
             .collect()
     }
 
+    /// Folder of the artifact that a stage has now, the first of a sweep's.
+    #[track_caller]
+    pub fn artifact(&self, stage: &str, arguments: &[&str]) -> PathBuf {
+        self.object(&self.output_of(stage, arguments)[0])
+    }
+
+    /// A JSON file of that.
+    #[track_caller]
+    pub fn json(&self, stage: &str, file: &str, arguments: &[&str]) -> serde_json::Value {
+        let path = self.artifact(stage, arguments).join(file);
+        serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+    }
+
     /// Folder of an artifact, by the beginning of its identity.
     #[track_caller]
     pub fn object(&self, start: &str) -> PathBuf {

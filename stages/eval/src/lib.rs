@@ -390,7 +390,7 @@ fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Op
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
         warp: "the true picture of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
-               both see the same surface (depths within 2 %, opacity at least one half)"
+               both see the same surface (depths within 2 %, or within a pixel as the view sees them; opacity at least one half)"
             .to_owned(),
         low_resolution: format!(
             "the render shrunk by {}, against the view's LR picture",

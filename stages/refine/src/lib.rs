@@ -6,23 +6,21 @@
 //! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches instead of adding to the view.
 //!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
-//! as it takes to agree with that.
+//! as it takes to agree with that; before, too, where the network learnt on views that do.
 //!
 //! Colours change; opacity, depth and cameras stay what the field made them.
-
-mod agreement;
 
 use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use paper_refiner::PaperRefiner;
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
-use refinement::{Architecture, KnownView, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided};
+use refinement::{
+    Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
+};
 use scene::{Background, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-use agreement::Photographs;
 
 /// Parameters of `refine`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -79,7 +77,7 @@ impl Stage for Refine {
         let mut views = Views::read(input)?;
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
-        let photographs = context.optional_input("photographs").map(Photographs::read).transpose()?;
+        let photographs = context.optional_input("photographs").map(OwnPhotographs::read).transpose()?;
         let mut job = Job {
             context,
             input,
@@ -89,6 +87,7 @@ impl Stage for Refine {
             turns: params.turns,
             references,
             photographs,
+            agreeing: file.agreeing,
         };
         if let Some(guidance) = job.network.guidance().filter(|_| !job.references.is_empty()) {
             job.leave_out(&views, guidance, LITTLE * file.trusted.unwrap_or(1.0))?;
@@ -100,6 +99,9 @@ impl Stage for Refine {
             context.check_interrupt()?;
             agreed += usize::from(job.refine(view, &mut uses)?);
             progress.add(1);
+        }
+        if job.agreeing && agreed < views.views.len() {
+            context.say("the network was trained on views that agree with LR photographs of their own, which some of these haven't: train one without");
         }
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
@@ -205,26 +207,35 @@ struct Job<'a> {
     strength: f32,
     turns: u32,
     references: Vec<KnownView>,
-    photographs: Option<Photographs<'a>>,
+    photographs: Option<OwnPhotographs<'a>>,
+    /// Whether the network was trained on views that agree with their own photographs.
+    agreeing: bool,
 }
 
 impl Job<'_> {
     /// Refines one view: its files are written, and named in it. Whether it was made to agree with its own photograph.
     fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
-        let (rendered, image) = read(self.input, view, self.background)?;
-        let refined = self.redraw(&rendered, uses)?;
-        let agreed = match &self.photographs {
-            Some(photographs) => photographs.of(&view.camera)?.map(|own| photographs.agree(&refined, &own)),
-            None => None,
+        let (mut rendered, image) = read(self.input, view, self.background)?;
+        let mut own = None;
+        if let Some(photographs) = &self.photographs {
+            own = photographs.of(&view.camera)?.map(|own| (photographs, own));
+        }
+        let agree = |picture: Picture| match &own {
+            Some((photographs, own)) => photographs.agree(&picture, own),
+            None => picture,
         };
-        let (refined, is_own) = agreed.map_or((refined, false), |agreed| (agreed, true));
+        if self.agreeing {
+            let colours = agree(rendered.colours());
+            rendered = rendered.with_colours(&colours);
+        }
+        let refined = agree(self.redraw(&rendered, uses)?);
         let path = format!("images/{name}.exr");
         self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;
         view.image = Some(path.clone());
         view.depth = view.depth.as_ref().map(|_| path);
-        Ok(is_own)
+        Ok(own.is_some())
     }
 
     /// What the network makes of a view: colours in 0..1. What each reference was of use for is added to `uses`.

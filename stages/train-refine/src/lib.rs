@@ -6,6 +6,9 @@
 //! For views that will be refined by references, it sees references in training, too: other views of the rehearsal, of which every one has
 //! its true picture.
 //!
+//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's split, they agree with those before the
+//! network sees them; so do the views that it learns from.
+//!
 //! Every eighth view is left out of training; what the network brings there is measured and kept with it.
 //!
 //! `net: paper` trains the published network instead, on the rendered views of references beside the references (block `train-paper`): that is
@@ -20,8 +23,8 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr};
 use refinement::{
-    Architecture, KnownView, Network, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer, RefinerTraining,
-    Rendered, Training, WEIGHTS_FILE,
+    Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer,
+    RefinerTraining, Rendered, Training, WEIGHTS_FILE,
 };
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -107,9 +110,24 @@ impl Stage for TrainRefine {
     const SUMMARY: &'static str = "Trains the network that refines rendered views, from views whose truth is known.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
+        let cameras = ["scene/cameras", "scene/train", "scene/truth", "scene/references", "cameras", "views"];
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("truth", Input::required(&["scene/train", "scene/truth", "scene/references"], "what they should look like")),
+            (
+                "photographs",
+                Input::optional(
+                    &["scene/train"],
+                    "net: compact: LR photographs that the field which rendered them was trained on",
+                ),
+            ),
+            (
+                "cameras",
+                Input::optional(
+                    &cameras,
+                    "net: compact: cameras of the views to be refined; where all have LR photographs, so have examples",
+                ),
+            ),
             (
                 "weights",
                 Input::optional(&["weights"], "net: paper: folder with VGG-19, for the perceptual loss; without it L1 alone"),
@@ -129,7 +147,8 @@ impl Stage for TrainRefine {
         if params.square % 2 == 1 {
             return Err(Failure::Usage(format!("parameter square: {} is odd; an even number is expected", params.square)).into());
         }
-        let (training, left_out) = examples(context.input("views")?, context.input("truth")?)?;
+        let own = own_photographs(context)?;
+        let (training, left_out) = examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
         if params.references > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
@@ -157,10 +176,24 @@ impl Stage for TrainRefine {
             rendered_psnr: scores.rendered_psnr,
             refined_psnr: scores.refined_psnr,
             trusted: scores.trusted,
+            agreeing: own.is_some(),
         };
         context.write_json(REFINER_FILE, &file)?;
         say(context, "views it hasn't seen", &file)
     }
+}
+
+/// LR photographs of the rehearsal's views, where those of the views to be refined will be known, too: the task is to be the same.
+fn own_photographs(context: &Context) -> anyhow::Result<Option<OwnPhotographs<'_>>> {
+    let Some((photographs, cameras)) = context.optional_input("photographs").zip(context.optional_input("cameras")) else {
+        return Ok(None);
+    };
+    let own = OwnPhotographs::read(photographs)?;
+    if !own.are_of_all(&Views::read(cameras)?) {
+        return Ok(None);
+    }
+    context.say("all views to be refined have LR photographs of their own: the network learns on views that agree with theirs");
+    Ok(Some(own))
 }
 
 /// What training brought to some views.
@@ -217,7 +250,11 @@ fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> 
 }
 
 /// Views beside their truth: those to train on, and those left out; where there are fewer than two, the same ones.
-fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<KnownView>, Vec<KnownView>)> {
+fn examples(
+    views: &GivenInput,
+    truth: &GivenInput,
+    own: Option<&OwnPhotographs<'_>>,
+) -> anyhow::Result<(Vec<KnownView>, Vec<KnownView>)> {
     let (rendered, known) = (Views::read(views)?, Views::read(truth)?);
     let background = known.background.shown();
     let example = |view: &View| -> anyhow::Result<Option<KnownView>> {
@@ -226,7 +263,13 @@ fn examples(views: &GivenInput, truth: &GivenInput) -> anyhow::Result<(Vec<Known
         let place = || format!("view {name}");
         let Some(photograph) = true_view.read_photograph(truth).bad_input(place())? else { return Ok(None) };
         let image = read_exr(&views.path(file)).bad_input(place())?;
-        let rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
+        let mut rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
+        if let Some(own) = own
+            && let Some(photograph) = own.of(&view.camera)?
+        {
+            let colours = own.agree(&rendered.colours(), &photograph);
+            rendered = rendered.with_colours(&colours);
+        }
         Ok(Some(KnownView::new(rendered, photograph.over(background)).bad_input("input views")?))
     };
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;

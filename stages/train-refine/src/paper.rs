@@ -10,7 +10,7 @@ const VGG: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
 
 /// Trains the published network. It learns from all views there are, as published: from one.
 pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-    let (mut known, left_out) = examples(context.input("views")?, context.input("truth")?)?;
+    let (mut known, left_out) = examples(context.input("views")?, context.input("truth")?, None)?;
     if known.len() > 1 {
         known.extend(left_out);
     }
@@ -44,7 +44,8 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
     }
     let network = Network::Paper { width, patches: params.patches };
-    let file = RefinerFile { network, strength: 1.0, rendered_psnr: rendered, refined_psnr: refined, trusted: None };
+    let file =
+        RefinerFile { network, strength: 1.0, rendered_psnr: rendered, refined_psnr: refined, trusted: None, agreeing: false };
     context.write_json(REFINER_FILE, &file)?;
     say(context, "the references that it learnt from", &file)
 }

@@ -55,7 +55,7 @@ pub struct Guided {
 /// Pixels to each side over which what is shown is compared with what is rendered: in their mean the detail that rendering lacks evens out.
 const AROUND: usize = 5;
 /// A mean difference that halves the trust, twice; and how far, in pixels, a reference may jump between neighbours before it does.
-const DIFFERENT: f32 = 0.15;
+const DIFFERENT: f32 = 0.1;
 const JUMP: f32 = 1.0;
 
 /// What one reference shows of a pixel.

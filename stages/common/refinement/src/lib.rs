@@ -10,6 +10,7 @@
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference; [`Exposure`]: how a
 //!   reference's differs from that of the other pictures.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes.
+//! * [`OwnPhotographs`]: LR pictures that views are made to agree with.
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
 //!
@@ -29,12 +30,14 @@
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
 
+mod agreement;
 mod folded;
 mod guide;
 mod refiner;
 mod trainer;
 mod view;
 
+pub use agreement::OwnPhotographs;
 pub use guide::{Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};

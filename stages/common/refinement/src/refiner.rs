@@ -71,6 +71,9 @@ pub struct RefinerFile {
     /// Share of what references saw of those views that they were trusted with, where the network knows references.
     #[serde(default)]
     pub trusted: Option<f64>,
+    /// Whether the network takes views that agree with LR photographs of their own.
+    #[serde(default)]
+    pub agreeing: bool,
 }
 
 /// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (He et al. 2016), one out. It pads

@@ -34,6 +34,25 @@ impl Rendered {
         Ok(Self { opacity: picture.channel(3), depth: depth.to_vec(), view, camera })
     }
 
+    /// Its colours alone.
+    pub fn colours(&self) -> Picture {
+        let colours = self.view.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]);
+        Picture::new(self.view.width, self.view.height, 3, colours.collect())
+    }
+
+    /// The same view with other colours.
+    ///
+    /// # Panics
+    /// Where they aren't of its size.
+    #[must_use]
+    pub fn with_colours(mut self, colours: &Picture) -> Self {
+        assert_eq!((colours.width, colours.height), (self.view.width, self.view.height), "colours of its size");
+        for (pixel, colour) in self.view.data.chunks_exact_mut(4).zip(colours.data.chunks_exact(3)) {
+            pixel[..3].copy_from_slice(colour);
+        }
+        self
+    }
+
     /// Where the field sees surfaces.
     pub fn surface(&self) -> Surface<'_> {
         Surface { camera: &self.camera, depth: &self.depth, opacity: &self.opacity }

@@ -1,3 +1,5 @@
+use glam::DVec3;
+
 use crate::camera::Camera;
 
 /// What a view sees: at each pixel's centre, row by row, the depth of the surface and its opacity.
@@ -22,8 +24,11 @@ pub struct Sight {
     pub detail: f32,
 }
 
-/// Two depths of one surface differ by at most this share; more is another surface.
+/// Two depths of one surface differ by at most this share of them,
 const SAME: f64 = 0.02;
+/// or what one view sees at the other's depth it sees in the same pixel, at most so many pixels away: of a far wall views from nearly one place
+/// tell depth badly, and it matters as little.
+const SAME_PLACE: f64 = 0.5;
 
 impl Surface<'_> {
     /// Where another view sees what this one sees at each pixel, row by row: [`Surface::sight`]'s places.
@@ -42,8 +47,9 @@ impl Surface<'_> {
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
     pub fn sight(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Sight> {
-        let (sight, at) = self.look(column, row, other.camera)?;
-        other.has_near(at).then_some(sight)
+        let (sight, point) = self.look(column, row, other.camera)?;
+        let place = [column as f64 + 0.5, row as f64 + 0.5];
+        other.shows(point, sight.place.map(f64::from), (self.camera, place)).then_some(sight)
     }
 
     /// The same, were nothing between: how a camera would see it through whatever stands there.
@@ -54,8 +60,8 @@ impl Surface<'_> {
         self.look(column, row, other).map(|(sight, _)| sight)
     }
 
-    /// How a camera would see what this view sees at a pixel, and where it would: x, y and depth.
-    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Sight, (f64, f64, f64))> {
+    /// How a camera would see what this view sees at a pixel, and which point that is.
+    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Sight, DVec3)> {
         let i = row * self.camera.intrinsics.width as usize + column;
         if self.opacity[i] < 0.5 {
             return None;
@@ -63,7 +69,7 @@ impl Surface<'_> {
         let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
         let distance = f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray);
         let point = ray.at(distance);
-        let (x, y, depth) = other.project(point)?;
+        let (x, y, _) = other.project(point)?;
         let size = [other.intrinsics.width, other.intrinsics.height].map(f64::from);
         // NaN lies nowhere.
         let is_inside = (0.0..=size[0]).contains(&x) && (0.0..=size[1]).contains(&y);
@@ -73,20 +79,28 @@ impl Surface<'_> {
             cosine: (ray.direction.dot(way) / way.length()) as f32,
             detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
         };
-        is_inside.then_some((sight, (x, y, depth)))
+        is_inside.then_some((sight, point))
     }
 
-    /// Whether there is a surface of that depth at one of the four pixels around a position. All four lie in the picture or at its border.
-    fn has_near(&self, (x, y, depth): (f64, f64, f64)) -> bool {
+    /// Whether what this view sees at a position is a point that another sees at a place: by the depth of one of the four pixels around,
+    /// which all lie in the picture or at its border.
+    fn shows(&self, point: DVec3, [x, y]: [f64; 2], (other, place): (&Camera, [f64; 2])) -> bool {
         let (width, height) = (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
         let around = |v: f64, size: usize| {
             let low = (v - 0.5).floor().max(0.0) as usize;
             [low.min(size - 1), (low + 1).min(size - 1)]
         };
+        let way = point - self.camera.centre();
+        let depth = way.dot(self.camera.forward());
+        let is_there = |own: f64| {
+            let seen = || other.project(self.camera.centre() + way * (own / depth));
+            (own - depth).abs() <= SAME * depth
+                || seen().is_some_and(|(u, v, _)| (u - place[0]).hypot(v - place[1]) <= SAME_PLACE)
+        };
         around(y, height).into_iter().any(|row| {
             around(x, width).into_iter().any(|column| {
                 let i = row * width + column;
-                self.opacity[i] >= 0.5 && (f64::from(self.depth[i]) - depth).abs() <= SAME * depth
+                self.opacity[i] >= 0.5 && is_there(f64::from(self.depth[i]))
             })
         })
     }
@@ -153,6 +167,24 @@ mod tests {
         let (da, db) = (depths(&a, false), depths(&b, false));
         let empty = Surface { camera: &a, depth: &da, opacity: &nothing };
         assert!(empty.seen_from(&Surface { camera: &b, depth: &db, opacity: &opacity }).iter().all(Option::is_none));
+    }
+
+    /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place: then it is seen in the same pixel.
+    #[test]
+    fn depth_matters_as_far_as_it_moves_what_is_seen() {
+        let opacity = vec![1.0; 64 * 48];
+        let a = camera(DVec3::new(0.0, 0.0, 4.0), 0.0);
+        let seen = |baseline: f64, off: f32| {
+            let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
+            let (da, db): (Vec<f32>, Vec<f32>) = (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
+            let other = Surface { camera: &b, depth: &db, opacity: &opacity };
+            Surface { camera: &a, depth: &da, opacity: &opacity }.seen_from(&other).iter().flatten().count()
+        };
+        let all = 64 * 48;
+        // 66 pixels of focal length: from 0.5 units aside 5 % of 4 units are 0.4 pixels, from 2 units 1.6.
+        assert!(seen(0.5, 1.05) > all * 3 / 4 && seen(0.5, 1.05) == seen(0.5, 1.0));
+        assert_eq!(seen(2.0, 1.05), 0);
+        assert!(seen(2.0, 1.015) > 0);
     }
 
     #[test]

@@ -2,8 +2,8 @@ use artifact::{FailureExt as _, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling};
 use scene::{Camera, Photograph, Views};
 
-/// LR photographs of some of the views.
-pub(crate) struct Photographs<'a> {
+/// LR photographs that some of the views' own cameras took: those that a field was trained on.
+pub struct OwnPhotographs<'a> {
     input: &'a GivenInput,
     views: Views,
     filter: Filter,
@@ -12,14 +12,20 @@ pub(crate) struct Photographs<'a> {
 /// LR pixels that the nearest picture looks at on each side.
 const REACH: usize = 12;
 
-impl<'a> Photographs<'a> {
-    pub(crate) fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
+impl<'a> OwnPhotographs<'a> {
+    /// Those of a scene's training views, with the kernel that made them.
+    pub fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
         let degradation: Degradation = input.read_json(DEGRADATION_FILE)?;
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
 
+    /// Whether each of some cameras took one.
+    pub fn are_of_all(&self, cameras: &Views) -> bool {
+        cameras.views.iter().all(|view| self.views.taken_by(&view.camera).is_some())
+    }
+
     /// The LR photograph that was taken by a view's own camera, over the background, where there is one: of that name and pose, and smaller.
-    pub(crate) fn of(&self, camera: &Camera) -> anyhow::Result<Option<Photograph>> {
+    pub fn of(&self, camera: &Camera) -> anyhow::Result<Option<Photograph>> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
         let photograph = view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
@@ -29,7 +35,7 @@ impl<'a> Photographs<'a> {
 
     /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
     /// photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
-    pub(crate) fn agree(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
+    pub fn agree(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
         let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
         let mut residual = kernel.apply(refined);
         for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
@@ -67,7 +73,7 @@ mod tests {
             let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
-            let photographs = Photographs { input: &input, views, filter };
+            let photographs = OwnPhotographs { input: &input, views, filter };
             let error = |a: &Picture, b: &Picture| {
                 let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
                 (squares.sum::<f64>() / a.data.len() as f64).sqrt()
