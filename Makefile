@@ -91,11 +91,11 @@ REFERENCES ?= 1
 given = $(if $(filter file,$(origin $(1))),$(2),$($(1)))
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
 	@python3 scripts/refine-table.py --data $(DATA) --scenes $(call given,SCENES,fern) --protocols $(call given,PROTOCOLS,252x2 252x4) --references $(REFERENCES) \
-	  $(if $(SPLIT),--split $(SPLIT)) --out $(or $(OUT),out/refine-table.json)
+	  $(if $(SPLIT),--split $(SPLIT)) --set $(SET) --out $(or $(OUT),out/refine-table.json)
 
 refine-ablation: build ## What each part of refinement brings, on views that its rehearsal leaves out
 	@python3 scripts/refine-ablation.py --data $(DATA) --scenes $(call given,SCENES,fern) $(if $(SPLIT),--split $(SPLIT)) \
-	  $(if $(VARIANTS),--variants $(VARIANTS)) --out $(or $(OUT),out/refine-ablation.json)
+	  $(if $(VARIANTS),--variants $(VARIANTS)) --set $(SET) --out $(or $(OUT),out/refine-ablation.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) \
