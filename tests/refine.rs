@@ -151,7 +151,11 @@ fn views_agree_with_their_own_photographs() {
     assert!(is_trained_so(&["-p", "split=paper"]) && !is_trained_so(&[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
-    let alone = stage("refine", "{}", &[("views", &views), ("refiner", &refiner)], &project.path("alone"), &[]);
+    let mut command = std::process::Command::new(common::bin("refine"));
+    command.arg("--output").arg(project.path("alone"));
+    command
+        .args([("views", &views), ("refiner", &refiner)].map(|(input, folder)| format!("--input={input}={}", folder.display())));
+    let alone = Finished::of(command.output().unwrap());
     assert_eq!(alone.code, 0, "{}", alone.stderr);
     assert!(alone.stderr.contains("trained on views that agree with LR photographs of their own"), "{}", alone.stderr);
 }

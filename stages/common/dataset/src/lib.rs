@@ -161,7 +161,9 @@ impl Dataset {
     /// Has pictures read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same size, with a
     /// border cut off where the lens saw no more.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
+        let mut undone = 0;
         for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
+            undone += 1;
             let pinhole = frame.taken_with.pinhole().ok_or_else(|| {
                 let reason = format!(
                     "lens distortion {} leaves no pinhole's picture; are its coefficients right?",
@@ -171,13 +173,23 @@ impl Dataset {
             })?;
             frame.pinhole = Some(pinhole);
         }
+        if undone > 0 {
+            self.notes.push(format!("lens distortion of {undone} photographs is undone"));
+        }
         Ok(self)
     }
 
     /// Takes all lenses for free of distortion.
     #[must_use]
     pub fn without_distortion(mut self) -> Self {
-        self.frames.iter_mut().for_each(|f| f.taken_with.distortion = scene::Distortion::default());
+        let mut ignored = 0;
+        for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
+            frame.taken_with.distortion = scene::Distortion::default();
+            ignored += 1;
+        }
+        if ignored > 0 {
+            self.notes.push(format!("lens distortion of {ignored} photographs is ignored"));
+        }
         self
     }
 
