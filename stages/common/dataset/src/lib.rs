@@ -15,7 +15,7 @@
 //! ```no_run
 //! let set = dataset::Dataset::read("my-photographs".as_ref())?;
 //! println!("{}: {} photographs", set.format, set.frames.len());
-//! let (picture, intrinsics) = set.frames[0].photograph()?;
+//! let (picture, camera) = (set.frames[0].photograph()?, set.frames[0].camera());
 //! # Ok::<(), dataset::DatasetError>(())
 //! ```
 
