@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use artifact::{Event, Record, Store, eta, hash_json};
+use artifact::{Event, Pace, Record, Store, hash_json};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use crate::key;
@@ -205,14 +205,19 @@ impl Display {
 
     pub(crate) fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
-            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg} · {eta} left")
-                .expect("the template is constant");
+            let style =
+                ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
             bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned()))
         });
         if bar.is_none() {
             self.line(&format!("{label}: running"));
         }
-        StageView { display: self, label: label.to_owned(), bar, started: Instant::now(), shown: Mutex::new(Instant::now()) }
+        StageView {
+            display: self,
+            label: label.to_owned(),
+            bar,
+            shown: Mutex::new(Shown { when: Instant::now(), label: String::new(), pace: Pace::default() }),
+        }
     }
 }
 
@@ -221,8 +226,14 @@ pub(crate) struct StageView<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
-    started: Instant,
-    shown: Mutex<Instant>,
+    shown: Mutex<Shown>,
+}
+
+/// What was last shown of a stage, and how fast the work that it last told of gets on.
+struct Shown {
+    when: Instant,
+    label: String,
+    pace: Pace,
 }
 
 impl StageView<'_> {
@@ -236,20 +247,18 @@ impl StageView<'_> {
 impl Watcher for StageView<'_> {
     fn progress(&self, event: &Event) {
         let Event::Progress { label, done, total, note } = event;
-        match &self.bar {
-            Some(bar) => {
-                bar.set_length(*total);
-                bar.set_position(*done);
-                bar.set_message(format!("{label} {note}"));
-            }
-            None => {
-                let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-                if shown.elapsed() > Duration::from_secs(15) {
-                    *shown = Instant::now();
-                    let left = eta(self.started.elapsed(), *done, *total);
-                    self.display.line(&format!("{}: {label} {}% {note} · {left} left", self.label, done * 100 / total.max(&1)));
-                }
-            }
+        let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if shown.label != *label {
+            (shown.label, shown.pace) = (label.clone(), Pace::default());
+        }
+        let left = shown.pace.left(*done, *total);
+        if let Some(bar) = &self.bar {
+            bar.set_length(*total);
+            bar.set_position(*done);
+            bar.set_message(format!("{label} {note} · {left} left"));
+        } else if shown.when.elapsed() > Duration::from_secs(15) {
+            shown.when = Instant::now();
+            self.display.line(&format!("{}: {label} {}% {note} · {left} left", self.label, done * 100 / total.max(&1)));
         }
     }
 

@@ -51,7 +51,7 @@ pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_folder, relative_path};
 pub use parameters::{ParameterProblem, Schema};
-pub use progress::{Event, Progress, ProgressMode, eta};
+pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run_record::{RunInput, RunNode, RunRecord};
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, KeyLock, Record, Store, StoreError};

@@ -44,19 +44,20 @@ pub struct Progress {
 struct State {
     done: u64,
     note: String,
-    started: Instant,
-    shown: Option<Instant>,
+    pace: Pace,
+    shown: Instant,
+    is_shown: bool,
 }
 
 impl Progress {
     /// Starts at 0 of `total`.
     pub fn new(label: &str, total: u64, mode: ProgressMode) -> Self {
         let bar = (mode == ProgressMode::Plain && std::io::stderr().is_terminal()).then(|| {
-            let style = indicatif::ProgressStyle::with_template("{prefix:>14} [{bar:30}] {percent:>3}% {msg} · {eta} left")
+            let style = indicatif::ProgressStyle::with_template("{prefix:>14} [{bar:30}] {percent:>3}% {msg} left")
                 .expect("the template is constant");
             indicatif::ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned())
         });
-        let state = State { done: 0, note: String::new(), started: Instant::now(), shown: None };
+        let state = State { done: 0, note: String::new(), pace: Pace::default(), shown: Instant::now(), is_shown: false };
         Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state) }
     }
 
@@ -76,16 +77,17 @@ impl Progress {
     fn update(&self, change: impl FnOnce(&mut State)) {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         change(&mut state);
+        let done = state.done;
+        let left = state.pace.left(done, self.total);
         let interval = if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
-        let last = state.shown.unwrap_or(state.started);
-        let due = last.elapsed() >= Duration::from_millis(interval);
-        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.shown.is_some())) {
+        let due = state.shown.elapsed() >= Duration::from_millis(interval);
+        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.is_shown)) {
             return;
         }
-        state.shown = Some(Instant::now());
+        (state.shown, state.is_shown) = (Instant::now(), true);
         if let Some(bar) = &self.bar {
             bar.set_position(state.done);
-            bar.set_message(state.note.clone());
+            bar.set_message(format!("{} · {left}", state.note));
         } else if self.mode == ProgressMode::Json {
             let event =
                 Event::Progress { label: self.label.clone(), done: state.done, total: self.total, note: state.note.clone() };
@@ -93,7 +95,6 @@ impl Progress {
             // A runner that went away is no reason to stop: the stage's work still counts.
             writeln!(std::io::stdout(), "{line}").ok();
         } else {
-            let left = eta(state.started.elapsed(), state.done, self.total);
             eprintln!("{}: {} of {} {} · {left} left", self.label, state.done, self.total, state.note);
         }
     }
@@ -107,11 +108,38 @@ impl Drop for Progress {
     }
 }
 
-/// Time left in words, from the time taken so far.
-pub fn eta(elapsed: Duration, done: u64, total: u64) -> String {
+/// How fast work gets on, from when it is first heard of: what an interrupted run did before says nothing of that.
+#[derive(Debug, Default)]
+pub struct Pace {
+    first: Option<(Instant, u64)>,
+}
+
+impl Pace {
+    /// Time left in words, now that so much is done.
+    pub fn left(&mut self, done: u64, total: u64) -> String {
+        let (since, from) = *self.first.get_or_insert_with(|| (Instant::now(), done));
+        in_words(since.elapsed(), done.saturating_sub(from), total.saturating_sub(done))
+    }
+}
+
+fn in_words(elapsed: Duration, done: u64, left: u64) -> String {
     if done == 0 {
         return "?".to_owned();
     }
-    let seconds = elapsed.as_secs_f64() * total.saturating_sub(done) as f64 / done as f64;
+    let seconds = elapsed.as_secs_f64() * left as f64 / done as f64;
     if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.1} min", seconds / 60.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_left_follows_from_this_run_alone() {
+        let mut pace = Pace { first: None };
+        assert_eq!(pace.left(900, 1000), "?");
+        let (since, _) = pace.first.unwrap();
+        pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
+        assert_eq!((pace.left(920, 1000).as_str(), pace.left(901, 1000).as_str()), ("4.0 min", "99.0 min"));
+    }
 }
