@@ -31,35 +31,28 @@ struct Image {
 
 /// Folders below `sparse` that hold a model, by name; `None` where there is none.
 pub(crate) fn models(folder: &Path) -> Option<Vec<PathBuf>> {
-    let sparse = folder.join("sparse");
-    let mut found: Vec<PathBuf> = std::fs::read_dir(&sparse).ok()?.flatten().map(|e| e.path()).filter(|p| p.is_dir()).collect();
-    found.sort();
-    found.insert(0, sparse);
-    let is_model = |p: &PathBuf| ["bin", "txt"].iter().any(|e| p.join("images").with_extension(e).is_file());
-    found.retain(is_model);
+    let found = with_list(folder, "images");
     (!found.is_empty()).then_some(found)
 }
 
 /// The camera of the first model below `sparse`, where that has one alone. What images the model has isn't looked at.
 pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetError> {
-    let sparse = folder.join("sparse");
-    let mut folders: Vec<PathBuf> = std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
-    folders.sort();
-    folders.insert(0, sparse);
-    for folder in folders {
-        let mut model = Model::default();
-        let (binary, text) = (folder.join("cameras.bin"), folder.join("cameras.txt"));
-        if let Ok(bytes) = std::fs::read(&binary) {
-            model.binary_cameras(&mut Bytes::new(&binary, &bytes))?;
-        } else if text.is_file() {
-            model.text_cameras(&text)?;
-        } else {
-            continue;
-        }
-        let mut cameras = model.cameras.into_values();
-        return Ok(cameras.next().filter(|_| cameras.next().is_none()));
+    let mut model = Model::default();
+    if let Some(first) = with_list(folder, "cameras").first() {
+        model.read_cameras(first)?;
     }
-    Ok(None)
+    let mut cameras = model.cameras.into_values();
+    Ok(cameras.next().filter(|_| cameras.next().is_none()))
+}
+
+/// `sparse` and the folders in it that have a list of such things, binary or as text, in order.
+fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
+    let sparse = folder.join("sparse");
+    let mut found: Vec<PathBuf> = std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    found.sort();
+    found.insert(0, sparse);
+    found.retain(|p| ["bin", "txt"].iter().any(|e| p.join(things).with_extension(e).is_file()));
+    found
 }
 
 /// Reads the model with most images, the first of several, and the pictures that it names.
@@ -110,30 +103,37 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
 }
 
+/// A file of a folder, if it is there.
+fn bytes_of(folder: &Path, name: &str) -> Result<Option<(PathBuf, Vec<u8>)>, DatasetError> {
+    let path = folder.join(name);
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let bytes = std::fs::read(&path).map_err(|source| DatasetError::Io { path: path.clone(), source })?;
+    Ok(Some((path, bytes)))
+}
+
 impl Model {
     fn read(folder: &Path) -> Result<Self, DatasetError> {
         let mut model = Self::default();
-        if folder.join("images.bin").is_file() {
-            let bytes = |name: &str| {
-                let path = folder.join(name);
-                std::fs::read(&path).map(|b| (path.clone(), b)).map_err(|source| DatasetError::Io { path, source })
-            };
-            let (path, cameras) = bytes("cameras.bin")?;
-            model.binary_cameras(&mut Bytes::new(&path, &cameras))?;
-            let (path, images) = bytes("images.bin")?;
-            model.binary_images(&mut Bytes::new(&path, &images))?;
-            if folder.join("points3D.bin").is_file() {
-                let (path, points) = bytes("points3D.bin")?;
-                model.binary_points(&mut Bytes::new(&path, &points))?;
-            }
-        } else {
-            model.text_cameras(&folder.join("cameras.txt"))?;
-            model.text_images(&folder.join("images.txt"))?;
-            if folder.join("points3D.txt").is_file() {
-                model.text_points(&folder.join("points3D.txt"))?;
-            }
+        model.read_cameras(folder)?;
+        match bytes_of(folder, "images.bin")? {
+            Some((path, images)) => model.binary_images(&mut Bytes::new(&path, &images))?,
+            None => model.text_images(&folder.join("images.txt"))?,
+        }
+        if let Some((path, points)) = bytes_of(folder, "points3D.bin")? {
+            model.binary_points(&mut Bytes::new(&path, &points))?;
+        } else if folder.join("points3D.txt").is_file() {
+            model.text_points(&folder.join("points3D.txt"))?;
         }
         Ok(model)
+    }
+
+    fn read_cameras(&mut self, folder: &Path) -> Result<(), DatasetError> {
+        match bytes_of(folder, "cameras.bin")? {
+            Some((path, cameras)) => self.binary_cameras(&mut Bytes::new(&path, &cameras)),
+            None => self.text_cameras(&folder.join("cameras.txt")),
+        }
     }
 
     fn binary_cameras(&mut self, bytes: &mut Bytes<'_>) -> Result<(), DatasetError> {
