@@ -48,9 +48,9 @@ fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let run = |name: &str, seed: u64, restarts: u32| {
-        let more = format!(r#""rate": 1.0, "seed": {seed}, "restarts": {restarts}, "batch": 64"#);
+        let more = format!(r#""rate": 1.0, "seed": {seed}, "restarts": {restarts}, "batch": 16"#);
         let params = PARAMS.replace(r#""batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1"#, &more);
-        let params = params.replace(r#""rate""#, r#""rays": 15000, "crop_steps": 0, "rate""#);
+        let params = params.replace(r#""rate""#, r#""rays": 4000, "crop_steps": 0, "rate""#);
         stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
     };
     let alone = |seed: u64| run(&format!("alone-{seed}"), seed, 0);

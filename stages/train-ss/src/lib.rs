@@ -147,9 +147,8 @@ impl Stage for TrainSs {
 
 /// Rays through all sub-pixels of all views.
 pub fn epoch(views: &Views, params: &Params) -> u64 {
-    let sub_rays = (params.supersample - 1e-6).ceil() as u64;
     let pixels = |v: &scene::View| u64::from(v.camera.intrinsics.width) * u64::from(v.camera.intrinsics.height);
-    views.views.iter().map(pixels).sum::<u64>() * sub_rays * sub_rays
+    views.views.iter().map(pixels).sum::<u64>() * params.side().pow(2)
 }
 
 /// Photographs to train on, each with its view: over the background, or premultiplied RGBA where that is open.
@@ -226,13 +225,14 @@ pub fn supervision(
             "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
         return Err(Failure::Usage(message.to_owned()).into());
     }
+    let rays = params.rays(epoch(&photographs.views, params));
     let options = SupersamplingOptions {
         supervision,
         scale: [params.supersample; 2],
         filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
         coarse: params.coarse(),
         order: params.order(),
-        crop_groups: params.crop_groups(((params.supersample - 1e-6).ceil() as u64).pow(2)),
+        crop_groups: params.crop_groups(rays),
         detail: params.detail(),
         exposure: params.exposure,
         pose_refinement: params.pose_refinement,

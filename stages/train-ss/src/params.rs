@@ -3,6 +3,7 @@ use scene::Space;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::supervision::coarse_stages;
 use crate::{Order, Supervision};
 
 /// Parameters of `train-ss`.
@@ -282,9 +283,25 @@ impl Params {
         if self.order() == Order::Epochs { 1.0 } else { self.or(self.detail, 10.0, 1.0) }
     }
 
-    /// Groups of rays that are drawn from the middle of the pictures, at `group` rays each.
-    pub fn crop_groups(&self, group: u64) -> u64 {
-        u64::from(self.or(self.crop_steps, 0, 1000)) * (u64::from(self.batch()) / group).max(1)
+    /// Sub-rays along each side of an LR pixel, once all are cast.
+    pub fn side(&self) -> u64 {
+        (self.supersample - 1e-6).ceil() as u64
+    }
+
+    /// Groups of rays that are drawn from the middle of the pictures: those of the first `crop_steps` steps, where the training has so many
+    /// rays.
+    pub fn crop_groups(&self, rays: u64) -> u64 {
+        let (batch, side) = (u64::from(self.batch()), self.side());
+        let doublings = coarse_stages(side);
+        let steps_of_stage = (self.coarse() * rays as f64 / f64::from(doublings.max(1))) as u64 / batch;
+        let stages = (0..doublings).map(|i| (steps_of_stage, 1 << i)).chain([(u64::MAX, side)]);
+        let mut left = u64::from(self.or(self.crop_steps, 0, 1000));
+        let groups = stages.map(|(steps, side): (u64, u64)| {
+            let steps = steps.min(left);
+            left -= steps;
+            steps * (batch / (side * side)).max(1)
+        });
+        groups.sum()
     }
 
     /// Rays over all members, where an epoch has so many.
@@ -376,11 +393,20 @@ mod tests {
         let ndc = Space::Ndc(Frustum { camera_to_world: [[0.0; 4]; 3], min: [0.0; 2], max: [1.0; 2], near: 1.0, far: 2.0 });
         let mlp = Params { field: FieldKind::Mlp, ..Params::default() };
         let there = mlp.published(&ndc, 100);
-        assert_eq!((there.rays(100), there.crop_groups(4), there.noise), (3000, 0, Some(1.0)));
+        assert_eq!((there.rays(100), there.crop_groups(3000), there.noise), (3000, 0, Some(1.0)));
         let here = mlp.published(&Space::Box, 100);
-        assert_eq!((here.rays(100), here.crop_groups(4), here.noise), (2000, 512_000, None));
+        assert_eq!((here.rays(100), here.crop_groups(2000), here.noise), (2000, 512_000, None));
         let said = Params { rays: Some(7), noise: Some(0.0), crop_steps: Some(1), ..mlp };
         assert_eq!(said.published(&ndc, 100), said);
         assert_eq!(Params::default().published(&ndc, 100), Params::default());
+    }
+
+    /// However many rays a group has at first, as many steps are drawn from the middle.
+    #[test]
+    fn crop_steps_are_steps_whatever_is_cast() {
+        let params = Params { crop_steps: Some(10), batch: Some(64), ..Params::default() };
+        let crop = |coarse, side| Params { coarse: Some(coarse), supersample: side, ..params.clone() }.crop_groups(6400);
+        // 16 groups of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with 16.
+        assert_eq!([crop(0.0, 2.0), crop(0.5, 2.0), crop(0.06, 4.0)], [160, 640, 3 * 64 + 3 * 16 + 4 * 4]);
     }
 }

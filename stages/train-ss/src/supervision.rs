@@ -349,13 +349,18 @@ fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> P
     out
 }
 
+/// How often the sub-rays along a side double before all are cast: as many stages has the coarse share of the rays.
+pub(crate) fn coarse_stages(side: u64) -> u32 {
+    side.next_power_of_two().trailing_zeros()
+}
+
 impl radiance::Supervision for Supersampling {
     fn begin(&mut self, done: f64) {
         self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
         if done < self.coarse {
-            let doublings = self.full[0].max(self.full[1]).next_power_of_two().trailing_zeros();
-            let now = 1 << (done / self.coarse * f64::from(doublings)) as u32;
+            let stages = coarse_stages(self.full[0].max(self.full[1]) as u64);
+            let now = 1 << (done / self.coarse * f64::from(stages)) as u32;
             self.side = self.full.map(|n| n.min(now));
         }
     }

@@ -38,8 +38,14 @@ pub struct MlpTrainer {
     dark_steps: u64,
 }
 
-/// Shards of a step on the CPU: fixed, so that sums have one order at any thread count.
-const SHARDS: usize = 8;
+/// Shards of a step on the CPU: by its rays alone, so that sums have one order at any thread count. Where a shard has few rays, libtorch's calls
+/// cost more than what they compute.
+fn shards(rays: usize) -> usize {
+    const MOST: usize = 8;
+    const RAYS: usize = 16;
+    rays.div_ceil(RAYS).clamp(1, MOST)
+}
+
 /// Samples that go through the fine network at once: few, so that what they leave on their way stays in the cache, and enough to be worth
 /// a call.
 const CHUNK_SAMPLES: usize = 4096;
@@ -126,8 +132,9 @@ impl MlpTrainer {
         if self.field.device != Device::Cpu {
             return step.in_pieces(|range| plan.run(&self.field, supervision, range));
         }
+        let (groups, count) = (step.groups, shards(step.groups * step.group));
         let shards: Vec<(Mlp, std::ops::Range<usize>)> =
-            (0..SHARDS).map(|i| (self.field.share(), step.groups * i / SHARDS..step.groups * (i + 1) / SHARDS)).collect();
+            (0..count).map(|i| (self.field.share(), groups * i / count..groups * (i + 1) / count)).collect();
         let pieces: Result<Vec<Option<Piece>>, TchError> =
             shards.into_par_iter().map(|(field, range)| plan.run_all(&field, supervision, range)).collect();
         Ok(pieces?.into_iter().flatten().collect())

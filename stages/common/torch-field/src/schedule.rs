@@ -4,7 +4,7 @@ pub enum Schedule {
     /// Exponentially with every step, as the paper's text has it.
     Exponential,
     /// As the reference's code does it: by epochs, flat until the last ten, of which each takes an eleventh of the way on a logarithmic
-    /// scale, so that the end is never quite reached.
+    /// scale, so that the end is never quite reached. A training of fewer than twenty goes through the same twenty in less time.
     Epochs {
         /// Epochs in all.
         epochs: u64,
@@ -20,7 +20,8 @@ impl Schedule {
         let progress = match self {
             Self::Exponential => done,
             Self::Epochs { epochs } => {
-                let epoch = ((done * epochs as f64) as u64).min(epochs.saturating_sub(1));
+                let epochs = epochs.max(2 * Self::FALLING);
+                let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
                 (epoch + 1 + Self::FALLING).saturating_sub(epochs) as f64 / (Self::FALLING + 1) as f64
             }
         };
@@ -43,6 +44,8 @@ mod tests {
             assert!((rate(e) / expected - 1.0).abs() < 5e-3, "{e}: {}", rate(e));
         }
         assert_eq!(schedule.rate(5e-4, 1e-2, 1.0), rate(19));
+        let short = Schedule::Epochs { epochs: 3 };
+        assert!((0u32..20).all(|e| short.rate(5e-4, 1e-2, (f64::from(e) + 0.5) / 20.0) == rate(u64::from(e))));
         let text = Schedule::Exponential;
         assert!((text.rate(5e-4, 1e-2, 0.5) - 5e-5).abs() < 1e-9 && (text.rate(5e-4, 1e-2, 1.0) - 5e-6).abs() < 1e-12);
     }
