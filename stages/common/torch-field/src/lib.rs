@@ -65,15 +65,14 @@ pub enum TorchFieldError {
         /// The step.
         step: u64,
     },
-    /// A network sees nothing but the background, and can't learn any more.
-    #[error(
-        "step {step}: the {network} network has collapsed: it sees nothing but the background, and its ReLU passes no gradient; \
-         try another seed"
-    )]
+    /// A network sees the same whatever the ray, and can't learn any more.
+    #[error("step {step}: the {network} network has collapsed: {why}; try another seed")]
     Collapsed {
         /// The step.
         step: u64,
         /// Which network.
         network: &'static str,
+        /// What it sees instead.
+        why: &'static str,
     },
 }

@@ -34,8 +34,8 @@ pub struct MlpTrainer {
     options: MlpTraining,
     adam: Adam,
     tally: Tally,
-    /// Steps in a row in which a network stopped next to no light.
-    dark_steps: u64,
+    /// Steps in a row in which a network was stuck.
+    stuck_steps: u64,
 }
 
 /// Shards of a step on the CPU: by its rays alone, so that sums have one order at any thread count. Where a shard has few rays, libtorch's calls
@@ -49,25 +49,57 @@ fn shards(rays: usize) -> usize {
 /// Samples that go through the fine network at once: few, so that what they leave on their way stays in the cache, and enough to be worth
 /// a call.
 const CHUNK_SAMPLES: usize = 4096;
-/// Steps with less opacity than this, so many in a row, are a collapse: the white background alone explains the pictures, and ReLU
-/// has no gradient there.
-const DARK_OPACITY: f64 = 1e-3;
-const DARK_STEPS: u64 = 200;
+/// So many steps in a row in which a network is stuck are a collapse: no gradient leads out of it.
+const STUCK_STEPS: u64 = 200;
+/// Less of the light than this stopped by all samples: the background alone explains the pictures, and ReLU has no gradient there.
+const CLEAR: f64 = 1e-3;
+/// More of the light than this stopped by the first sample: what is left is of rays whose second happens to be drawn close to it, and
+/// what lies behind gets no gradient.
+const WALL: f64 = 0.9;
+
+/// What a network makes of a step's rays, all together.
+#[derive(Clone, Copy, Default)]
+struct Stopped {
+    /// Light that is stopped.
+    all: f64,
+    /// Light that the first sample stops.
+    first: f64,
+}
+
+impl Stopped {
+    fn by(weights: &Tensor) -> Result<Self, TchError> {
+        let sum = |of: &Tensor| of.f_sum(Kind::Double)?.f_double_value(&[]);
+        Ok(Self { all: sum(weights)?, first: sum(&weights.f_narrow(1, 0, 1)?)? })
+    }
+
+    fn add(self, other: Self) -> Self {
+        Self { all: self.all + other.all, first: self.first + other.first }
+    }
+
+    /// Why nothing more is learnt, if that is so for as many rays.
+    fn stuck(self, rays: f64) -> Option<&'static str> {
+        match self {
+            Self { all, .. } if all < CLEAR * rays => Some("it sees nothing but the background, and its ReLU passes no gradient"),
+            Self { first, .. } if first > WALL * rays => Some("it sees a wall right before every camera, and nothing behind it"),
+            _ => None,
+        }
+    }
+}
 
 /// What a piece of a step leaves.
 struct Piece {
     gradients: Vec<Tensor>,
     colours: Vec<[f32; 3]>,
     loss: f64,
-    /// Sum of the rays' opacities, by the coarse and the fine network.
-    opacity: [f64; 2],
+    /// By the coarse and the fine network.
+    stopped: [Stopped; 2],
 }
 
 impl MlpTrainer {
     /// Starts from a field.
     pub fn new(field: Mlp, options: MlpTraining) -> Result<Self, TorchFieldError> {
         let adam = Adam::new(field.parameters())?;
-        Ok(Self { field, options, adam, tally: Tally::default(), dark_steps: 0 })
+        Ok(Self { field, options, adam, tally: Tally::default(), stuck_steps: 0 })
     }
 
     /// The field as it is now.
@@ -95,7 +127,7 @@ impl MlpTrainer {
         let pieces = self.pieces(&*supervision, step)?;
         let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
         let rays = groups * group;
-        let opacity = [0, 1].map(|i| pieces.iter().map(|p| p.opacity[i]).sum::<f64>() / rays as f64);
+        let stopped = [0, 1].map(|i| pieces.iter().map(|p| p.stopped[i]).fold(Stopped::default(), Stopped::add));
         self.tally.cast(groups, group);
         let mut gradients = Vec::new();
         let mut colours = Vec::with_capacity(pieces.len());
@@ -117,10 +149,10 @@ impl MlpTrainer {
             step.remember(supervision, colours.iter().map(Vec::as_slice));
         }
         self.tally.steps += 1;
-        self.dark_steps = if opacity.iter().any(|&o| o < DARK_OPACITY) { self.dark_steps + 1 } else { 0 };
-        if self.dark_steps >= DARK_STEPS {
-            let network = if opacity[0] < DARK_OPACITY { "coarse" } else { "fine" };
-            return Err(TorchFieldError::Collapsed { step: self.tally.steps, network });
+        let stuck = ["coarse", "fine"].into_iter().zip(stopped).find_map(|(n, s)| Some((n, s.stuck(rays as f64)?)));
+        self.stuck_steps = if stuck.is_some() { self.stuck_steps + 1 } else { 0 };
+        if let Some((network, why)) = stuck.filter(|_| self.stuck_steps >= STUCK_STEPS) {
+            return Err(TorchFieldError::Collapsed { step: self.tally.steps, network, why });
         }
         let samples = rays * (2 * self.field.architecture.coarse_samples + self.field.architecture.fine_samples) as usize;
         Ok(Some(StepReport { loss, rays, samples, skipped }))
@@ -149,7 +181,7 @@ impl MlpTrainer {
     /// Writes all that a resumed training needs. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
         let [steps, groups, rays, scale, fault] = self.tally.counters();
-        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, groups, rays, scale, fault, self.dark_steps])?)
+        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, groups, rays, scale, fault, self.stuck_steps])?)
     }
 
     /// The step a checkpoint was written at.
@@ -160,8 +192,8 @@ impl MlpTrainer {
 
     /// Goes on from a checkpoint of a trainer made with the same field and options.
     pub fn resume(&mut self, path: &Path) -> Result<(), TorchFieldError> {
-        let (adam, [tally @ .., dark_steps]): (Adam, [u64; 6]) = Adam::resume(path, &self.field.named())?;
-        (self.adam, self.tally, self.dark_steps) = (adam, Tally::from_counters(tally), dark_steps);
+        let (adam, [tally @ .., stuck_steps]): (Adam, [u64; 6]) = Adam::resume(path, &self.field.named())?;
+        (self.adam, self.tally, self.stuck_steps) = (adam, Tally::from_counters(tally), stuck_steps);
         Ok(())
     }
 }
@@ -195,7 +227,7 @@ impl Plan {
                     }
                     sum.colours.extend(piece.colours);
                     sum.loss += piece.loss;
-                    (0..2).for_each(|i| sum.opacity[i] += piece.opacity[i]);
+                    (0..2).for_each(|i| sum.stopped[i] = sum.stopped[i].add(piece.stopped[i]));
                     sum
                 }
             });
@@ -212,8 +244,79 @@ impl Plan {
         let fine = self.step.judge(supervision, &range, &seen.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(&[coarse.towards.f_add(&fine.towards)?], &parameters, false, false)?;
-        let opacity = |weights: &Tensor| -> Result<f64, TchError> { weights.f_sum(Kind::Double)?.f_double_value(&[]) };
-        let opacity = [opacity(&seen.coarse.weights)?, opacity(&seen.fine.weights)?];
-        Ok(Piece { gradients, colours: fine.colours, loss: coarse.loss + fine.loss, opacity })
+        let stopped = [Stopped::by(&seen.coarse.weights)?, Stopped::by(&seen.fine.weights)?];
+        Ok(Piece { gradients, colours: fine.colours, loss: coarse.loss + fine.loss, stopped })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use radiance::{MlpArchitecture, Ray};
+    use scene::Bounds;
+
+    use super::*;
+    use crate::network::Network;
+
+    /// Rays side by side, every other of which should be dark.
+    struct Stripes;
+
+    impl Supervision for Stripes {
+        fn rays_per_group(&self) -> usize {
+            1
+        }
+
+        fn cast(&self, group: u64, rays: &mut [Ray]) {
+            let across = 0.2 * (group % 4) as f32;
+            rays[0] = Ray { origin: [across, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
+        }
+
+        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+            let off = colours[0].map(|x| x - (group % 2) as f32);
+            gradients[0] = off.map(|x| 2.0 * x);
+            off.iter().map(|&x| f64::from(x * x)).sum()
+        }
+    }
+
+    /// Whatever keeps a network from learning is told: nothing stops the light, or all of it is stopped at once. A sound field goes on.
+    #[test]
+    fn collapses_are_told() {
+        let architecture =
+            MlpArchitecture { depth: 5, width: 16, coarse_samples: 16, fine_samples: 8, ..MlpArchitecture::default() };
+        let bounds = Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let options = MlpTraining {
+            rays: 8 * 250,
+            batch: 8,
+            rate: 5e-4,
+            final_rate: 0.1,
+            schedule: Schedule::Exponential,
+            noise: 0.0,
+            seed: 0,
+        };
+        let raw_density = Network::layers(&architecture).iter().position(|(name, ..)| name == "sigma").unwrap();
+        // A training of which one network's raw densities are shifted.
+        let train = |network: fn(&Mlp) -> &Network, shift: f64| {
+            let field = Mlp::new(architecture, bounds, 1, Device::Cpu).unwrap();
+            let _ = no_grad(|| network(&field).parameters[2 * raw_density + 1].shallow_clone().f_add_scalar_(shift)).unwrap();
+            let mut trainer = MlpTrainer::new(field, options).unwrap();
+            loop {
+                match trainer.step(&mut Stripes) {
+                    Ok(Some(_)) => {}
+                    Ok(None) => return None,
+                    Err(error) => return Some(error.to_string()),
+                }
+            }
+        };
+        assert_eq!(train(|f| &f.fine, 0.5), None);
+        for (network, shift, said) in [
+            (
+                (|f| &f.coarse) as fn(&Mlp) -> &Network,
+                -300.0,
+                "the coarse network has collapsed: it sees nothing but the background",
+            ),
+            (|f| &f.fine, 300.0, "the fine network has collapsed: it sees a wall right before every camera"),
+        ] {
+            let error = train(network, shift).expect("a collapse");
+            assert!(error.contains("step 200") && error.contains(said), "{error}");
+        }
     }
 }
