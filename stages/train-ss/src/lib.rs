@@ -119,7 +119,7 @@ impl Stage for TrainSs {
         let references = context.optional_input("references");
         let views = Views::read(input)?;
         let epoch = epoch(&views, params);
-        let params = &params.published(&views.bounds.space, epoch);
+        let params = &params.suited(&views.bounds.space, views.background, epoch);
         let model = match params.field {
             FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),

@@ -1,5 +1,5 @@
 use radiance::{Architecture, MlpArchitecture, TrainingOptions};
-use scene::Space;
+use scene::{Background, Space};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -72,9 +72,10 @@ pub struct Params {
     /// `grid`: share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
     #[schemars(range(min = 0.0, max = 0.999))]
     pub averaging: f64,
-    /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze, fewer samples, and less detail.
+    /// `grid`: weight of the distortion loss, which draws what stops a ray together: less haze and fewer samples. Without it: 0.004
+    /// in NDC with nothing behind the scene (an opaque background), which else becomes fog; 0 elsewhere, where it costs detail.
     #[schemars(range(min = 0.0, max = 10.0))]
-    pub distortion: f64,
+    pub distortion: Option<f64>,
     /// `grid`: weight decay of the networks.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub network_decay: f64,
@@ -118,7 +119,7 @@ pub struct Params {
     /// `mlp`: standard deviation of the noise on raw densities. Without it: 0, and 1 in NDC.
     #[schemars(range(min = 0.0, max = 100.0))]
     pub noise: Option<f64>,
-    /// `mlp`: how often a network that has collapsed to the background may start over, with the next seed.
+    /// `mlp`: how often a network that has collapsed (to the background, or to a wall before every camera) may start over, with the next seed.
     #[schemars(range(min = 0, max = 100))]
     pub restarts: u32,
     /// Seed of everything that is drawn.
@@ -148,7 +149,7 @@ impl Default for Params {
             final_rate: None,
             schedule: RateSchedule::Code,
             averaging: 0.97,
-            distortion: 0.0,
+            distortion: None,
             network_decay: 1e-6,
             levels: grid.levels,
             coarsest: grid.coarsest,
@@ -192,6 +193,8 @@ pub enum RateSchedule {
 /// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
 const EPOCHS: u64 = 20;
 const EPOCHS_IN_NDC: u64 = 30;
+/// Weight of the distortion loss in NDC with nothing behind the scene.
+const DISTORTION_IN_NDC: f64 = 0.004;
 
 impl Params {
     /// Fails on parameters that can't be meant together.
@@ -241,17 +244,20 @@ impl Params {
         }
     }
 
-    /// With what was published for a space, where nothing else is said: the paper's field is trained otherwise on photographs in NDC. `epoch`
-    /// counts the rays of all pixels.
-    pub fn published(&self, space: &Space, epoch: u64) -> Self {
-        if self.field != FieldKind::Mlp || !matches!(space, Space::Ndc(_)) {
-            return self.clone();
-        }
-        Self {
-            rays: self.rays.or(Some(EPOCHS_IN_NDC * epoch)),
-            crop_steps: self.crop_steps.or(Some(0)),
-            noise: self.noise.or(Some(1.0)),
-            ..self.clone()
+    /// With what suits a scene where nothing else is said: the paper's field is trained otherwise on photographs in NDC, as published, and a grid
+    /// is kept from becoming fog there. `epoch` counts the rays of all pixels.
+    pub fn suited(&self, space: &Space, background: Background, epoch: u64) -> Self {
+        match self.field {
+            FieldKind::Mlp if matches!(space, Space::Ndc(_)) => Self {
+                rays: self.rays.or(Some(EPOCHS_IN_NDC * epoch)),
+                crop_steps: self.crop_steps.or(Some(0)),
+                noise: self.noise.or(Some(1.0)),
+                ..self.clone()
+            },
+            FieldKind::Grid if matches!(space, Space::Ndc(_)) && background == Background::Opaque => {
+                Self { distortion: self.distortion.or(Some(DISTORTION_IN_NDC)), ..self.clone() }
+            }
+            _ => self.clone(),
         }
     }
 
@@ -349,7 +355,7 @@ impl Params {
             final_rate: self.or(self.final_rate, 0.25, 0.01),
             warm_up: 100,
             averaging: self.averaging as f32,
-            distortion: self.distortion as f32,
+            distortion: self.distortion.unwrap_or(0.0) as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,
         }
@@ -387,18 +393,26 @@ mod tests {
 
     use super::*;
 
-    /// What was published for photographs holds where nothing else is said, for that field, in that space.
+    /// What suits a scene holds where nothing else is said, for that field alone: the published ones for photographs in NDC, and a
+    /// loss against fog there.
     #[test]
-    fn photographs_have_published_settings_of_their_own() {
+    fn scenes_have_settings_of_their_own() {
         let ndc = Space::Ndc(Frustum { camera_to_world: [[0.0; 4]; 3], min: [0.0; 2], max: [1.0; 2], near: 1.0, far: 2.0 });
         let mlp = Params { field: FieldKind::Mlp, ..Params::default() };
-        let there = mlp.published(&ndc, 100);
-        assert_eq!((there.rays(100), there.crop_groups(3000), there.noise), (3000, 0, Some(1.0)));
-        let here = mlp.published(&Space::Box, 100);
+        let there = mlp.suited(&ndc, Background::Opaque, 100);
+        assert_eq!((there.rays(100), there.crop_groups(3000), there.noise, there.distortion), (3000, 0, Some(1.0), None));
+        let here = mlp.suited(&Space::Box, Background::White, 100);
         assert_eq!((here.rays(100), here.crop_groups(2000), here.noise), (2000, 512_000, None));
         let said = Params { rays: Some(7), noise: Some(0.0), crop_steps: Some(1), ..mlp };
-        assert_eq!(said.published(&ndc, 100), said);
-        assert_eq!(Params::default().published(&ndc, 100), Params::default());
+        assert_eq!(said.suited(&ndc, Background::Opaque, 100), said);
+
+        let grid = Params::default();
+        assert!(grid.suited(&ndc, Background::Opaque, 100).distortion > Some(0.0));
+        for (space, background) in [(&ndc, Background::White), (&Space::Contraction, Background::Opaque)] {
+            assert_eq!(grid.suited(space, background, 100), grid);
+        }
+        let said = Params { distortion: Some(0.0), ..grid };
+        assert_eq!(said.suited(&ndc, Background::Opaque, 100), said);
     }
 
     /// However many rays a group has at first, as many steps are drawn from the middle.
