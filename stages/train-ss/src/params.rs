@@ -67,7 +67,8 @@ pub struct Params {
     /// Learning rates at the end, as a share of the highest. Without it: 0.25 for `grid`, 0.01 for `mlp`.
     #[schemars(range(min = 1e-6, max = 1.0))]
     pub final_rate: Option<f64>,
-    /// `mlp`: how the learning rate falls. (`grid`'s falls exponentially.)
+    /// `mlp`: how the learning rate falls. (`grid`'s falls exponentially.) A training shorter than the published one goes through the same
+    /// schedule in fewer steps.
     pub schedule: RateSchedule,
     /// `grid`: share that the weights' running average keeps at each of its steps, late in the training; 0 for the last weights.
     #[schemars(range(min = 0.0, max = 0.999))]

@@ -78,13 +78,14 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         change(&mut state);
         let done = state.done;
-        let left = state.pace.left(done, self.total);
+        state.pace.begin(done);
         let interval = if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
         let due = state.shown.elapsed() >= Duration::from_millis(interval);
         if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.is_shown)) {
             return;
         }
         (state.shown, state.is_shown) = (Instant::now(), true);
+        let left = state.pace.left(done, self.total);
         if let Some(bar) = &self.bar {
             bar.set_position(state.done);
             bar.set_message(format!("{} · {left}", state.note));
@@ -115,9 +116,14 @@ pub struct Pace {
 }
 
 impl Pace {
+    /// Is told when work is first heard of, and how much was done by then. Later calls change nothing.
+    pub fn begin(&mut self, done: u64) -> (Instant, u64) {
+        *self.first.get_or_insert_with(|| (Instant::now(), done))
+    }
+
     /// Time left in words, now that so much is done.
     pub fn left(&mut self, done: u64, total: u64) -> String {
-        let (since, from) = *self.first.get_or_insert_with(|| (Instant::now(), done));
+        let (since, from) = self.begin(done);
         in_words(since.elapsed(), done.saturating_sub(from), total.saturating_sub(done))
     }
 }
