@@ -42,13 +42,13 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     assert!(views.join("images").read_dir().unwrap().count() == 1);
 }
 
-/// A rate of 1 kills a network under some seeds: the stage says so, and another seed is tried where that is allowed.
+/// A high rate kills a network under some seeds: the stage says so, and another seed is tried where that is allowed.
 #[test]
 fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let run = |name: &str, seed: u64, restarts: u32| {
-        let more = format!(r#""rate": 1.0, "seed": {seed}, "restarts": {restarts}, "batch": 16"#);
+        let more = format!(r#""rate": 0.03, "seed": {seed}, "restarts": {restarts}, "batch": 16"#);
         let params = PARAMS.replace(r#""batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1"#, &more);
         let params = params.replace(r#""rate""#, r#""rays": 4000, "crop_steps": 0, "rate""#);
         stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
