@@ -2,7 +2,7 @@
 
 # Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
 BUDGET = {"100x2": (32_000_000, 1), "100x4": (64_000_000, 4), "200x2": (80_000_000, 1), "200x4": (70_000_000, 1)}
-# Photographs in NDC: rays meet three times as many samples there as before white.
+# Photographs in NDC: every ray ends on something and meets more samples than before white.
 BUDGET |= {"252x2": (15_000_000, 1), "252x4": (15_000_000, 1)}
 OTHER_BUDGET = (60_000_000, 1)
 # `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
