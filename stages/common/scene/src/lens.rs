@@ -216,11 +216,14 @@ mod tests {
         assert_eq!(folded.pinhole(), None);
         assert!(!folded.has_rays());
         assert!(!camera([f64::NAN, 0.0, 0.0], [0.0; 2]).has_rays());
+        // Bent a little further than any mild lens below, the picture folds in one corner alone.
+        assert!(!camera([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_rays());
     }
 
+    /// Lenses that bend, but fold no corner of the picture.
     fn mild() -> impl Strategy<Value = Intrinsics> {
         let (tangential, k3) = (-0.01..0.01f64, -0.02..0.02f64);
-        (-0.2..0.3f64, -0.05..0.05f64, k3, tangential.clone(), tangential)
+        (-0.15..0.3f64, -0.05..0.05f64, k3, tangential.clone(), tangential)
             .prop_map(|(k1, k2, k3, p1, p2)| camera([k1, k2, k3], [p1, p2]))
     }
 
