@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::Params;
 use crate::compare::compare;
-use crate::pictures::{colour, data_uri, depth, uri_of};
+use crate::pictures::{colour, data_uri, depth, depths_of, uri_of};
 use crate::results::metrics;
 
 const STYLE: &str = "
@@ -149,12 +149,16 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
     let (views, truths) = (Views::of_folder(&rendered)?, Views::of_folder(&truth)?);
     let all = point.metrics["views"].as_array().cloned().unwrap_or_default();
     let shown = count.min(all.len());
+    let find = |list: &Views, name: &str| list.views.iter().find(|v| v.camera.name == name).cloned();
+    let chosen = (0..shown).map(|k| &all[k * all.len() / shown]).filter_map(|scores| {
+        let name = scores["name"].as_str()?;
+        Some((scores, find(&views, name)?, find(&truths, name)?))
+    });
+    let chosen: Vec<_> = chosen.collect();
+    let range = depths_of(&rendered, chosen.iter().map(|(_, view, _)| view))?.unwrap_or((0.0, 1.0));
     let mut rows = Vec::new();
-    for k in 0..shown {
-        let scores = &all[k * all.len() / shown];
-        let name = scores["name"].as_str().unwrap_or_default();
-        let find = |list: &Views| list.views.iter().find(|v| v.camera.name == name).cloned();
-        let (Some(view), Some(true_view)) = (find(&views), find(&truths)) else { continue };
+    for (scores, view, true_view) in chosen {
+        let name = &view.camera.name;
         let figure = |class: &str, uri: Option<String>, caption: String| {
             html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }
         };
@@ -167,7 +171,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let expected = picture(&truth, &true_view.image, truths.background)?;
         let error = scores["error_map"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
         let warped = scores["warp"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
-        let depth = depth(&rendered, &view)?;
+        let depth = depth(&rendered, &view, range)?;
         let caption = |what: &str, found: &Option<(String, usize)>| {
             found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
         };

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use base64::Engine as _;
-use pixels::{Rgba8, depth_range, draw_depth, encode_png, read_exr, read_premultiplied};
+use pixels::{ExrImage, Rgba8, common_range, depth_range, draw_depth, encode_png, read_exr, read_premultiplied};
 use scene::{Background, View};
 
 /// A picture as the value of an `<img src>`.
@@ -14,12 +14,23 @@ pub(crate) fn colour(folder: &Path, file: &str, background: Background) -> anyho
     Ok(read_premultiplied(&folder.join(file))?.over(background.shown()).to_rgba8())
 }
 
+/// The range of depths that several views show together; `None` where there are no depths.
+pub(crate) fn depths_of<'a>(folder: &Path, views: impl Iterator<Item = &'a View>) -> anyhow::Result<Option<(f32, f32)>> {
+    let ranges = views.filter_map(|view| depth_file(folder, view)).map(|image| {
+        let image = image?;
+        Ok(image.channel("Z").zip(image.channel("A")).and_then(|(z, a)| depth_range(z, a)))
+    });
+    Ok(common_range(ranges.collect::<anyhow::Result<Vec<_>>>()?.into_iter().flatten()))
+}
+
 /// Depth of a rendered view as colours from near (warm) to far; white where nothing stands.
-pub(crate) fn depth(folder: &Path, view: &View) -> anyhow::Result<Option<Rgba8>> {
-    let Some(file) = &view.depth else { return Ok(None) };
-    let image = read_exr(&folder.join(file))?;
-    let (Some(z), Some(a)) = (image.channel("Z"), image.channel("A")) else { return Ok(None) };
-    Ok(Some(draw_depth(image.width, z, a, depth_range(z, a).unwrap_or((0.0, 1.0)))))
+pub(crate) fn depth(folder: &Path, view: &View, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
+    let Some(image) = depth_file(folder, view).transpose()? else { return Ok(None) };
+    Ok(image.channel("Z").zip(image.channel("A")).map(|(z, a)| draw_depth(image.width, z, a, range)))
+}
+
+fn depth_file(folder: &Path, view: &View) -> Option<anyhow::Result<ExrImage>> {
+    view.depth.as_ref().map(|file| Ok(read_exr(&folder.join(file))?))
 }
 
 /// The PNG bytes of an 8-bit picture.

@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, Input, Output, RunNode, RunRecord, Stage};
-use pixels::{Rgba8, depth_range, draw_depth, read_exr, read_premultiplied, write_png};
+use pixels::{Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png};
 use rayon::prelude::*;
 use scene::Views;
 use schemars::JsonSchema;
@@ -83,7 +83,7 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
         Ok(image.channel("Z").zip(image.channel("A")).and_then(|(z, a)| depth_range(z, a)))
     });
     let ranges = ranges.collect::<anyhow::Result<Vec<_>>>()?;
-    let range = ranges.into_iter().flatten().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)));
+    let range = common_range(ranges.into_iter().flatten());
     views
         .views
         .par_iter()

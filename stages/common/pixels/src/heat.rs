@@ -29,6 +29,11 @@ pub fn depth_range(z: &[f32], a: &[f32]) -> Option<(f32, f32)> {
     at(0.01).zip(at(0.99))
 }
 
+/// One range for several pictures, so that a depth has the same colour in all of them.
+pub fn common_range(ranges: impl IntoIterator<Item = (f32, f32)>) -> Option<(f32, f32)> {
+    ranges.into_iter().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+}
+
 /// Depth as colours from near (warm) to far, even in disparity where the far end is many times as far; white where nothing stands.
 pub fn draw_depth(width: usize, z: &[f32], a: &[f32], (near, far): (f32, f32)) -> Rgba8 {
     let scale = |z: f32| if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z };
@@ -40,4 +45,23 @@ pub fn draw_depth(width: usize, z: &[f32], a: &[f32], (near, far): (f32, f32)) -
         [over(heat[0]), over(heat[1]), over(heat[2]), 255]
     };
     Rgba8::new(width, z.len() / width.max(1), z.iter().zip(a).flat_map(pixel).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One picture spans little, the other much: alone the first is even in depth, the second in disparity.
+    #[test]
+    fn a_depth_has_one_colour_in_all_pictures() {
+        let depths = |step: f32| (0..=100).map(|i| 2.0 + step * i as f32).collect::<Vec<f32>>();
+        let (close, deep, opaque) = (depths(0.02), depths(0.5), [1.0; 101]);
+        let ranges = [&close, &deep].map(|z| depth_range(z, &opaque).unwrap());
+        let drawn = |z: &[f32], range| draw_depth(z.len(), z, &opaque, range);
+        let at_three = |picture: &Rgba8, i: usize| picture.data[4 * i..4 * i + 4].to_vec();
+        let range = common_range(ranges).unwrap();
+        assert_eq!(at_three(&drawn(&close, range), 50), at_three(&drawn(&deep, range), 2));
+        assert_ne!(at_three(&drawn(&close, ranges[0]), 50), at_three(&drawn(&deep, ranges[1]), 2), "each by itself");
+        assert_eq!(common_range([]), None);
+    }
 }

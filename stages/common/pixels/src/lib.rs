@@ -35,7 +35,7 @@ mod srgb;
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr};
-pub use heat::{Palette, depth_range, draw_depth, heat};
+pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
 pub use mask::Mask;
 pub use operator::{AxisTaps, Resampling};
