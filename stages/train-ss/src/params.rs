@@ -89,6 +89,10 @@ pub struct Params {
     /// `grid`: cells along an axis of the finest level. Without it: 2.56 for every LR pixel across the field, at least `coarsest`.
     #[schemars(range(min = 2, max = 4096))]
     pub finest: Option<u32>,
+    /// `grid`: cells along z at most, of any level. Without it: 148 of 256 `steps` in NDC, where rays run along z and cells needn't lie closer than
+    /// their samples; no limit elsewhere.
+    #[schemars(range(min = 2, max = 4096))]
+    pub finest_z: Option<u32>,
     /// `grid`: base-2 logarithm of the most entries in a level. Without it: 17 for 256 cells along the finest level's axis, and two more
     /// for every doubling of those, since surfaces grow with the square.
     #[schemars(range(min = 8, max = 22))]
@@ -155,6 +159,7 @@ impl Default for Params {
             levels: grid.levels,
             coarsest: grid.coarsest,
             finest: None,
+            finest_z: None,
             log2_entries: None,
             hidden: None,
             steps: None,
@@ -233,6 +238,7 @@ impl Params {
                 ("levels", self.levels != default.levels),
                 ("coarsest", self.coarsest != default.coarsest),
                 ("finest", self.finest != default.finest),
+                ("finest_z", self.finest_z != default.finest_z),
                 ("log2_entries", self.log2_entries != default.log2_entries),
                 ("steps", self.steps != default.steps),
             ],
@@ -321,13 +327,20 @@ impl Params {
         let by_width = (2.56 * pixels).round().clamp(64.0, 2048.0) as u32;
         let finest = self.finest.unwrap_or(by_width.max(self.coarsest));
         let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
+        let is_ndc = matches!(space, Space::Ndc(_));
+        let steps = self.steps.unwrap_or(if is_ndc { 256 } else { 512 });
+        // There rays run along z: cells needn't lie closer than their samples.
+        let unlimited = Architecture::default().finest_z;
+        let by_steps = (f64::from(steps) / 3.0f64.sqrt()).round() as u32;
+        let finest_z = if is_ndc { by_steps.min(unlimited) } else { unlimited };
         Architecture {
             levels: self.levels,
             coarsest: self.coarsest,
             finest,
+            finest_z: self.finest_z.unwrap_or(finest_z),
             log2_entries: self.log2_entries.unwrap_or(by_finest),
             hidden: self.or(self.hidden, Architecture::default().hidden, 256),
-            steps: self.steps.unwrap_or(if matches!(space, Space::Ndc(_)) { 256 } else { 512 }),
+            steps,
         }
     }
 
@@ -412,6 +425,11 @@ mod tests {
         for (space, background) in [(&ndc, Background::White), (&Space::Contraction, Background::Opaque)] {
             assert_eq!(grid.suited(space, background, 100), grid);
         }
+        // No more cells along z there than there are samples.
+        let cells = |params: &Params, space: &Space| params.grid(340.0, space).finest_z;
+        assert_eq!((cells(&grid, &ndc), cells(&grid, &Space::Box)), (148, Architecture::default().finest_z));
+        assert_eq!(cells(&Params { finest_z: Some(60), steps: Some(999), ..grid.clone() }, &ndc), 60);
+        assert!(Params { steps: Some(8192), ..grid.clone() }.grid(340.0, &ndc).check().is_ok());
         let said = Params { distortion: Some(0.0), ..grid };
         assert_eq!(said.suited(&ndc, Background::Opaque, 100), said);
     }

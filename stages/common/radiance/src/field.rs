@@ -25,6 +25,8 @@ pub struct Architecture {
     pub coarsest: u32,
     /// Cells along an axis of the finest level.
     pub finest: u32,
+    /// Cells along z at most, of any level: in NDC rays run along z, and cells that lie closer than their samples learn little each.
+    pub finest_z: u32,
     /// Base-2 logarithm of the most entries a level may have; finer levels are hashed.
     pub log2_entries: u32,
     /// Width of the hidden layers.
@@ -33,9 +35,12 @@ pub struct Architecture {
     pub steps: u32,
 }
 
+/// Cells along an axis, at most.
+const MOST_CELLS: u32 = 4096;
+
 impl Default for Architecture {
     fn default() -> Self {
-        Self { levels: 8, coarsest: 16, finest: 256, log2_entries: 17, hidden: 64, steps: 512 }
+        Self { levels: 8, coarsest: 16, finest: 256, finest_z: MOST_CELLS, log2_entries: 17, hidden: 64, steps: 512 }
     }
 }
 
@@ -45,7 +50,8 @@ impl Architecture {
         let ranges = [
             ("levels", self.levels, 1, 16),
             ("coarsest", self.coarsest, 2, 512),
-            ("finest", self.finest, self.coarsest, 4096),
+            ("finest", self.finest, self.coarsest, MOST_CELLS),
+            ("finest_z", self.finest_z, 2, MOST_CELLS),
             ("log2_entries", self.log2_entries, 8, 22),
             ("hidden", self.hidden, 16, 128),
             ("steps", self.steps, 16, 8192),
@@ -185,7 +191,7 @@ impl Field {
     }
 
     fn empty(architecture: Architecture, bounds: Bounds) -> Self {
-        let levels = levels(architecture.levels as usize, architecture.coarsest, architecture.finest, architecture.log2_entries);
+        let levels = levels(&architecture);
         let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
         let grid = vec![0.0; levels.last().map_or(0, |l| l.range().end)];
         // Whole vectors, for the optimiser.

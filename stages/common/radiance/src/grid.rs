@@ -4,6 +4,7 @@
 //! primitives", eq. 4), and collisions are left to the networks.
 
 use crate::adam::Touched;
+use crate::field::Architecture;
 use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
 
@@ -16,7 +17,7 @@ const PER_BLOCK: usize = LANES / FEATURES;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Level {
     /// Cells along each axis.
-    pub(crate) resolution: u32,
+    pub(crate) resolution: [u32; 3],
     /// Entries in its table.
     pub(crate) entries: usize,
     /// Whether vertices are hashed; then `entries` is a power of two.
@@ -36,14 +37,16 @@ impl Level {
     }
 }
 
-/// Levels from `coarsest` to `finest` cells in equal ratios, at most 2^`log2_entries` entries each.
-pub(crate) fn levels(count: usize, coarsest: u32, finest: u32, log2_entries: u32) -> Vec<Level> {
-    let ratio = (f64::from(finest) / f64::from(coarsest)).powf(1.0 / (count.max(2) - 1) as f64);
+/// Levels from `coarsest` to `finest` cells in equal ratios, no more than `finest_z` along z, at most 2^`log2_entries` entries each.
+pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
+    let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } = *architecture;
+    let ratio = (f64::from(finest) / f64::from(coarsest)).powf(1.0 / f64::from(count.max(2) - 1));
     let mut offset = 0;
     (0..count)
         .map(|i| {
-            let resolution = (f64::from(coarsest) * ratio.powi(i as i32)).round() as u32;
-            let vertices = (u64::from(resolution) + 1).pow(3);
+            let cells = (f64::from(coarsest) * ratio.powi(i as i32)).round() as u32;
+            let resolution = [cells, cells, cells.min(finest_z)];
+            let vertices: u64 = resolution.iter().map(|n| u64::from(*n) + 1).product();
             let hashed = vertices > 1 << log2_entries;
             // Whole cache lines a level.
             let entries = if hashed { 1usize << log2_entries } else { (vertices as usize).next_multiple_of(LANES) };
@@ -62,11 +65,11 @@ struct Corners {
 
 #[inline(always)]
 fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
-    let resolution = level.resolution as f32;
-    let last = resolution - 1.0;
     let mut cell = [[0u32; LANES]; 3];
     let mut fraction = [[0.0f32; LANES]; 3];
     for axis in 0..3 {
+        let resolution = level.resolution[axis] as f32;
+        let last = resolution - 1.0;
         for l in 0..LANES {
             let at = p[axis][l].max(0.0).min(1.0) * resolution;
             // A position on the far face belongs to the last cell: 0.5 keeps the product inside it.
@@ -75,7 +78,7 @@ fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
             fraction[axis][l] = at - whole;
         }
     }
-    let side = level.resolution + 1;
+    let [across, down, _] = level.resolution.map(|n| n + 1);
     let mask = level.entries as u32 - 1;
     for (corner, (index, weight)) in out.index.iter_mut().zip(&mut out.weight).enumerate() {
         let (dx, dy, dz) = (corner as u32 & 1, corner as u32 >> 1 & 1, corner as u32 >> 2);
@@ -84,7 +87,7 @@ fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
             index[l] = if level.hashed {
                 (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & mask
             } else {
-                x + side * (y + side * z)
+                x + across * (y + down * z)
             };
             let share = |f: f32, d: u32| if d == 1 { f } else { 1.0 - f };
             weight[l] = share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
@@ -175,12 +178,12 @@ mod tests {
 
     #[test]
     fn a_linear_function_is_interpolated_exactly() {
-        let level = levels(1, 16, 16, 17)[0];
+        let level = levels(&Architecture { levels: 1, finest: 16, finest_z: 8, ..Architecture::default() })[0];
         let mut table = vec![0.0; level.entries * FEATURES];
-        for z in 0..17 {
+        for z in 0..9 {
             for y in 0..17 {
                 for x in 0..17 {
-                    table[(x + 17 * (y + 17 * z)) * FEATURES] = (x + 2 * y + 3 * z) as f32 / 16.0;
+                    table[(x + 17 * (y + 17 * z)) * FEATURES] = (x + 2 * y + 6 * z) as f32 / 16.0;
                 }
             }
         }
@@ -196,7 +199,8 @@ mod tests {
     /// Scattering is the adjoint of encoding: <encode(t), d> = <t, scatter(d)>.
     #[test]
     fn scatter_is_the_adjoint_of_encode() {
-        for level in levels(4, 8, 128, 10) {
+        let small = Architecture { levels: 4, coarsest: 8, finest: 128, log2_entries: 10, ..Architecture::default() };
+        for level in [4096, 12].into_iter().flat_map(|finest_z| levels(&Architecture { finest_z, ..small })) {
             let n = 48;
             let table: Vec<f32> = (0..level.entries * FEATURES).map(|i| uniform(1, 0, i as u64) - 0.5).collect();
             let d: Vec<[f32; 4]> = (0..n as u64).map(|i| [0, 1, 2, 3].map(|k| uniform(2, k, i) - 0.5)).collect();

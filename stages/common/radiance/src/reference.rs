@@ -21,8 +21,8 @@ struct Judge<'a> {
 
 impl Judge<'_> {
     fn interpolate(&self, level: &Level, p: [f64; 3]) -> [f64; FEATURES] {
-        let at = p.map(|x| x.clamp(0.0, 1.0) * f64::from(level.resolution));
-        let cell = at.map(|x| (x as u32).min(level.resolution - 1));
+        let at: [f64; 3] = std::array::from_fn(|i| p[i].clamp(0.0, 1.0) * f64::from(level.resolution[i]));
+        let cell: [u32; 3] = std::array::from_fn(|i| (at[i] as u32).min(level.resolution[i] - 1));
         let mut sum = [0.0; FEATURES];
         for corner in 0..8u32 {
             let d = [corner & 1, corner >> 1 & 1, corner >> 2];
@@ -33,11 +33,11 @@ impl Judge<'_> {
                     if d[i] == 1 { f } else { 1.0 - f }
                 })
                 .product();
-            let side = level.resolution + 1;
+            let [across, down, _] = level.resolution.map(|n| n + 1);
             let index = if level.hashed {
                 (v[0] ^ v[1].wrapping_mul(2_654_435_761) ^ v[2].wrapping_mul(805_459_861)) as usize % level.entries
             } else {
-                (v[0] + side * (v[1] + side * v[2])) as usize
+                (v[0] + across * (v[1] + down * v[2])) as usize
             };
             for k in 0..FEATURES {
                 sum[k] += w * self.grid[level.offset + index * FEATURES + k];
@@ -90,7 +90,7 @@ impl Judge<'_> {
 }
 
 fn example() -> (Field, Vec<Ray>) {
-    let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, log2_entries: 9, hidden: 16, steps: 24 };
+    let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, finest_z: 20, log2_entries: 9, hidden: 16, steps: 24 };
     let mut field =
         Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() }, 3);
     let mut draws = Draws::new(8, 8, 8);
@@ -260,7 +260,15 @@ fn every_family_renders_and_trains_to_equal_bits() {
 fn extremes_stay_finite() {
     for raw in [-1e30f32, -50.0, 0.0, 50.0, 1e30] {
         for scale in [1e-6f64, 1.0, 1e6] {
-            let architecture = Architecture { levels: 2, coarsest: 2, finest: 4, log2_entries: 8, hidden: 16, steps: 64 };
+            let architecture = Architecture {
+                levels: 2,
+                coarsest: 2,
+                finest: 4,
+                log2_entries: 8,
+                hidden: 16,
+                steps: 64,
+                ..Architecture::default()
+            };
             let mut field = Field::new(
                 architecture,
                 Bounds { min: [-scale; 3], max: [scale; 3], near: 0.1 * scale, far: 20.0 * scale, ..Default::default() },

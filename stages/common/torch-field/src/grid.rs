@@ -25,7 +25,8 @@ pub struct TorchGrid {
 /// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Level {
-    resolution: i64,
+    /// Cells along each axis.
+    resolution: [i64; 3],
     pub(crate) first: i64,
     pub(crate) entries: i64,
     hashed: bool,
@@ -62,8 +63,9 @@ fn levels(architecture: &Architecture) -> Vec<Level> {
     let ratio = (finest / coarsest).powf(1.0 / f64::from(architecture.levels.max(2) - 1));
     let mut first = 0;
     let level = |i: u32| {
-        let resolution = (coarsest * ratio.powi(i as i32)).round() as i64;
-        let vertices = (resolution + 1).pow(3);
+        let cells = (coarsest * ratio.powi(i as i32)).round() as i64;
+        let resolution = [cells, cells, cells.min(i64::from(architecture.finest_z))];
+        let vertices: i64 = resolution.iter().map(|n| n + 1).product();
         let hashed = vertices > 1 << architecture.log2_entries;
         // Dense levels end with whole cache lines.
         let entries = if hashed { 1 << architecture.log2_entries } else { (vertices + 15) / 16 * 16 };
@@ -158,24 +160,28 @@ impl TorchGrid {
     /// Interpolated features of positions in the unit cube (n × 3): n × 4·levels.
     fn encode(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         let mut features = Vec::with_capacity(self.levels.len());
+        let positions = positions.f_clamp(0.0, 1.0)?;
         for level in &self.levels {
-            let at = positions.f_clamp(0.0, 1.0)?.f_mul_scalar(level.resolution as f64)?;
-            let cell = at.f_floor()?.f_clamp_max(level.resolution as f64 - 1.0)?;
-            let fraction = at.f_sub(&cell)?;
-            let cell = cell.f_to_kind(Kind::Int64)?;
+            // Fraction of a cell and the cell, axis by axis.
+            let along = |axis: usize| -> Result<(Tensor, Tensor), TchError> {
+                let cells = level.resolution[axis] as f64;
+                let at = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
+                let cell = at.f_floor()?.f_clamp_max(cells - 1.0)?;
+                Ok((at.f_sub(&cell)?, cell.f_to_kind(Kind::Int64)?))
+            };
+            let axes = [along(0)?, along(1)?, along(2)?];
             let mut sum: Option<Tensor> = None;
             for corner in 0..8i64 {
                 let d = [corner & 1, corner >> 1 & 1, corner >> 2];
                 let mut share = None;
                 let mut index = Vec::with_capacity(3);
-                for (axis, &d) in d.iter().enumerate() {
-                    let f = fraction.i((.., axis as i64));
-                    let f = if d == 1 { f } else { f.f_neg()?.f_add_scalar(1.0)? };
+                for ((fraction, cell), d) in axes.iter().zip(d) {
+                    let f = if d == 1 { fraction.shallow_clone() } else { fraction.f_neg()?.f_add_scalar(1.0)? };
                     share = Some(match share {
                         None => f,
                         Some(product) => f.f_mul(&product)?,
                     });
-                    index.push(cell.i((.., axis as i64)).f_add_scalar(d)?);
+                    index.push(cell.f_add_scalar(d)?);
                 }
                 let index = if level.hashed {
                     let mixed = index[0]
@@ -183,8 +189,8 @@ impl TorchGrid {
                         .f_bitwise_xor_tensor(&index[2].f_mul_scalar(805_459_861i64)?)?;
                     mixed.f_bitwise_and(level.entries - 1)?
                 } else {
-                    let side = level.resolution + 1;
-                    index[2].f_mul_scalar(side)?.f_add(&index[1])?.f_mul_scalar(side)?.f_add(&index[0])?
+                    let [across, down, _] = level.resolution.map(|n| n + 1);
+                    index[2].f_mul_scalar(down)?.f_add(&index[1])?.f_mul_scalar(across)?.f_add(&index[0])?
                 };
                 let entry = self.table.f_index_select(0, &index.f_add_scalar(level.first)?)?;
                 let part = entry.f_mul(&share.expect("three axes").f_unsqueeze(-1)?)?;
@@ -338,7 +344,8 @@ mod tests {
         let mut devices = vec![Device::Cpu];
         devices.extend(nets::device("cuda").ok());
         for (spread, log2_entries, hidden) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)] {
-            let architecture = Architecture { finest: 96, log2_entries, hidden, steps: 256, ..Architecture::default() };
+            let architecture =
+                Architecture { finest: 96, finest_z: 40, log2_entries, hidden, steps: 256, ..Architecture::default() };
             let field = example(architecture, bounds, spread);
             let rays = rays(300, 1.0);
             let mut passes = Passes::new(&field);
