@@ -3,11 +3,13 @@
 # Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
 BUDGET = {"100x2": (32_000_000, 1), "100x4": (64_000_000, 4), "200x2": (80_000_000, 1), "200x4": (70_000_000, 1)}
 # Photographs in NDC: every ray ends on something and meets more samples than before white.
-BUDGET |= {"252x2": (15_000_000, 1), "252x4": (15_000_000, 1)}
+PHOTOGRAPHS = {"252x2": (15_000_000, 1), "252x4": (17_500_000, 1)}
+BUDGET |= PHOTOGRAPHS
 OTHER_BUDGET = (60_000_000, 1)
 # `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
 AVERAGE_RAYS = 13 / 12
-# The field that a refiner rehearses with gets as many rays for an LR pixel, and no fewer than these.
+# The field that a refiner rehearses with gets as many rays for an LR pixel, and no fewer than these. Of photographs it gets half as many: shrunk once
+# more they are easier to fit, and what fits them better lacks less, so that too little is learnt (ARCHITECTURE.md, "Refinement").
 REHEARSAL_RAYS = 2_000_000
 
 
@@ -21,5 +23,6 @@ def settings(protocol: str, supervision: str, refined: bool) -> dict:
     chosen = {"lr": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "members": members}
     chosen["sub_rays"] = sub_rays
     if refined:
-        chosen["rehearsal-field.rays"] = max(REHEARSAL_RAYS, round(rays / float(scale) ** 2))
+        as_many = round(rays / float(scale) ** 2)
+        chosen["rehearsal-field.rays"] = as_many // 2 if protocol in PHOTOGRAPHS else max(REHEARSAL_RAYS, as_many)
     return chosen
