@@ -103,12 +103,30 @@ fn pictures(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), Strin
     Err(format!("{count} poses, but {seen}; pictures and poses must be as many"))
 }
 
+/// Opening brackets in the header of an array of numbers, at most: a dictionary's and its shape's are two. The parser takes twice the time for each
+/// further one that is nested (found by fuzzing), and as much more of the stack.
+const MOST_BRACKETS: usize = 4;
+
+/// Opening brackets in a NumPy file's header.
+fn brackets(bytes: &[u8]) -> usize {
+    // Magic bytes, version, and the header's length: two bytes, or four from version 2 on.
+    let length = match *bytes {
+        [_, _, _, _, _, _, 1, _, a, b, ..] => 10 + usize::from(u16::from_le_bytes([a, b])),
+        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => 12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize),
+        _ => 0,
+    };
+    bytes[..length.min(bytes.len())].iter().filter(|byte| b"{[(".contains(byte)).count()
+}
+
 /// The array's rows.
 fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let io = |source| DatasetError::Io { path: path.to_path_buf(), source };
     let mut bytes = Vec::new();
     std::fs::File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(io)?;
     let bad = |reason: String| DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"));
+    if brackets(&bytes) > MOST_BRACKETS {
+        return Err(bad("its header is nested".to_owned()));
+    }
     let file = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(e.to_string()))?;
     let shape = file.shape().to_vec();
     let rows = match shape[..] {
@@ -229,6 +247,17 @@ mod tests {
         claimed[place + 1] = b'9';
         let message = Dataset::read(folder(&claimed, &[("images", 9)]).path()).unwrap_err().to_string();
         assert!(message.contains("not a NumPy array"), "{message}");
+        // One nested so deep that reading it would take years, or all of the stack.
+        for version in [1, 2] {
+            let mut nested = b"\x93NUMPY".to_vec();
+            nested.extend([version, 0]);
+            let header = [&b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, 17), "[..], &[b'{'; 30_000], b"}\n"].concat();
+            let length = (header.len() as u32).to_le_bytes();
+            nested.extend(if version == 1 { &length[..2] } else { &length });
+            nested.extend(header);
+            let message = Dataset::read(folder(&nested, &[("images", 3)]).path()).unwrap_err().to_string();
+            assert!(message.contains("its header is nested"), "{message}");
+        }
     }
 
     #[test]
