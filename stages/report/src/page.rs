@@ -2,12 +2,13 @@ use std::path::Path;
 
 use artifact::{RunInput, RunNode, RunRecord};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
+use pixels::read_png;
 use scene::Views;
 use serde_json::Value;
 
 use crate::Params;
 use crate::compare::compare;
-use crate::pictures::{colour, data_uri, depth, depths_of, uri_of};
+use crate::pictures::{colour, depth, depths_of, shown_in_gallery};
 use crate::results::metrics;
 
 const STYLE: &str = "
@@ -164,13 +165,16 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         };
         let picture = |folder: &Path, file: &Option<String>, background| -> anyhow::Result<Option<(String, usize)>> {
             let image = file.as_ref().map(|f| colour(folder, f, background)).transpose()?;
-            Ok(image.map(|i| (uri_of(&i), i.width)))
+            Ok(image.map(|i| (shown_in_gallery(&i), i.width)))
         };
         let low = picture(&truth, &true_view.low_resolution, truths.background)?;
         let found = picture(&rendered, &view.image, views.background)?;
         let expected = picture(&truth, &true_view.image, truths.background)?;
-        let error = scores["error_map"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
-        let warped = scores["warp"].as_str().map(|f| std::fs::read(point.node.folder.join(f))).transpose()?;
+        let map = |key: &str| -> anyhow::Result<Option<String>> {
+            let file = scores[key].as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
+            Ok(file.map(|map| shown_in_gallery(&map)))
+        };
+        let (error, warped) = (map("error_map")?, map("warp")?);
         let depth = depth(&rendered, &view, range)?;
         let caption = |what: &str, found: &Option<(String, usize)>| {
             found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
@@ -188,9 +192,9 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
                 (figure("lr", low.clone().map(|l| l.0), caption("LR", &low)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
-                (figure("px", error.map(|b| data_uri(&b)), if expected.is_some() { "error" } else { "error at LR" }.to_owned()))
-                (figure("px", warped.map(|b| data_uri(&b)), format!("neighbour by depth, {} dB (red: not seen)", number("/warp/psnr", 2))))
-                (figure("px", depth.map(|d| uri_of(&d)), "depth (warm is near)".to_owned()))
+                (figure("px", error, if expected.is_some() { "error" } else { "error at LR" }.to_owned()))
+                (figure("px", warped, format!("neighbour by depth, {} dB (red: not seen)", number("/warp/psnr", 2))))
+                (figure("px", depth.map(|d| shown_in_gallery(&d)), "depth (warm is near)".to_owned()))
             }
         });
     }
