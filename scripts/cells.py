@@ -36,12 +36,14 @@ def run_refined(
     return run_target("refined", nerf_sr, page, scene, settings, weights)
 
 
-def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights) -> list[dict]:
+def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights, inputs: dict = {}) -> list[dict]:
+    """The same of any target; `inputs` are further ones, by name."""
     command = [nerf_sr, "run", target, "-j", "1", "--out", page]
     if scene:
         command += ["-i", f"dataset={scene}"]
     if weights and weights.is_dir():
         command += ["-i", f"eval.weights={weights}"]  # refiners may take weights, too
+    command += [word for name, value in inputs.items() for word in ("-i", f"{name}={value}")]
     command += [word for setting in settings for word in ("-p", setting)]
     print("==", *settings, flush=True)
     call(command)

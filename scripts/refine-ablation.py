@@ -2,8 +2,12 @@
 """What each part of refinement brings: `make refine-ablation`.
 
 A refiner is trained for each row, and scored as its training ends, by views of the rehearsal that it left out: at LR size, where LR pictures are the
-truth, so that choices made by this table look at no HR picture and at no test view. References are other views of the rehearsal. What is in
-the store isn't run again. After every row OUT (one JSON array) is written anew; at the end a Markdown table is printed.
+truth, so that choices made by this table look at no HR picture and at no test view. References are other views of the rehearsal.
+
+Rows of the paper's network follow, whose parts ours doesn't have: perceptual loss, several reference patches, patches that overlap. They are scored at HR on
+the test views, by a network of a quarter of the published width and by few steps: what a part brings there, not what the published training reaches.
+
+What is in the store isn't run again. After every row OUT (one JSON array) is written anew; at the end Markdown tables are printed.
 """
 
 import argparse
@@ -29,6 +33,14 @@ PARTS = [
     ("one reference, 16 features", [ONE, "train-refine.channels=16"]),
     ("one reference, two blocks", [ONE, "train-refine.blocks=2"]),
 ]
+# The same of the paper's network.
+PAPER = ["train-paper.channels=32", "train-paper.batch=8"]
+PAPER_PARTS = [
+    ("paper's network", PAPER, True),
+    ("L1 alone, no perceptual loss", PAPER, False),
+    ("one reference patch", [*PAPER, "train-paper.patches=1"], True),
+    ("patches side by side", [*PAPER, "refine-paper.overlap=0"], True),
+]
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_llff_data/SCENE, nerf_synthetic/SCENE (or SCENE)")
@@ -36,6 +48,7 @@ parser.add_argument("--scenes", nargs="+", default=["fern"])
 parser.add_argument("--protocol", default="252x4", help="LR width x scale")
 parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
 parser.add_argument("--steps", type=int, default=2000, help="steps of each training")
+parser.add_argument("--paper-steps", type=int, default=400, help="steps of each training of the paper's network; 0 leaves its rows out")
 parser.add_argument("--variants", type=int, help="only the first so many rows")
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/refine-ablation.json"))
 parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further parameters for every row")
@@ -59,6 +72,19 @@ def trained(scene: str, settings: list[str]) -> dict:
     return json.loads((folder / "refiner.json").read_text())
 
 
+def published(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, dict]:
+    """Figures of the test views as rendered, and as the paper's network redraws them."""
+    chosen = protocols.settings(options.protocol, "kernel", refined=False) | {"prep.references": 1, "train-paper.steps": options.paper_steps}
+    chosen |= {"split": options.split} if options.split else {}
+    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
+    settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("rehearsal")]
+    weights = options.data / "weights"
+    inputs = {"train-paper.weights": weights} if perceptual else {}
+    page = options.out.parent / "refine-ablation" / scene
+    rendered, redrawn = cells.run_target("published", options.nerf_sr, page, cells.dataset(options.data, scene), settings, weights, inputs)
+    return rendered, redrawn
+
+
 rows: list[dict] = []
 for name, settings in PARTS[: options.variants]:
     for scene in options.scenes:
@@ -75,3 +101,19 @@ gain = lambda name: sum(row["refined"] - row["rendered"] for row in of(name)) / 
 for name, _ in PARTS[: options.variants]:
     mean = cells.mean(of(name))
     print(f"| {name} | {mean['rendered']:.2f} | {mean['refined']:.2f} | {gain(name):+.2f} | {gain(name) - gain(PARTS[0][0]):+.2f} |")
+
+if options.paper_steps and options.variants is None:
+    paper: list[dict] = []
+    for name, settings, perceptual in PAPER_PARTS:
+        for scene in options.scenes:
+            print("==", scene, name, flush=True)
+            for variant, row in zip(("rendered", name), published(scene, settings, perceptual)):
+                scores = {key: row[key] for key in ("psnr", "ssim", "lpips")}
+                paper += [kept] if (kept := {"variant": variant, "scene": scene, **scores}) not in paper else []
+            cells.write(options.out, rows + paper)
+    print(f"\nTest views, {', '.join(options.scenes)}, {options.protocol}, {options.paper_steps} steps of the paper's network at a quarter of its width, means:\n")
+    print("| variant | PSNR | SSIM | LPIPS |")
+    print("| --- | --- | --- | --- |")
+    for name in ["rendered", *(name for name, *_ in PAPER_PARTS)]:
+        mean = cells.mean([row for row in paper if row["variant"] == name])
+        print(f"| {name} | {mean['psnr']:.2f} | {mean['ssim']:.4f} | {mean.get('lpips', float('nan')):.4f} |")

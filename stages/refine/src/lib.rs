@@ -13,7 +13,7 @@
 use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
-use paper_refiner::PaperRefiner;
+use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
     Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
@@ -34,11 +34,14 @@ pub struct Params {
     /// Ways to turn and mirror a view in which our network sees it; the mean of what it adds is taken. Time grows with them.
     #[schemars(range(min = 1, max = 8))]
     pub turns: u32,
+    /// `net: paper`: pixels by which its patches of 64 overlap and are blended.
+    #[schemars(range(min = 0, max = 32))]
+    pub overlap: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { strength: None, references: None, turns: 8 }
+        Self { strength: None, references: None, turns: 8, overlap: OVERLAP as u32 }
     }
 }
 
@@ -85,6 +88,7 @@ impl Stage for Refine {
             network,
             strength,
             turns: params.turns,
+            overlap: params.overlap as usize,
             references,
             photographs,
             agreeing: file.agreeing,
@@ -206,6 +210,7 @@ struct Job<'a> {
     network: AnyRefiner,
     strength: f32,
     turns: u32,
+    overlap: usize,
     references: Vec<KnownView>,
     photographs: Option<OwnPhotographs<'a>>,
     /// Whether the network was trained on views that agree with their own photographs.
@@ -251,7 +256,7 @@ impl Job<'_> {
                 Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
             }
             AnyRefiner::Paper(network, patches) => {
-                let mut drawn = network.refine(rendered, &references, *patches).bad_input("input views")?;
+                let mut drawn = network.refine(rendered, &references, *patches, self.overlap).bad_input("input views")?;
                 for (to, from) in drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4)) {
                     (0..3).for_each(|c| to[c] = (from[c] + self.strength * (to[c] - from[c])).clamp(0.0, 1.0));
                 }

@@ -1,5 +1,5 @@
 use artifact::{Context, FailureExt as _, GivenInput};
-use paper_refiner::{PaperRefiner, PaperTrainer, PaperTraining, Perceptual};
+use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, Perceptual};
 use pixels::psnr_of;
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 
@@ -38,7 +38,7 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         psnr_of(errors.map(|e| f64::from(e).powi(2)).sum::<f64>() / count as f64)
     };
     for view in &known {
-        let drawn = trainer.network().refine(&view.rendered, &[view], options.references)?;
+        let drawn = trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
         let (truth, own) = (&view.truth.data, view.rendered.view.data.chunks_exact(4).flat_map(|p| &p[..3]));
         rendered += mean(&mut own.zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
         refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;

@@ -29,4 +29,5 @@ mod trainer;
 
 pub use loss::Perceptual;
 pub use network::PaperRefiner;
+pub use patches::OVERLAP;
 pub use trainer::{PaperTrainer, PaperTraining};

@@ -11,8 +11,8 @@ use crate::network::COLOURS;
 
 /// Pixels along a patch's side, as published.
 pub(crate) const PATCH: usize = 64;
-/// From one patch to the next: they overlap by a quarter.
-const STRIDE: usize = 48;
+/// Pixels by which patches overlap unless told otherwise: a quarter.
+pub const OVERLAP: usize = 16;
 /// Pixels along each side of a patch that look for a reference patch.
 const LOOKS: usize = 4;
 
@@ -20,10 +20,16 @@ const LOOKS: usize = 4;
 type Corner = (usize, usize);
 
 impl PaperRefiner {
-    /// A view redrawn by patches of 64×64 that overlap and are blended. Each gets `count` patches of references that show the same: where its own
+    /// A view redrawn by patches of 64×64 that overlap by so many pixels, at most by half, and are blended. Each gets `count` patches of references that show the same: where its own
     /// pixels are seen there, by depth and with nothing before them. One that has fewer is given itself instead, as in the reference.
     /// A picture of three channels in 0..1.
-    pub fn refine(&self, rendered: &Rendered, references: &[&KnownView], count: usize) -> Result<Picture, RefinementError> {
+    pub fn refine(
+        &self,
+        rendered: &Rendered,
+        references: &[&KnownView],
+        count: usize,
+        overlap: usize,
+    ) -> Result<Picture, RefinementError> {
         let view = &rendered.view;
         if view.width < PATCH || view.height < PATCH {
             let reason = format!("{}×{} pixels; the paper's network needs {PATCH}×{PATCH}", view.width, view.height);
@@ -33,9 +39,9 @@ impl PaperRefiner {
             let reason = format!("a reference of fewer than {PATCH}×{PATCH} pixels");
             return Err(RefinementError::View { name: small.rendered.camera.name.clone(), reason });
         }
-        let corners: Vec<(Corner, Self)> = starts(view.height)
+        let corners: Vec<(Corner, Self)> = starts(view.height, overlap)
             .into_iter()
-            .flat_map(|y| starts(view.width).into_iter().map(move |x| (x, y)))
+            .flat_map(|y| starts(view.width, overlap).into_iter().map(move |x| (x, y)))
             .map(|corner| (corner, self.share()))
             .collect();
         let redraw = |(corner, network): (Corner, Self)| -> Result<(Corner, Vec<f32>), TchError> {
@@ -60,9 +66,9 @@ impl PaperRefiner {
 }
 
 /// Where patches begin along an axis: the last one ends at the border.
-fn starts(size: usize) -> Vec<usize> {
+fn starts(size: usize, overlap: usize) -> Vec<usize> {
     let last = size - PATCH;
-    let mut all: Vec<usize> = (0..last).step_by(STRIDE).collect();
+    let mut all: Vec<usize> = (0..last).step_by(PATCH - overlap.min(PATCH / 2)).collect();
     all.push(last);
     all
 }
@@ -132,13 +138,14 @@ mod tests {
 
     #[test]
     fn patches_that_do_nothing_are_stitched_to_the_picture() {
-        for (width, height) in [(64, 64), (65, 200), (150, 112)] {
+        for (width, height, overlap) in [(64, 64, 16), (65, 200, 0), (150, 112, 16), (150, 112, 0), (129, 300, 100)] {
             let whole = picture(width, height, 3);
-            let corners = starts(height).into_iter().flat_map(|y| starts(width).into_iter().map(move |x| (x, y)));
+            let corners =
+                starts(height, overlap).into_iter().flat_map(|y| starts(width, overlap).into_iter().map(move |x| (x, y)));
             let patches: Vec<_> = corners.map(|corner| (corner, patch(&whole, corner))).collect();
             let again = stitch(width, height, &patches);
             let worst = whole.data.iter().zip(&again.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-            assert!(worst < 1e-6, "{width}×{height}: {worst}");
+            assert!(worst < 1e-6, "{width}×{height} by {overlap}: {worst}");
         }
     }
 
@@ -172,12 +179,12 @@ mod tests {
         let network = PaperRefiner::new(4, 1).unwrap();
         let (view, other) = (known(0.0), known(20.0));
         for references in [vec![], vec![&other]] {
-            let drawn = network.refine(&view.rendered, &references, 8).unwrap();
+            let drawn = network.refine(&view.rendered, &references, 8, OVERLAP).unwrap();
             assert_eq!((drawn.width, drawn.height, drawn.channels), (160, 96, 3));
             assert!(drawn.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
         let mut small = view.rendered.clone();
         small.view = picture(63, 96, 4);
-        assert!(network.refine(&small, &[], 8).unwrap_err().to_string().contains("64×64"));
+        assert!(network.refine(&small, &[], 8, OVERLAP).unwrap_err().to_string().contains("64×64"));
     }
 }
