@@ -1,7 +1,9 @@
 use std::path::Path;
 
 use base64::Engine as _;
-use pixels::{ExrImage, Filter, Rgba8, common_range, depth_range, draw_depth, encode_png, read_exr, read_premultiplied, resize_pillow};
+use pixels::{
+    ExrImage, Filter, Rgba8, common_range, depth_range, draw_depth, encode_png, read_exr, read_premultiplied, resize_pillow,
+};
 use scene::{Background, View};
 
 /// A view's picture over its background, for looking at.
@@ -59,7 +61,9 @@ mod tests {
 
     #[test]
     fn galleries_have_pictures_that_a_screen_can_show() {
-        for ((width, height), expected) in [((600, 10), (600, 10)), ((601, 3), (301, 2)), ((1008, 756), (504, 378)), ((4032, 1), (576, 1))] {
+        for ((width, height), expected) in
+            [((600, 10), (600, 10)), ((601, 3), (301, 2)), ((1008, 756), (504, 378)), ((4032, 1), (576, 1))]
+        {
             let image = Rgba8::new(width, height, vec![200; width * height * 4]);
             assert_eq!(size(&shown_in_gallery(&image)), expected);
             assert_eq!(size(&uri_of(&image)), (width as u32, height as u32));

@@ -177,7 +177,8 @@ impl Supersampling {
             let before = pixels;
             let counts = |pixel: &usize| mask.as_ref().is_none_or(|m| m.counts[*pixel]);
             if options.detail > 1.0 {
-                with_detail[usize::from(ready.len() >= low)].extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
+                with_detail[usize::from(ready.len() >= low)]
+                    .extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
             }
             // What the kernel needs to know of pixels around them stays: what was photographed, since it blurred into its neighbours.
             let picture = Photograph { picture, mask }.known();
