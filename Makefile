@@ -95,7 +95,7 @@ refine-table: build ## Rendered and refined views: make refine-table SCENES=fern
 
 refine-ablation: build ## What each part of refinement brings, on views that its rehearsal leaves out
 	@python3 scripts/refine-ablation.py --data $(DATA) --scenes $(call given,SCENES,fern) $(if $(SPLIT),--split $(SPLIT)) \
-	  $(if $(VARIANTS),--variants $(VARIANTS)) --set $(SET) --out $(or $(OUT),out/refine-ablation.json)
+	  $(if $(VARIANTS),--variants $(VARIANTS)) $(if $(PAPER_STEPS),--paper-steps $(PAPER_STEPS)) --set $(SET) --out $(or $(OUT),out/refine-ablation.json)
 
 ablation: build ## What each part brings and costs, on withheld training views
 	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) \

@@ -76,10 +76,10 @@ def published(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, 
     """Figures of the test views as rendered, and as the paper's network redraws them."""
     chosen = protocols.settings(options.protocol, "kernel", refined=False) | {"prep.references": 1, "train-paper.steps": options.paper_steps}
     chosen |= {"split": options.split} if options.split else {}
-    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
+    chosen |= dict(setting.split("=", 1) for setting in [*settings, *options.set])
     settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("rehearsal")]
     weights = options.data / "weights"
-    inputs = {"train-paper.weights": weights} if perceptual else {}
+    inputs = {"train-paper.weights": weights} if perceptual and weights.is_dir() else {}
     page = options.out.parent / "refine-ablation" / scene
     rendered, redrawn = cells.run_target("published", options.nerf_sr, page, cells.dataset(options.data, scene), settings, weights, inputs)
     return rendered, redrawn
@@ -102,7 +102,7 @@ for name, _ in PARTS[: options.variants]:
     mean = cells.mean(of(name))
     print(f"| {name} | {mean['rendered']:.2f} | {mean['refined']:.2f} | {gain(name):+.2f} | {gain(name) - gain(PARTS[0][0]):+.2f} |")
 
-if options.paper_steps and options.variants is None:
+if options.paper_steps:
     paper: list[dict] = []
     for name, settings, perceptual in PAPER_PARTS:
         for scene in options.scenes:

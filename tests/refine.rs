@@ -52,6 +52,9 @@ const REFINED: &str = "
   eval-paper:
     like: eval
     inputs: {views: refine-paper, truth: prep/truth}
+  published:
+    run: report
+    inputs: {run: eval, paper: eval-paper}
 ";
 
 fn project() -> Project {
@@ -330,8 +333,9 @@ fn tables_have_rendered_and_refined_rows() {
     let refined: Vec<bool> = read("out/quality.json").iter().map(|r| r["refined"].as_bool().unwrap()).collect();
     assert_eq!(refined, [false, true]);
 
-    let parts = ["--scenes", "demo", "--protocol", "24x2", "--variants", "3", "--steps", "40", "--out", "out/ablation.json"];
-    let made = project.script("refine-ablation.py", &[&parts[..], &["--set", "rehearsal-field.rays=30000"]].concat());
+    let ours = ["--protocol", "24x2", "--variants", "3", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
+    let parts = [&["--scenes", "demo"], &ours[..], &["--set", "rehearsal-field.rays=30000"]].concat();
+    let made = project.script("refine-ablation.py", &parts);
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| one reference, no occlusion test |"), "{}", made.stdout);
     let rows = read("out/ablation.json");
@@ -423,6 +427,24 @@ fn the_paper_s_network_refines_by_references() {
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));
     let file: serde_json::Value = serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
     assert_eq!(file["network"]["paper"]["width"], 4);
+
+    // Its parts on and off: `make refine-ablation`.
+    project.demo_data();
+    if let Some(data) = data() {
+        std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
+    }
+    let parts =
+        ["--scenes", "demo", "--protocol", "36x2", "--variants", "0", "--paper-steps", "2", "--out", "out/published.json"];
+    let small = ["--set", "rays=60000", "train-paper.channels=4", "train-paper.batch=2"];
+    let made = project.script("refine-ablation.py", &[&parts[..], &small].concat());
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert!(made.stdout.contains("| patches side by side |"), "{}", made.stdout);
+    let rows: Vec<serde_json::Value> =
+        serde_json::from_slice(&std::fs::read(project.path("out/published.json")).unwrap()).unwrap();
+    let psnr: Vec<f64> = rows.iter().map(|r| r["psnr"].as_f64().unwrap()).collect();
+    assert!(psnr.len() == 5 && psnr.iter().all(|p| p.is_finite()), "{psnr:?}");
+    assert!(psnr[1] != psnr[3], "fewer reference patches change nothing: {psnr:?}");
+
     // Without references, patches are given themselves.
     let none = project.path("none");
     let done = stage("refine", "{}", &[("views", &views), ("refiner", &refiner)], &none, &[]);

@@ -149,6 +149,15 @@ mod tests {
         }
     }
 
+    #[test]
+    fn patches_overlap_by_as_much_as_asked() {
+        assert_eq!(starts(256, 0), [0, 64, 128, 192]);
+        assert_eq!(starts(256, OVERLAP), [0, 48, 96, 144, 192]);
+        assert_eq!(starts(150, 32), [0, 32, 64, 86]);
+        // Never by more than half.
+        assert_eq!(starts(150, 64), starts(150, 32));
+    }
+
     /// A wall at distance 2, seen by cameras that move along it by so many pixels.
     fn known(pixels: f64) -> KnownView {
         let (width, height) = (160, 96);
