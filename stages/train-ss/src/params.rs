@@ -37,8 +37,8 @@ pub struct Params {
     /// as much, so that the expectation stays. Without it: 10 for `grid`, 1 for `mlp`, which goes through all pixels in turn.
     #[schemars(range(min = 1.0, max = 100.0))]
     pub detail: Option<f64>,
-    /// Share of the rays that are cast for references' pixels, where they join training and pixels are drawn in random order. Without it: what share
-    /// of all pixels they are.
+    /// Share of the rays that are cast for references' pixels, where they join training and pixels are drawn in random order. Without it
+    /// they are drawn as any other pixel.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub reference_share: Option<f64>,
     /// Steps at the start that draw from the middle half of each picture's width and height alone, where something is to be seen.

@@ -57,7 +57,7 @@ pub struct Supersampling {
     order: Order,
     crop_groups: u64,
     focus: Focus,
-    /// Of references; and the share of the draws that are theirs.
+    /// Of references alone, where it is said what share of the draws is theirs; and that.
     references: Option<(f32, Focus)>,
     seed: u64,
     memory: Option<Memory>,
@@ -114,7 +114,7 @@ pub struct SupersamplingOptions {
     pub crop_groups: u64,
     /// How many times as often a pixel with detail is drawn as a flat one, in random order.
     pub detail: f64,
-    /// Share of the random draws that are of references' pixels, where there are some; without it what share of all pixels they are.
+    /// Share of the random draws that are of references' pixels, where there are some; without it these are drawn as any other.
     pub reference_share: Option<f64>,
     /// Whether to find each photograph's exposure.
     pub exposure: bool,
@@ -191,11 +191,13 @@ impl Supersampling {
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
         let [of_low, of_references] = with_detail;
-        let focus = Focus::new(detail, 0..low_pixels, of_low);
-        let references = (pixels > low_pixels).then(|| {
-            let share = options.reference_share.unwrap_or((pixels - low_pixels) as f64 / pixels as f64);
-            (share as f32, Focus::new(detail, low_pixels..pixels, of_references))
-        });
+        let (focus, references) = match options.reference_share.filter(|_| pixels > low_pixels) {
+            Some(share) => {
+                let of_references = Focus::new(detail, low_pixels..pixels, of_references);
+                (Focus::new(detail, 0..low_pixels, of_low), Some((share as f32, of_references)))
+            }
+            None => (Focus::new(detail, 0..pixels, [of_low, of_references].concat()), None),
+        };
         let exposures = exposure.then(|| Exposures::new(ready.len()));
         let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(|view| &view.picture)));
         let side = full;
@@ -728,7 +730,8 @@ mod tests {
             Photographs { views, pictures: vec![fine_picture(5 * scale, 4 * scale).into()] }
         };
         for (reference_share, expected) in [(None, 0.8), (Some(0.1), 0.1), (Some(0.0), 0.0), (Some(1.0), 1.0)] {
-            for detail in [1.0, 10.0] {
+            // Else what has detail decides.
+            for detail in [1.0, 10.0].into_iter().take(if reference_share.is_some() { 2 } else { 1 }) {
                 let options = SupersamplingOptions { reference_share, detail, ..options(Supervision::Average, [1.0, 1.0]) };
                 let joined = Supersampling::new(given(1), Some(given(2)), &options);
                 let draws = 10_000;
