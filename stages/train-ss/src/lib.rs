@@ -234,7 +234,6 @@ pub fn supervision(
         order: params.order(),
         crop_groups: params.crop_groups(rays),
         detail: params.detail(),
-        reference_share: params.reference_share,
         exposure: params.exposure,
         pose_refinement: params.pose_refinement,
         seed: params.seed,

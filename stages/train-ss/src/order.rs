@@ -1,14 +1,10 @@
-use std::ops::Range;
-
 use pixels::Picture;
 use radiance::Draws;
 
 /// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
 /// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
 pub(crate) struct Focus {
-    /// Numbers of the pixels, among those of all views.
-    pixels: Range<u64>,
-    /// Those of them with detail.
+    /// Numbers of the pixels with detail, among those of all views.
     detailed: Vec<u64>,
     /// Share of the draws that are even, over all pixels; the others are among the detailed ones.
     even: f32,
@@ -21,25 +17,20 @@ const FLAT: f32 = 8.0 / 255.0;
 
 impl Focus {
     /// Detailed pixels are drawn `detail` times as often as flat ones.
-    pub(crate) fn new(detail: f64, pixels: Range<u64>, detailed: Vec<u64>) -> Self {
-        let share = detailed.len() as f64 / (pixels.end - pixels.start).max(1) as f64;
+    pub(crate) fn new(detail: f64, pixels: u64, detailed: Vec<u64>) -> Self {
+        let share = detailed.len() as f64 / pixels.max(1) as f64;
         let even = if detail > 1.0 && share > 0.0 { 1.0 / (detail - 1.0).mul_add(share, 1.0) } else { 1.0 };
         let weights = [1.0 / even, 1.0 / (even * detail)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
-        Self { pixels, detailed, even: even as f32, weights }
+        Self { detailed, even: even as f32, weights }
     }
 
     /// Draws the number of a pixel.
-    pub(crate) fn draw(&self, draws: &mut Draws) -> u64 {
+    pub(crate) fn draw(&self, pixels: u64, draws: &mut Draws) -> u64 {
         if self.even == 1.0 || draws.uniform() < self.even {
-            self.pixels.start + draws.below(self.pixels.end - self.pixels.start)
+            draws.below(pixels)
         } else {
             self.detailed[draws.below(self.detailed.len() as u64) as usize]
         }
-    }
-
-    /// Whether it draws a pixel.
-    pub(crate) fn has(&self, pixel: u64) -> bool {
-        self.pixels.contains(&pixel)
     }
 
     /// Weight of a pixel's loss.
@@ -94,9 +85,9 @@ mod tests {
         let mut flat = Picture::new(20, 10, 3, vec![0.5; 600]);
         flat.data[3 * (3 * 20 + 4)] = 0.9;
         assert!(detailed(&flat).eq((2..5).flat_map(|y| (3..6).map(move |x| 20 * y + x))), "what is around a dot");
-        let focus = Focus::new(7.0, 0..200, detailed(&flat).map(|p| p as u64).collect());
+        let focus = Focus::new(7.0, 200, detailed(&flat).map(|p| p as u64).collect());
         let (mut counts, draws) = ([0u32; 200], 400_000);
-        (0..draws).for_each(|k| counts[focus.draw(&mut Draws::new(1, 2, k)) as usize] += 1);
+        (0..draws).for_each(|k| counts[focus.draw(200, &mut Draws::new(1, 2, k)) as usize] += 1);
         for (pixel, &count) in (0..200).zip(&counts) {
             let mean = f64::from(count) * 200.0 / draws as f64 * f64::from(focus.weight(pixel));
             assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");
@@ -104,7 +95,7 @@ mod tests {
         let (dot, elsewhere) = (counts[3 * 20 + 4], counts[6 * 20..].iter().sum::<u32>());
         let often = f64::from(dot) / (f64::from(elsewhere) / 80.0);
         assert!((often - 7.0).abs() < 0.6, "{often}");
-        for even in [Focus::new(1.0, 0..200, vec![3]), Focus::new(5.0, 0..200, Vec::new())] {
+        for even in [Focus::new(1.0, 200, vec![3]), Focus::new(5.0, 200, Vec::new())] {
             assert!(even.weight(3) == 1.0 && even.even == 1.0);
         }
     }

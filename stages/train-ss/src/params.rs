@@ -37,10 +37,6 @@ pub struct Params {
     /// as much, so that the expectation stays. Without it: 10 for `grid`, 1 for `mlp`, which goes through all pixels in turn.
     #[schemars(range(min = 1.0, max = 100.0))]
     pub detail: Option<f64>,
-    /// Share of the rays that are cast for references' pixels, where they join training and pixels are drawn in random order. Without it
-    /// they are drawn as any other pixel.
-    #[schemars(range(min = 0.0, max = 1.0))]
-    pub reference_share: Option<f64>,
     /// Steps at the start that draw from the middle half of each picture's width and height alone, where something is to be seen.
     /// Without it: 0 for `grid`; 1000 for `mlp`, but 0 in NDC.
     #[schemars(range(min = 0))]
@@ -147,7 +143,6 @@ impl Default for Params {
             pose_refinement: false,
             order: None,
             detail: None,
-            reference_share: None,
             crop_steps: None,
             members: 1,
             rays: None,

@@ -57,8 +57,6 @@ pub struct Supersampling {
     order: Order,
     crop_groups: u64,
     focus: Focus,
-    /// Of references alone, where it is said what share of the draws is theirs; and that.
-    references: Option<(f32, Focus)>,
     seed: u64,
     memory: Option<Memory>,
     exposures: Option<Exposures>,
@@ -114,8 +112,6 @@ pub struct SupersamplingOptions {
     pub crop_groups: u64,
     /// How many times as often a pixel with detail is drawn as a flat one, in random order.
     pub detail: f64,
-    /// Share of the random draws that are of references' pixels, where there are some; without it these are drawn as any other.
-    pub reference_share: Option<f64>,
     /// Whether to find each photograph's exposure.
     pub exposure: bool,
     /// Whether to move cameras to where photographs are met best.
@@ -152,8 +148,7 @@ impl Supersampling {
         let mut memory = None;
         let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
-        let mut with_detail = [Vec::new(), Vec::new()];
-        let mut low_pixels = 0;
+        let mut with_detail = Vec::new();
         let mut ready = Vec::new();
         let mut cameras = Vec::new();
         let all = [Some(photographs), references].into_iter().flatten();
@@ -177,27 +172,16 @@ impl Supersampling {
             let before = pixels;
             let counts = |pixel: &usize| mask.as_ref().is_none_or(|m| m.counts[*pixel]);
             if options.detail > 1.0 {
-                with_detail[usize::from(ready.len() >= low)]
-                    .extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
+                with_detail.extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
             }
             // What the kernel needs to know of pixels around them stays: what was photographed, since it blurred into its neighbours.
             let picture = Photograph { picture, mask }.known();
             pixels += (picture.width * picture.height) as u64;
-            if ready.len() < low {
-                low_pixels = pixels;
-            }
             ready.push(TrainingView::new(picture, before, &view.camera));
             cameras.push(view.camera);
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
-        let [of_low, of_references] = with_detail;
-        let (focus, references) = match options.reference_share.filter(|_| pixels > low_pixels) {
-            Some(share) => {
-                let of_references = Focus::new(detail, low_pixels..pixels, of_references);
-                (Focus::new(detail, 0..low_pixels, of_low), Some((share as f32, of_references)))
-            }
-            None => (Focus::new(detail, 0..pixels, [of_low, of_references].concat()), None),
-        };
+        let focus = Focus::new(detail, pixels, with_detail);
         let exposures = exposure.then(|| Exposures::new(ready.len()));
         let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(|view| &view.picture)));
         let side = full;
@@ -212,7 +196,6 @@ impl Supersampling {
             order,
             crop_groups,
             focus,
-            references,
             seed,
             memory,
             exposures,
@@ -301,10 +284,7 @@ impl Supersampling {
                 self.place(shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels))
             }
             _ => {
-                let mut draw = || {
-                    let of_references = self.references.as_ref().filter(|(share, _)| draws.uniform() < *share);
-                    self.place(of_references.map_or(&self.focus, |(_, focus)| focus).draw(&mut draws))
-                };
+                let mut draw = || self.place(self.focus.draw(self.pixels, &mut draws));
                 let mut place = draw();
                 for _ in 1..REDRAWS {
                     if self.counts(place) {
@@ -328,12 +308,6 @@ impl Supersampling {
     fn place(&self, pixel: u64) -> (usize, usize) {
         let view = self.views.partition_point(|v| v.before <= pixel) - 1;
         (view, (pixel - self.views[view].before) as usize)
-    }
-
-    /// Weight of a pixel's loss, by how often it is drawn.
-    fn weight(&self, pixel: u64) -> f32 {
-        let of_references = self.references.as_ref().map(|(_, focus)| focus).filter(|focus| focus.has(pixel));
-        of_references.unwrap_or(&self.focus).weight(pixel)
     }
 
     /// Whether anything is known of a pixel.
@@ -424,7 +398,7 @@ impl radiance::Supervision for Supersampling {
         let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
         let is_cropped = group < self.crop_groups;
-        let weight = if is_cropped { 1.0 } else { self.weight(self.views[index].before + pixel as u64) };
+        let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(memory) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
             let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
@@ -481,7 +455,6 @@ mod tests {
             order: Order::Random,
             crop_groups: 0,
             detail: 1.0,
-            reference_share: None,
             exposure: false,
             pose_refinement: false,
             seed: 9,
@@ -717,27 +690,6 @@ mod tests {
             joined.judge(low, &colours, &mut gradients[0]);
             plain.judge(drawn(&plain, 0, 7), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
-        }
-    }
-
-    /// Pixels of references are drawn as often as any, or as asked; LR pictures keep their draws among themselves.
-    #[test]
-    fn references_have_their_share_of_the_draws() {
-        let (_, camera) = example(Supervision::Average, [1.0, 1.0], None);
-        let given = |scale: usize| {
-            let camera = camera.resized(5 * scale as u32, 4 * scale as u32);
-            let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-            Photographs { views, pictures: vec![fine_picture(5 * scale, 4 * scale).into()] }
-        };
-        for (reference_share, expected) in [(None, 0.8), (Some(0.1), 0.1), (Some(0.0), 0.0), (Some(1.0), 1.0)] {
-            // Else what has detail decides.
-            for detail in [1.0, 10.0].into_iter().take(if reference_share.is_some() { 2 } else { 1 }) {
-                let options = SupersamplingOptions { reference_share, detail, ..options(Supervision::Average, [1.0, 1.0]) };
-                let joined = Supersampling::new(given(1), Some(given(2)), &options);
-                let draws = 10_000;
-                let of_reference = (0..draws).filter(|&group| joined.pixel(group).0 == 1).count();
-                assert!((of_reference as f64 / draws as f64 - expected).abs() < 0.02, "{reference_share:?}: {of_reference}");
-            }
         }
     }
 
