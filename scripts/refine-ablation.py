@@ -33,14 +33,14 @@ PARTS = [
     ("one reference, 16 features", [ONE, "train-refine.channels=16"]),
     ("one reference, two blocks", [ONE, "train-refine.blocks=2"]),
 ]
-# The same of the paper's network.
-PAPER = ["train-paper.channels=32", "train-paper.batch=8"]
+# The same of the paper's network, with or without the perceptual loss; and its size, unless --set says another.
 PAPER_PARTS = [
-    ("paper's network", PAPER, True),
-    ("L1 alone, no perceptual loss", PAPER, False),
-    ("one reference patch", [*PAPER, "train-paper.patches=1"], True),
-    ("patches side by side", [*PAPER, "refine-paper.overlap=0"], True),
+    ("paper's network", [], True),
+    ("L1 alone, no perceptual loss", [], False),
+    ("one reference patch", ["train-paper.patches=1"], True),
+    ("patches side by side", ["refine-paper.overlap=0"], True),
 ]
+PAPER_SIZE = {"train-paper.channels": 32, "train-paper.batch": 8}
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_llff_data/SCENE, nerf_synthetic/SCENE (or SCENE)")
@@ -49,7 +49,7 @@ parser.add_argument("--protocol", default="252x4", help="LR width x scale")
 parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
 parser.add_argument("--steps", type=int, default=2000, help="steps of each training")
 parser.add_argument("--paper-steps", type=int, default=400, help="steps of each training of the paper's network; 0 leaves its rows out")
-parser.add_argument("--variants", type=int, help="only the first so many rows")
+parser.add_argument("--variants", type=int, help="only the first so many rows of our network")
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/refine-ablation.json"))
 parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further parameters for every row")
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
@@ -74,9 +74,10 @@ def trained(scene: str, settings: list[str]) -> dict:
 
 def published(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, dict]:
     """Figures of the test views as rendered, and as the paper's network redraws them."""
-    chosen = protocols.settings(options.protocol, "kernel", refined=False) | {"prep.references": 1, "train-paper.steps": options.paper_steps}
+    chosen = protocols.settings(options.protocol, "kernel", refined=False) | PAPER_SIZE
+    chosen |= {"prep.references": 1, "train-paper.steps": options.paper_steps}
     chosen |= {"split": options.split} if options.split else {}
-    chosen |= dict(setting.split("=", 1) for setting in [*settings, *options.set])
+    chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
     settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("rehearsal")]
     weights = options.data / "weights"
     inputs = {"train-paper.weights": weights} if perceptual and weights.is_dir() else {}
