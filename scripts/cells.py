@@ -38,6 +38,11 @@ def run_refined(
 
 def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights, inputs: dict = {}) -> list[dict]:
     """The same of any target; `inputs` are further ones, by name."""
+    return [figures(row) for row in results(target, nerf_sr, page, scene, settings, weights, inputs)]
+
+
+def results(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights, inputs: dict = {}) -> list[dict]:
+    """The same, as `results.json` has it."""
     command = [nerf_sr, "run", target, "-j", "1", "--out", page]
     if scene:
         command += ["-i", f"dataset={scene}"]
@@ -47,7 +52,7 @@ def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: l
     command += [word for setting in settings for word in ("-p", setting)]
     print("==", *settings, flush=True)
     call(command)
-    return [figures(row) for row in json.loads((page / target / "results.json").read_text())]
+    return json.loads((page / target / "results.json").read_text())
 
 
 def call(command: list) -> None:
@@ -74,6 +79,12 @@ def figures(row: dict) -> dict:
         "rays_per_s": log["rays"] / train["seconds"],
         "samples_per_ray": log["samples_per_ray"],
     }
+
+
+def view_psnr(row: dict) -> dict[str, float]:
+    """PSNR of every view, by name, of a row as `results.json` has it."""
+    metrics = json.loads((pathlib.Path(row["stages"][row["stage"]]["folder"]) / "metrics.json").read_text())
+    return {view["name"]: view["scores"]["psnr"] for view in metrics["views"]}
 
 
 def mean(rows: list[dict]) -> dict:

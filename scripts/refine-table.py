@@ -3,10 +3,13 @@
 
 All methods are scored on the same views: as many references are left out of them as any method uses. Cells go through the ordinary
 pipeline, one after the other; what is in the store isn't run again. After every cell OUT (one JSON array) is written anew, and at the
-end a Markdown table is printed.
+end a Markdown table is printed. Beside the means over all views stand those over views that look the way a reference does, within 60°,
+and what the view that fares worst gains over what is rendered.
 """
 
 import argparse
+import json
+import math
 import pathlib
 
 import cells
@@ -34,14 +37,31 @@ def cell(scene: str, protocol: str, references: int) -> list[dict]:
     chosen |= dict(setting.split("=", 1) for setting in options.set)
     settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
-    results = cells.run_target("referenced", options.nerf_sr, page, folder, settings, options.data / "weights")
+    results = cells.results("referenced", options.nerf_sr, page, folder, settings, options.data / "weights")
+    rendered = cells.view_psnr(results[0])
+    near = views_near_references(pathlib.Path(results[0]["stages"]["prep"]["folder"]))
     kinds = [("ss", 0, "render_s"), ("refine", 0, "refine_s"), ("refine", references, "refine_s")]
     rows = []
-    for (method, count, spent), row in zip(kinds, results):
+    for (method, count, spent), result in zip(kinds, results):
+        row, views = cells.figures(result), cells.view_psnr(result)
         name = {"scene": scene, "protocol": protocol, "method": method, "references": count}
         scores = {key: row[key] for key in ("psnr", "ssim", "lpips")}
+        scores |= {"near_views": len(near), "near_psnr": sum(views[view] for view in near) / len(near) if near else None}
+        scores |= {"least_gain": min(views[view] - rendered[view] for view in views)}
         rows.append(name | scores | {"seconds_per_view": row[spent] / row["views"]})
     return rows
+
+
+def views_near_references(prep: pathlib.Path, degrees: float = 60) -> list[str]:
+    """Test views whose optical axis is within so many degrees of a reference's."""
+
+    def axes(part: str) -> dict[str, list[float]]:
+        views = json.loads((prep / part / "views.json").read_text())["views"]
+        return {view["camera"]["name"]: [row[2] for row in view["camera"]["camera_to_world"]] for view in views}
+
+    least = math.cos(math.radians(degrees))
+    references = axes("references").values()
+    return [name for name, axis in axes("cameras").items() if any(sum(a * b for a, b in zip(axis, other)) >= least for other in references)]
 
 
 rows = []
@@ -51,11 +71,12 @@ for protocol in options.protocols:
             rows += [row for row in cell(scene, protocol, references) if row not in rows]
             cells.write(options.out, rows)
 
-print("| LR × scale | scene | method | references | PSNR | SSIM | LPIPS | seconds a view |")
-print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+print("| LR × scale | scene | method | references | PSNR | SSIM | LPIPS | PSNR of views within 60° of a reference | least gain of a view | seconds a view |")
+print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
 for row in rows:
     lpips = f"{row['lpips']:.4f}" if row["lpips"] is not None else "–"
+    near = f"{row['near_psnr']:.2f} ({row['near_views']})" if row["near_views"] else "–"
     print(
         f"| {row['protocol']} | {row['scene']} | {row['method']} | {row['references']} | {row['psnr']:.2f} | {row['ssim']:.4f} "
-        f"| {lpips} | {row['seconds_per_view']:.2f} |"
+        f"| {lpips} | {near} | {row['least_gain']:+.2f} | {row['seconds_per_view']:.2f} |"
     )

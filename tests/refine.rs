@@ -319,7 +319,11 @@ fn tables_have_rendered_and_refined_rows() {
     let rows: Vec<(String, u64)> = read("out/table.json")
         .iter()
         .map(|r| {
-            assert!(["psnr", "ssim", "seconds_per_view"].iter().all(|k| r[k].as_f64().is_some_and(|v| v > 0.0)), "{r}");
+            assert!(
+                ["psnr", "ssim", "near_psnr", "seconds_per_view"].iter().all(|k| r[k].as_f64().is_some_and(|v| v > 0.0)),
+                "{r}"
+            );
+            assert_eq!(r["least_gain"] == 0.0, r["method"] == "ss", "{r}");
             (r["method"].as_str().unwrap().to_owned(), r["references"].as_u64().unwrap())
         })
         .collect();

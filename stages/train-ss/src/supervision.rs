@@ -64,8 +64,10 @@ pub struct Supersampling {
 }
 
 struct TrainingView {
-    /// NaN where nothing is known: pixels that don't count.
+    /// What groups are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
     picture: Picture,
+    /// A reference's own pixels.
+    fine: Option<Picture>,
     /// Number of pixels in the views before this one.
     before: u64,
     intrinsics: Intrinsics,
@@ -77,12 +79,16 @@ struct TrainingView {
 }
 
 impl TrainingView {
-    fn new(picture: Picture, before: u64, camera: &Camera) -> Self {
-        let none = [0.0; 3];
-        let mut view =
-            Self { picture, before, intrinsics: camera.intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
+    fn new(picture: Picture, fine: Option<Picture>, before: u64, camera: &Camera) -> Self {
+        let (intrinsics, none) = (camera.intrinsics, [0.0; 3]);
+        let mut view = Self { picture, fine, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
         view.place(camera);
         view
+    }
+
+    /// The photograph at its own size.
+    fn photograph(&self) -> &Picture {
+        self.fine.as_ref().unwrap_or(&self.picture)
     }
 
     /// Has its rays cast from where a camera is.
@@ -131,8 +137,7 @@ const REDRAWS: usize = 64;
 const SATURATED: f32 = 254.5 / 255.0;
 
 impl Supersampling {
-    /// Supervision by LR photographs, and by HR ones that join them: of those, the mean of sub-rays is a pixel. Pixels that don't count are
-    /// neither drawn nor compared with.
+    /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are neither drawn nor compared with.
     pub fn new(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Self {
         let (background, low) = (photographs.views.background, photographs.pictures.len());
         let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
@@ -141,7 +146,8 @@ impl Supersampling {
             (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
         };
         let smallest = |i: usize, length: fn(&Picture) -> usize| {
-            photographs.pictures.iter().map(|p| fine(length(&p.picture), i)).min().unwrap_or(1)
+            let low = photographs.pictures.iter().map(|p| fine(length(&p.picture), i));
+            low.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
         };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
@@ -170,20 +176,25 @@ impl Supersampling {
                 }
             }
             let before = pixels;
-            let counts = |pixel: &usize| mask.as_ref().is_none_or(|m| m.counts[*pixel]);
+            let (whole, known) = (picture.clone(), Photograph { picture, mask }.known());
+            // What the kernel needs to know of pixels around those that don't count stays: what was photographed, since it blurred into its neighbours.
+            let (whole, picture, fine) = if ready.len() < low {
+                (whole, known, None)
+            } else {
+                (block_means(&whole, full), block_means(&known, full), Some(known))
+            };
             if options.detail > 1.0 {
-                with_detail.extend(detailed(&picture).filter(counts).map(|pixel| before + pixel as u64));
+                let counts = |pixel: &usize| !picture.data[pixel * picture.channels].is_nan();
+                with_detail.extend(detailed(&whole).filter(counts).map(|pixel| before + pixel as u64));
             }
-            // What the kernel needs to know of pixels around them stays: what was photographed, since it blurred into its neighbours.
-            let picture = Photograph { picture, mask }.known();
             pixels += (picture.width * picture.height) as u64;
-            ready.push(TrainingView::new(picture, before, &view.camera));
+            ready.push(TrainingView::new(picture, fine, before, &view.camera));
             cameras.push(view.camera);
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
         let focus = Focus::new(detail, pixels, with_detail);
         let exposures = exposure.then(|| Exposures::new(ready.len()));
-        let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(|view| &view.picture)));
+        let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(TrainingView::photograph)));
         let side = full;
         Self {
             views: ready,
@@ -349,6 +360,28 @@ fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> P
     out
 }
 
+/// Where a block of a reference's pixels begins: the last of a row or column ends with the picture.
+fn block_start(block: usize, block_length: usize, length: usize) -> usize {
+    (block * block_length).min(length.saturating_sub(block_length))
+}
+
+/// Means over blocks of a picture's pixels, of those that are known.
+fn block_means(picture: &Picture, block: [usize; 2]) -> Picture {
+    let (width, height) = (picture.width.div_ceil(block[0]), picture.height.div_ceil(block[1]));
+    let mut data = Vec::with_capacity(width * height * picture.channels);
+    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+        let (left, top) = (block_start(x, block[0], picture.width), block_start(y, block[1], picture.height));
+        let rows = top..(top + block[1]).min(picture.height);
+        let pixels = rows.flat_map(|j| (left..(left + block[0]).min(picture.width)).map(move |i| j * picture.width + i));
+        data.extend((0..picture.channels).map(|c| {
+            let known = pixels.clone().map(|pixel| picture.data[pixel * picture.channels + c]).filter(|v| !v.is_nan());
+            let (sum, count) = known.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0f32));
+            sum / count
+        }));
+    }
+    Picture::new(width, height, picture.channels, data)
+}
+
 /// How often the sub-rays along a side double before all are cast: as many stages has the coarse share of the rays.
 pub(crate) fn coarse_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
@@ -374,10 +407,14 @@ impl radiance::Supervision for Supersampling {
         let view = &self.views[index];
         let background = self.behind(group);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
-        // Where the sub-rays begin, and how far apart they are, in LR pixels.
-        let (start, apart) = match self.kernel(index) {
-            Some(memory) => memory.block_in_pixels(index, x, y),
-            None => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
+        // Where the sub-rays begin, and how far apart they are, in pixels of the camera's.
+        let (start, apart) = match (self.kernel(index), &view.fine) {
+            (Some(memory), _) => memory.block_in_pixels(index, x, y),
+            (None, Some(fine)) => {
+                let start = [block_start(x, self.full[0], fine.width), block_start(y, self.full[1], fine.height)];
+                (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
+            }
+            (None, None) => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
         };
         for (k, ray) in rays.iter_mut().enumerate() {
             let (a, b) = (k % self.side[0], k / self.side[0]);
@@ -406,11 +443,28 @@ impl radiance::Supervision for Supersampling {
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
             return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
+        let target = |sample: &[f32], c: usize| match sample {
+            [.., alpha] if sample.len() == 4 => back[c] * (sample[c] + (1.0 - alpha) * behind[c]),
+            _ => back[c] * sample[c],
+        };
         let mut loss = 0.0;
+        if let Some(fine) = self.views[index].fine.as_ref().filter(|_| self.side == self.full) {
+            let left = block_start(pixel % picture.width, self.full[0], fine.width);
+            let top = block_start(pixel / picture.width, self.full[1], fine.height);
+            for (k, (colour, gradient)) in colours.iter().zip(gradients).enumerate() {
+                let at = (top + k / self.full[0]) * fine.width + left + k % self.full[0];
+                let sample = &fine.data[at * fine.channels..][..fine.channels];
+                for c in 0..3 {
+                    let residual = residual(colour[c], target(sample, c));
+                    loss += f64::from(weight * share) * f64::from(residual) * f64::from(residual) / 3.0;
+                    gradient[c] = weight * residual * share * (2.0 / 3.0);
+                }
+            }
+            return loss;
+        }
         for c in 0..3 {
-            let target = if picture.channels == 4 { sample[c] + (1.0 - sample[3]) * behind[c] } else { sample[c] };
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = residual(mean, back[c] * target);
+            let residual = residual(mean, target(sample, c));
             loss += f64::from(weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
                 gradient[c] = weight * residual * share * (2.0 / 3.0);
@@ -659,38 +713,73 @@ mod tests {
         assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
     }
 
-    /// References join LR pictures as they are: whatever made those, the mean of its sub-rays is a reference's pixel.
+    /// References join LR pictures as they are: whatever made those, each sub-ray is a reference's pixel, and all are met by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
-        let given = |name: &str, scale: usize| {
-            let camera = Camera { name: name.into(), ..camera.resized(5 * scale as u32, 4 * scale as u32) };
+        let given = |name: &str, width: usize, height: usize| {
+            let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-            Photographs { views, pictures: vec![fine_picture(5 * scale, 4 * scale).into()] }
+            Photographs { views, pictures: vec![fine_picture(width, height).into()] }
         };
-        let alone = Supersampling::new(given("a", 2), None, &options(Supervision::Average, [2.0, 2.0]));
+        // The last column of blocks overlaps the one before it.
+        let (width, height) = (9, 8);
+        let truth = fine_picture(width, height);
+        let camera = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
-            let mut joined = Supersampling::new(given("a", 1), Some(given("a", 2)), &options(kind, [2.0, 2.0]));
-            let drawn = |of: &Supersampling, view: usize, pixel: usize| (0..).find(|&g| of.pixel(g) == (view, pixel)).unwrap();
-            let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
-            for pixel in [0, 33, 79] {
-                let (group, other) = (drawn(&joined, 1, pixel), drawn(&alone, 0, pixel));
-                let mut rays = [[Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4]; 2];
-                let mut gradients = [[[0.0; 3]; 4]; 2];
-                joined.cast(group, &mut rays[0]);
-                alone.cast(other, &mut rays[1]);
-                assert_eq!(rays[0].map(|r| r.direction), rays[1].map(|r| r.direction), "{kind:?}");
-                let losses = [joined.judge(group, &colours, &mut gradients[0]), alone.judge(other, &colours, &mut gradients[1])];
-                assert!(losses[0] == losses[1] && gradients[0] == gradients[1], "{kind:?}");
+            let mut joined = Supersampling::new(given("a", 5, 4), Some(given("a", width, height)), &options(kind, [2.0, 2.0]));
+            assert_eq!(joined.pixels, 20 + 20, "{kind:?}");
+            let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
+            let mut seen = [false; 72];
+            for group in 0..800 {
+                if joined.pixel(group).0 == 0 {
+                    continue;
+                }
+                joined.cast(group, &mut rays);
+                let pixels = rays.map(|ray| {
+                    let of =
+                        |pixel: usize| camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3();
+                    (0..72).find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6).expect("a pixel's ray")
+                });
+                pixels.iter().for_each(|&pixel| seen[pixel] = true);
+                // A tenth too bright in the last sub-ray's red, and right in all else.
+                let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
+                colours[3][0] += 0.1;
+                let mut gradients = [[9.0; 3]; 4];
+                let loss = joined.judge(group, &colours, &mut gradients);
+                assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
+                let pulled = gradients[3][0];
+                assert!(
+                    (pulled - 0.2 / 12.0).abs() < 1e-6 && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
+                );
                 joined.remember(group, &colours);
             }
+            assert!(seen.iter().all(|s| *s), "{kind:?}");
+            // With fewer sub-rays they meet the block's mean together.
+            joined.coarse = 0.5;
+            joined.begin(0.0);
+            let group = (0..).find(|&group| joined.pixel(group) == (1, 4)).unwrap();
+            joined.cast(group, &mut rays[..1]);
+            assert!(camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6, "{kind:?}");
+            let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
+            let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
+            assert!(joined.judge(group, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
+            joined.begin(1.0);
             // LR pictures have what they had.
-            let (low, plain) = (drawn(&joined, 0, 7), Supersampling::new(given("a", 1), None, &options(kind, [2.0, 2.0])));
+            let plain = Supersampling::new(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));
+            let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
+            let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
-            joined.judge(low, &colours, &mut gradients[0]);
-            plain.judge(drawn(&plain, 0, 7), &colours, &mut gradients[1]);
+            joined.judge(drawn(&joined), &colours, &mut gradients[0]);
+            plain.judge(drawn(&plain), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
+        let mut masked = truth;
+        masked.data[..3].fill(f32::NAN);
+        let means = block_means(&masked, [2, 2]);
+        assert!(means.data.iter().all(|v| v.is_finite()) && (means.width, means.height) == (5, 4));
+        masked.data.fill(f32::NAN);
+        assert!(block_means(&masked, [2, 2]).data.iter().all(|v| v.is_nan()));
     }
 
     #[test]
