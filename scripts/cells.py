@@ -64,21 +64,24 @@ def call(command: list) -> None:
 
 def figures(row: dict) -> dict:
     """A row's means, and the seconds of what it came through: training includes a refiner's, rendering includes refining."""
-    stages = row["stages"]
-    seconds = lambda *names: sum(stages[name]["seconds"] for name in names if name in stages)
-    train = stages["train-ss"]
+    train = row["stages"]["train-ss"]
     log = json.loads((pathlib.Path(train["folder"]) / "training.json").read_text())
     return {
         "psnr": row["mean"]["psnr"],
         "ssim": row["mean"]["ssim"],
         "lpips": row["mean"].get("lpips"),
-        "train_s": seconds("train-ss", "rehearsal-field", "rehearsal-views", "train-refine", "train-referenced"),
-        "render_s": seconds("render-depth", "refine", "refine-referenced"),
-        "refine_s": seconds("refine", "refine-referenced"),
+        "train_s": seconds(row, "train-ss", "rehearsal-field", "rehearsal-views", "train-refine", "train-joined", "train-referenced"),
+        "render_s": seconds(row, "render-depth", "referenced-views", "refine", "refine-referenced"),
+        "refine_s": seconds(row, "refine", "refine-referenced"),
         "views": row["views"],
         "rays_per_s": log["rays"] / train["seconds"],
         "samples_per_ray": log["samples_per_ray"],
     }
+
+
+def seconds(row: dict, *names: str) -> float:
+    """What those of the stages took that a row, as `results.json` has it, came through."""
+    return sum(row["stages"][name]["seconds"] for name in names if name in row["stages"])
 
 
 def view_psnr(row: dict) -> dict[str, float]:

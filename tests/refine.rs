@@ -26,6 +26,12 @@ const REFINED: &str = "
   refined:
     run: report
     inputs: {run: eval, refined: eval-refined}
+  train-joined:
+    like: train-ss
+    inputs: {scene: prep/train, references: prep/references}
+  referenced-views:
+    like: render-depth
+    inputs: {field: train-ss, beside: train-joined, cameras: prep/cameras}
   reference-views:
     like: render-depth
     inputs: {field: train-ss, cameras: prep/references}
@@ -35,7 +41,7 @@ const REFINED: &str = "
     parameters: {references: 2}
   refine-referenced:
     like: refine
-    inputs: {views: render-depth, refiner: train-referenced, references: prep/references, reference-views: reference-views}
+    inputs: {views: referenced-views, refiner: train-referenced, references: prep/references, reference-views: reference-views}
   eval-referenced:
     like: eval
     inputs: {views: refine-referenced, truth: prep/truth}
@@ -168,7 +174,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
-    let (views, refiner) = (folder("render-depth"), folder("train-referenced"));
+    let (views, refiner) = (folder("referenced-views"), folder("train-referenced"));
     let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
         let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
@@ -252,7 +258,7 @@ fn bad_references_do_no_harm() {
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner, prep, reference_views) =
-        (folder("render-depth"), folder("train-referenced"), folder("prep"), folder("reference-views"));
+        (folder("referenced-views"), folder("train-referenced"), folder("prep"), folder("reference-views"));
     println!("{}", project.json("train-referenced", "refiner.json", &target));
     let references = prep.join("references");
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
@@ -371,6 +377,11 @@ fn references_join_a_training() {
     };
     println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
+    // None of them, and all is as without.
+    let none = [&arguments[..], &["-p", "train-joined.references=0"]].concat();
+    project.ok(&[&["run"], &none[..]].concat());
+    let weights = |stage: &str| std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap();
+    assert!(weights("train-joined") == weights("train-ss"));
 }
 
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.

@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::Params;
 use crate::compare::compare;
 use crate::pictures::{colour, depth, depths_of, shown_in_gallery};
-use crate::results::metrics;
+use crate::results::{metrics, scored};
 
 const STYLE: &str = "
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
@@ -32,7 +32,7 @@ pub(crate) struct Point<'a> {
 
 pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
     let mut points = Vec::new();
-    for (index, node) in run.nodes.iter().enumerate().filter(|(_, n)| n.kind == "metrics") {
+    for (index, node) in scored(run) {
         points.push(Point { node, metrics: metrics(node)?, index });
     }
     let galleries = points.iter().map(|p| gallery(run, p, params.views as usize)).collect::<anyhow::Result<Vec<_>>>()?;

@@ -44,8 +44,16 @@ pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
 }
 
+/// The nodes that scored, each with its place in the list: what came through fewer stages first, so that what is rendered stands before what is
+/// refined.
+pub(crate) fn scored(run: &RunRecord) -> Vec<(usize, &RunNode)> {
+    let mut scored: Vec<_> = run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").collect();
+    scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
+    scored
+}
+
 pub(crate) fn results(run: &RunRecord) -> anyhow::Result<Vec<ResultRow>> {
-    let rows = run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").map(|(index, node)| {
+    let rows = scored(run).into_iter().map(|(index, node)| {
         let metrics = metrics(node)?;
         let stages = run.ancestors(index).into_iter().chain([index]).map(|i| {
             let node = &run.nodes[i];

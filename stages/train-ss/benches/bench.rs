@@ -200,7 +200,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &scene.join("train"))?;
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
-        let mut supervision = train_ss::supervision(&input, params, Photographs::read(&input)?, None)?;
+        let mut supervision = train_ss::supervision(&input, params, Photographs::read(&input)?, None, &|_| ())?;
         let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width), &views.bounds.space);
         let training = params.grid_training(params.rays(0));
         let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
@@ -259,7 +259,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     let params =
         Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
     nets::deterministic();
-    let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None)?;
+    let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None, &|_| ())?;
     let architecture = params.mlp();
     let field = torch_field::Mlp::new(architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;

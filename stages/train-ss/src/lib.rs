@@ -16,6 +16,7 @@ mod memory;
 mod moving_cameras;
 mod order;
 mod params;
+mod references;
 mod supervision;
 
 use anyhow::Context as _;
@@ -163,7 +164,13 @@ pub struct Photographs {
 impl Photographs {
     /// Reads those of an input.
     pub fn read(input: &artifact::GivenInput) -> anyhow::Result<Self> {
-        let views = Views::read(input)?;
+        Self::read_first(input, usize::MAX)
+    }
+
+    /// Reads so many of them, the first.
+    pub fn read_first(input: &artifact::GivenInput, most: usize) -> anyhow::Result<Self> {
+        let mut views = Views::read(input)?;
+        views.views.truncate(most);
         let pictures = read_pictures(input, &views)?;
         Ok(Self { views, pictures })
     }
@@ -186,12 +193,13 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
     views.views.iter().map(read).collect()
 }
 
-/// What the field is compared with, by the parameters and by what the input says of its own making.
+/// What the field is compared with, by the parameters and by what the input says of its own making. What is wrong with a reference is said.
 pub fn supervision(
     input: &artifact::GivenInput,
     params: &Params,
     photographs: Photographs,
     references: Option<Photographs>,
+    say: &dyn Fn(String),
 ) -> anyhow::Result<Supersampling> {
     let background = photographs.views.background;
     if references.as_ref().is_some_and(|references| references.views.background != background) {
@@ -226,10 +234,12 @@ pub fn supervision(
         return Err(Failure::Usage(message.to_owned()).into());
     }
     let rays = params.rays(epoch(&photographs.views, params));
+    let filter = made.map_or(Filter::Lanczos, |d| d.kernel.filter());
+    let references = references.map(|references| references::checked(references, &photographs, filter, say));
     let options = SupersamplingOptions {
         supervision,
         scale: [params.supersample; 2],
-        filter: made.map_or(Filter::Lanczos, |d| d.kernel.filter()),
+        filter,
         coarse: params.coarse(),
         order: params.order(),
         crop_groups: params.crop_groups(rays),

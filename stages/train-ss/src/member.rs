@@ -81,8 +81,9 @@ impl<'a> Member<'a> {
         progress: &Progress,
     ) -> anyhow::Result<TrainingLog> {
         let context = self.context;
-        let references = references.map(Photographs::read).transpose()?;
-        let mut supervision = supervision(input, params, Photographs::read(input)?, references)?;
+        let most = params.references.map_or(usize::MAX, |most| most as usize);
+        let references = references.map(|input| Photographs::read_first(input, most)).transpose()?;
+        let mut supervision = supervision(input, params, Photographs::read(input)?, references, &|text| context.say(text))?;
         let epoch = epoch(views, params);
         let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
         if total < group as u64 {

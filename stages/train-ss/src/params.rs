@@ -127,6 +127,8 @@ pub struct Params {
     /// `mlp`: how often a network that has collapsed (to the background, or to a wall before every camera) may start over, with the next seed.
     #[schemars(range(min = 0, max = 100))]
     pub restarts: u32,
+    /// At most so many of the references given, the first. Without it: all.
+    pub references: Option<u32>,
     /// Seed of everything that is drawn.
     pub seed: u64,
 }
@@ -171,6 +173,7 @@ impl Default for Params {
             fine_samples: mlp.fine_samples,
             noise: None,
             restarts: 0,
+            references: None,
             seed: 0,
         }
     }

@@ -6,6 +6,7 @@
 //!   [`VIEW_CHANNELS`]: what a rendered view's EXR has.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
+//! * [`Exposure`]: what another exposure made of a picture.
 //! * [`Mask`]: which pixels of a picture count.
 //! * [`sample_cubic`], [`Picture::colour_at`]: a picture between its pixels.
 //! * [`psnr_of`]: a mean squared error in dB.
@@ -21,6 +22,7 @@
 
 mod cubic;
 mod degradation;
+mod exposure;
 mod exr_file;
 mod heat;
 mod image_buffer;
@@ -34,6 +36,7 @@ mod srgb;
 
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
+pub use exposure::Exposure;
 pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr};
 pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
 pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};

@@ -9,14 +9,18 @@ use crate::view::{KnownView, Rendered};
 /// A rectangle of a view: columns and rows.
 pub(crate) type Part = (Range<usize>, Range<usize>);
 
-/// What references know of a part of a view: how the colour they show there differs from the rendered one, and how far they can be trusted,
-/// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered).
+/// What references know of a part of a view: how the colour they show there differs from the rendered one; how far they can be trusted,
+/// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered); and what their own rendered views
+/// lack there, which is of use even where they show a surface a little aside, or in another light.
 #[derive(Debug)]
 pub(crate) struct Guide {
     part: Part,
-    known: Vec<[f32; 4]>,
+    known: Vec<[f32; KNOWN]>,
     uses: Vec<Use>,
 }
+
+/// Channels of what references know.
+pub(crate) const KNOWN: usize = GUIDED_INPUTS - INPUTS;
 
 /// What of a view a reference was of use for.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -46,7 +50,7 @@ impl Use {
 /// A view with what references know of it.
 #[derive(Clone, Debug)]
 pub struct Guided {
-    /// As a guided refiner takes it: colour, opacity, difference to the references, their confidence.
+    /// As a guided refiner takes it: colour, opacity, difference to the references, their confidence, and what their own views lack.
     pub view: Picture,
     /// What each reference was of use for.
     pub uses: Vec<Use>,
@@ -63,6 +67,8 @@ const JUMP: f32 = 1.0;
 struct Shown {
     /// Difference to what is rendered.
     difference: [f32; 3],
+    /// Difference to what is rendered for the reference.
+    lacking: [f32; 3],
     place: [f32; 2],
     /// By angle and size; 0 where it shows nothing.
     sight: f32,
@@ -78,30 +84,34 @@ impl Guide {
         part: Part,
         occlusion: bool,
     ) -> Self {
-        let mut sums = vec![([0.0f32; 3], 0.0f32, 0.0f32); part.0.len() * part.1.len()];
+        let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); part.0.len() * part.1.len()];
         let mut uses = Vec::new();
         for reference in references {
             let trusted = trusted(rendered, reference, &part, occlusion);
             let mut of_use = Use::default();
-            for ((sum, weights, confidence), Shown { difference, sight, trust, .. }) in sums.iter_mut().zip(trusted) {
+            for ((sum, lacks, weights, confidence), Shown { difference, lacking, sight, trust, .. }) in
+                sums.iter_mut().zip(trusted)
+            {
                 of_use.add(&Use { seen: usize::from(sight > 0.0), sight: f64::from(sight), trust: f64::from(trust) });
                 // The best counts most. What isn't trusted fades, as if it weren't seen.
                 let weight = trust.powi(4);
                 let agrees = trust / sight.max(f32::MIN_POSITIVE);
                 (0..3).for_each(|c| sum[c] += weight * agrees * difference[c]);
+                (0..3).for_each(|c| lacks[c] += weight * agrees * lacking[c]);
                 *weights += weight;
                 *confidence = confidence.max(trust);
             }
             uses.push(of_use);
         }
-        let known = |([r, g, b], weights, confidence): ([f32; 3], f32, f32)| {
-            if weights > 0.0 { [r / weights, g / weights, b / weights, confidence] } else { [0.0; 4] }
+        let known = |(sum, lacks, weights, confidence): ([f32; 3], [f32; 3], f32, f32)| {
+            let ([r, g, b], [x, y, z]) = (sum.map(|v| v / weights), lacks.map(|v| v / weights));
+            if weights > 0.0 { [r, g, b, confidence, x, y, z] } else { [0.0; KNOWN] }
         };
         Self { known: sums.into_iter().map(known).collect(), part, uses }
     }
 
     /// At a pixel of the part.
-    pub(crate) fn at(&self, (column, row): (usize, usize)) -> [f32; 4] {
+    pub(crate) fn at(&self, (column, row): (usize, usize)) -> [f32; KNOWN] {
         let (columns, rows) = &self.part;
         self.known[(row - rows.start) * columns.len() + column - columns.start]
     }
@@ -121,10 +131,12 @@ fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part, o
         let colour = reference.truth.colour_at(sight.place);
         let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
+        let theirs = reference.rendered.view.colour_at(sight.place);
+        let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
         // A picture with a hole in it shows nothing there.
         let is_shown = difference.iter().all(|d: &f32| d.is_finite());
         let well = sight.cosine.max(0.0) * sight.detail.min(1.0);
-        if is_shown { Shown { difference, place: sight.place, sight: well, trust: well } } else { Shown::default() }
+        if is_shown { Shown { difference, lacking, place: sight.place, sight: well, trust: well } } else { Shown::default() }
     };
     let shown: Vec<Shown> =
         high.clone().flat_map(|row| wide.clone().map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
@@ -308,7 +320,7 @@ mod tests {
         let part = Guide::new(&view.rendered, [&reference].into_iter(), (30..50, 7..41), true);
         for row in 7..41 {
             for column in 30..50 {
-                let expected = &whole.data[(row * WIDTH + column) * GUIDED_INPUTS + INPUTS..][..4];
+                let expected = &whole.data[(row * WIDTH + column) * GUIDED_INPUTS + INPUTS..][..KNOWN];
                 let found = part.at((column, row));
                 assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
             }

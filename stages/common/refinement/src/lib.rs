@@ -7,8 +7,7 @@
 //! Where true pictures of some views are known at HR, references, a guided network sees what they show of each pixel, too. The field's depth
 //! says where they show it, and whether they see it at all.
 //!
-//! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference; [`Exposure`]: how a
-//!   reference's differs from that of the other pictures.
+//! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes.
 //! * [`OwnPhotographs`]: LR pictures that views are made to agree with.
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
@@ -41,7 +40,7 @@ pub use agreement::OwnPhotographs;
 pub use guide::{Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
-pub use view::{Exposure, KnownView, Rendered};
+pub use view::{KnownView, Rendered};
 
 /// A refiner that can't be read, written, used or trained.
 #[derive(Debug, thiserror::Error)]

@@ -87,8 +87,8 @@ pub struct Refiner {
 
 /// Channels of a rendered view: colour and opacity.
 pub(crate) const INPUTS: usize = 4;
-/// The same with the difference to references, and their confidence.
-pub(crate) const GUIDED_INPUTS: usize = 8;
+/// The same with the difference to references, their confidence, and what their own views lack.
+pub(crate) const GUIDED_INPUTS: usize = 11;
 /// Channels of a picture.
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
@@ -344,7 +344,7 @@ mod tests {
         for other in [Architecture { channels: 0, ..architecture }, Architecture { blocks: u32::MAX, ..architecture }] {
             assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
         }
-        assert!(matches!(again.refine(&picture(8, 8)), Err(RefinementError::Channels { channels: 4, expected: 8 })));
+        assert!(matches!(again.refine(&picture(8, 8)), Err(RefinementError::Channels { channels: 4, expected: GUIDED_INPUTS })));
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

@@ -265,6 +265,7 @@ impl<'a> Drawn<'a> {
                 let known = guide.at(around.place(view, x, y));
                 inputs.extend(self.order.map(|c| self.gain * known[c]));
                 inputs.push(known[OUTPUTS]);
+                inputs.extend(self.order.map(|c| self.gain * known[OUTPUTS + 1 + c]));
             }
         });
         self.square.fold(|x, y| {
@@ -290,6 +291,7 @@ mod tests {
     use scene::{Camera, Intrinsics};
 
     use super::*;
+    use crate::refiner::GUIDED_INPUTS;
     use crate::{Architecture, Rendered};
 
     /// Stripes, and the same blurred by a pixel.
@@ -346,7 +348,7 @@ mod tests {
         let (view, other) = (example(5), example(2));
         let pixels = guided(&view.rendered, &[&other], true).view;
         let (mut seen, mut worst) = (0, 0.0f32);
-        for (i, pixel) in pixels.data.chunks_exact(8).enumerate() {
+        for (i, pixel) in pixels.data.chunks_exact(GUIDED_INPUTS).enumerate() {
             let column = i % 32;
             if pixel[7] == 0.0 {
                 // The other camera stands three pixels to the left: it doesn't see the last three columns.
@@ -359,6 +361,6 @@ mod tests {
             assert!(pixel[7] > if (5..20).contains(&column) { 0.8 } else { 0.5 }, "column {column}: {}", pixel[7]);
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
-        assert!(guided(&view.rendered, &[], true).view.data.chunks_exact(8).all(|p| p[4..] == [0.0; 4]));
+        assert!(guided(&view.rendered, &[], true).view.data.chunks_exact(GUIDED_INPUTS).all(|p| p[4..] == [0.0; 7]));
     }
 }

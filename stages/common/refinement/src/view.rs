@@ -1,4 +1,4 @@
-use pixels::{ExrImage, Picture};
+use pixels::{Exposure, ExrImage, Picture};
 use scene::{Camera, Photograph, Surface};
 
 use crate::RefinementError;
@@ -84,85 +84,20 @@ impl KnownView {
     }
 }
 
-/// How another exposure made a picture from what it should be, channel by channel: v ↦ gain · v + offset.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Exposure {
-    /// Factors of red, green and blue.
-    pub gain: [f32; 3],
-    /// What is added to each.
-    pub offset: [f32; 3],
-}
-
-impl Exposure {
-    /// No more than what a field gets wrong: factors within 10 % and offsets within 0.05 are none. (Views of fern come to 1 %, of lego to 6 %.)
-    pub fn is_none(&self) -> bool {
-        self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1) && self.offset.iter().all(|o| o.abs() <= 0.05)
-    }
-}
-
-/// Samples beyond these are clipped, and say nothing of an exposure.
-const CLIPPED: [f32; 2] = [0.02, 0.98];
-/// Pixels along a block's side.
+/// Pixels along the sides of blocks whose means are compared: in those, what a field lacks in detail evens out.
 const BLOCK: usize = 8;
-/// Fewer blocks say too little.
-const LEAST_BLOCKS: f64 = 12.0;
-/// Factors beyond these are no exposure: what is rendered shows something else.
-const POSSIBLE: [f32; 2] = [0.1, 10.0];
 
 impl KnownView {
-    /// The exposure of the true picture against the rendered view, which has the exposure of the pictures that the field learnt from: the line
-    /// through both by least squares. Means of blocks are compared, where what the field lacks in detail evens out, of what is clipped in neither.
-    /// None where too little is left, or no line fits.
+    /// The exposure of the true picture against the rendered view, which has the exposure of the pictures that the field learnt from.
+    /// None where too little says what it is.
     pub fn exposure(&self) -> Option<Exposure> {
-        let mut exposure = Exposure { gain: [1.0; 3], offset: [0.0; 3] };
-        for c in 0..3 {
-            let (mut n, mut x, mut y, mut xx, mut xy) = (0.0f64, 0.0, 0.0, 0.0, 0.0);
-            for [r, t] in self.block_means(c) {
-                (n, x, y, xx, xy) = (n + 1.0, x + r, y + t, xx + r * r, xy + r * t);
-            }
-            let (spread, together) = (n * xx - x * x, n * xy - x * y);
-            if n < LEAST_BLOCKS || spread <= 1e-5 * n * n {
-                return None;
-            }
-            let gain = together / spread;
-            if !(POSSIBLE[0]..=POSSIBLE[1]).contains(&(gain as f32)) {
-                return None;
-            }
-            (exposure.gain[c], exposure.offset[c]) = (gain as f32, ((y - gain * x) / n) as f32);
-        }
-        Some(exposure)
-    }
-
-    /// Means of the rendered and the true picture's channel over blocks, of those blocks of which at least half is clipped in neither.
-    fn block_means(&self, channel: usize) -> Vec<[f64; 2]> {
-        let (width, height) = (self.truth.width, self.truth.height);
-        let is_seen = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
-        let starts = |size: usize| (0..size).step_by(BLOCK);
-        let mean = |(x, y): (usize, usize)| {
-            let (mut n, mut sum) = (0usize, [0.0f64; 2]);
-            for row in y..(y + BLOCK).min(height) {
-                for column in x..(x + BLOCK).min(width) {
-                    let at = row * width + column;
-                    let pair = [self.rendered.view.data[at * 4 + channel], self.truth.data[at * 3 + channel]];
-                    if pair.into_iter().all(is_seen) {
-                        n += 1;
-                        (0..2).for_each(|i| sum[i] += f64::from(pair[i]));
-                    }
-                }
-            }
-            (2 * n >= BLOCK * BLOCK).then(|| sum.map(|s| s / n as f64))
-        };
-        starts(height).flat_map(|y| starts(width).map(move |x| (x, y))).filter_map(mean).collect()
+        Exposure::between(&self.rendered.view, &self.truth, BLOCK)
     }
 
     /// The same view with a true picture as the rendered one's exposure would have made it.
     #[must_use]
     pub fn without(mut self, exposure: &Exposure) -> Self {
-        for pixel in self.truth.data.chunks_exact_mut(3) {
-            for c in 0..3 {
-                pixel[c] = ((pixel[c] - exposure.offset[c]) / exposure.gain[c]).clamp(0.0, 1.0);
-            }
-        }
+        exposure.take_back(&mut self.truth);
         self
     }
 }

@@ -1,0 +1,80 @@
+use crate::Picture;
+
+/// How another exposure made a picture from what it should be, channel by channel: v ↦ gain · v + offset.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Exposure {
+    /// Factors of red, green and blue.
+    pub gain: [f32; 3],
+    /// What is added to each.
+    pub offset: [f32; 3],
+}
+
+/// Samples beyond these are clipped, and say nothing of an exposure.
+const CLIPPED: [f32; 2] = [0.02, 0.98];
+/// Fewer blocks say too little.
+const LEAST_BLOCKS: f64 = 12.0;
+/// Factors beyond these are no exposure: the pictures show different things.
+const POSSIBLE: [f32; 2] = [0.1, 10.0];
+
+impl Exposure {
+    /// The exposure of a picture against another of its size that has the right one: the line through both by least squares, a channel at a time. Means of
+    /// square blocks of pixels are compared, of what is clipped in neither. None where too little is left, or no line fits.
+    ///
+    /// # Panics
+    /// With fewer than three channels, other sizes, or no pixels in a block.
+    pub fn between(right: &Picture, seen: &Picture, block: usize) -> Option<Self> {
+        assert_eq!((right.width, right.height), (seen.width, seen.height), "pictures of one size");
+        let mut exposure = Self { gain: [1.0; 3], offset: [0.0; 3] };
+        for c in 0..3 {
+            let (mut n, mut x, mut y, mut xx, mut xy) = (0.0f64, 0.0, 0.0, 0.0, 0.0);
+            for [r, t] in block_means(right, seen, c, block) {
+                (n, x, y, xx, xy) = (n + 1.0, x + r, y + t, xx + r * r, xy + r * t);
+            }
+            let (spread, together) = (n * xx - x * x, n * xy - x * y);
+            if n < LEAST_BLOCKS || spread <= 1e-5 * n * n {
+                return None;
+            }
+            let gain = together / spread;
+            if !(POSSIBLE[0]..=POSSIBLE[1]).contains(&(gain as f32)) {
+                return None;
+            }
+            (exposure.gain[c], exposure.offset[c]) = (gain as f32, ((y - gain * x) / n) as f32);
+        }
+        Some(exposure)
+    }
+
+    /// No more than what a field gets wrong: factors within 10 % and offsets within 0.05 are none. (Views of fern come to 1 %, of lego to 6 %.)
+    pub fn is_none(&self) -> bool {
+        self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1) && self.offset.iter().all(|o| o.abs() <= 0.05)
+    }
+
+    /// Gives a picture the right exposure: colours in 0..1.
+    pub fn take_back(&self, picture: &mut Picture) {
+        for pixel in picture.data.chunks_exact_mut(picture.channels) {
+            for (c, value) in pixel.iter_mut().take(3).enumerate() {
+                *value = ((*value - self.offset[c]) / self.gain[c]).clamp(0.0, 1.0);
+            }
+        }
+    }
+}
+
+/// Means of both pictures' channel over blocks, of those blocks of which at least half is clipped in neither.
+fn block_means(right: &Picture, seen: &Picture, channel: usize, block: usize) -> Vec<[f64; 2]> {
+    let (width, height) = (seen.width, seen.height);
+    let is_known = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
+    let starts = |size: usize| (0..size).step_by(block);
+    let mean = |(x, y): (usize, usize)| {
+        let (mut n, mut sum) = (0usize, [0.0f64; 2]);
+        for row in y..(y + block).min(height) {
+            for column in x..(x + block).min(width) {
+                let pair = [right, seen].map(|picture| picture.data[(row * width + column) * picture.channels + channel]);
+                if pair.into_iter().all(is_known) {
+                    n += 1;
+                    (0..2).for_each(|i| sum[i] += f64::from(pair[i]));
+                }
+            }
+        }
+        (2 * n >= block * block).then(|| sum.map(|s| s / n as f64))
+    };
+    starts(height).flat_map(|y| starts(width).map(move |x| (x, y))).filter_map(mean).collect()
+}
