@@ -198,7 +198,7 @@ fn every_option_goes_through() {
         &["-p", "hull=alpha"],
         &["-p", "kernel=average", "-p", "coarse=0.2"],
         &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
-        &["-p", "lr=20", "-p", "scale=1.5", "-p", "references=2", "-p", "test_views=2"],
+        &["-p", "lr=20", "-p", "scale=1.5", "-p", "prep.references=2", "-p", "test_views=2"],
         &["-p", "lr=24", "-p", "scale=1", "-p", "supersample=1"],
         &["-p", "supervision=refiltered"],
         &["-p", "supervision=kernel"],

@@ -414,7 +414,7 @@ impl radiance::Supervision for Supersampling {
         let view = &self.views[index];
         let background = self.behind(group);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
-        // Where the sub-rays begin, and how far apart they are, in pixels of the camera's.
+        // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.fine) {
             (Some(memory), _) => memory.block_in_pixels(index, x, y),
             (None, Some(fine)) => {
