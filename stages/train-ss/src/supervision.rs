@@ -43,6 +43,9 @@ pub enum Order {
 /// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
 /// rendered, those around it remembered ([`Memory`]), so that the whole footprint costs no more rays than the average. Each
 /// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
+///
+/// Of an HR reference a block of pixels is drawn at a time, one for each sub-ray to meet, and altogether four times as many blocks as an LR picture has
+/// pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
