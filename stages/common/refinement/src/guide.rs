@@ -20,7 +20,7 @@ pub(crate) struct Guide {
 }
 
 /// Channels of what references know.
-pub(crate) const KNOWN: usize = GUIDED_INPUTS - INPUTS;
+const KNOWN: usize = GUIDED_INPUTS - INPUTS;
 
 /// What of a view a reference was of use for.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
