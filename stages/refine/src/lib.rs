@@ -83,7 +83,8 @@ impl Stage for Refine {
         let photographs = context.optional_input("photographs").map(OwnPhotographs::read).transpose()?;
         // Those that the network learnt by agreed, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
-            references = references.into_iter().map(|reference| agreeing(reference, own)).collect::<anyhow::Result<_>>()?;
+            let agreeing = |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.agreeing(rendered)?, truth });
+            references = references.into_iter().map(agreeing).collect::<Result<_, _>>()?;
         }
         let mut job = Job {
             context,
@@ -154,15 +155,6 @@ fn same_exposure(context: &Context, reference: KnownView) -> KnownView {
     let name = &reference.rendered.camera.name;
     context.say(format!("reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"));
     reference.without(&exposure)
-}
-
-/// A reference whose rendered view agrees with its LR photograph, where it has one.
-fn agreeing(mut reference: KnownView, own: &OwnPhotographs<'_>) -> anyhow::Result<KnownView> {
-    if let Some(photograph) = own.of(&reference.rendered.camera)? {
-        let colours = own.agree(&reference.rendered.colours(), &photograph);
-        reference.rendered = reference.rendered.with_colours(&colours);
-    }
-    Ok(reference)
 }
 
 /// A rendered view, and its file's channels.

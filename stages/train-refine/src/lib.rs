@@ -264,11 +264,8 @@ fn examples(
         let Some(photograph) = true_view.read_photograph(truth).bad_input(place())? else { return Ok(None) };
         let image = read_exr(&views.path(file)).bad_input(place())?;
         let mut rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
-        if let Some(own) = own
-            && let Some(photograph) = own.of(&view.camera)?
-        {
-            let colours = own.agree(&rendered.colours(), &photograph);
-            rendered = rendered.with_colours(&colours);
+        if let Some(own) = own {
+            rendered = own.agreeing(rendered)?;
         }
         Ok(Some(KnownView::new(rendered, photograph.over(background)).bad_input("input views")?))
     };

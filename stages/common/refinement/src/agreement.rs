@@ -2,6 +2,8 @@ use artifact::{FailureExt as _, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling};
 use scene::{Camera, Photograph, Views};
 
+use crate::Rendered;
+
 /// LR photographs that some of the views' own cameras took: those that a field was trained on.
 pub struct OwnPhotographs<'a> {
     input: &'a GivenInput,
@@ -31,6 +33,13 @@ impl<'a> OwnPhotographs<'a> {
         let k = &camera.intrinsics;
         let is_smaller = |p: &Photograph| p.picture.width <= k.width as usize && p.picture.height <= k.height as usize;
         Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
+    }
+
+    /// A rendered view that agrees with its own photograph, where there is one.
+    pub fn agreeing(&self, rendered: Rendered) -> anyhow::Result<Rendered> {
+        let Some(photograph) = self.of(&rendered.camera)? else { return Ok(rendered) };
+        let colours = self.agree(&rendered.colours(), &photograph);
+        Ok(rendered.with_colours(&colours))
     }
 
     /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
