@@ -117,4 +117,5 @@ if options.paper_steps:
     print("| --- | --- | --- | --- |")
     for name in ["rendered", *(name for name, *_ in PAPER_PARTS)]:
         mean = cells.mean([row for row in paper if row["variant"] == name])
-        print(f"| {name} | {mean['psnr']:.2f} | {mean['ssim']:.4f} | {mean.get('lpips', float('nan')):.4f} |")
+        lpips = f"{mean['lpips']:.4f}" if "lpips" in mean else "–"
+        print(f"| {name} | {mean['psnr']:.2f} | {mean['ssim']:.4f} | {lpips} |")

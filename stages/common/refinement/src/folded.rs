@@ -1,5 +1,3 @@
-use std::ops::Range;
-
 use pixels::Picture;
 use tch::{TchError, Tensor};
 
@@ -34,21 +32,10 @@ impl Square {
         }
     }
 
-    /// Column and row in a picture of a place in the square; beyond the border, those at the border.
-    pub(crate) fn place(self, picture: &Picture, column: usize, row: usize) -> (usize, usize) {
-        let clamped = |start: isize, by: usize, size: usize| (start + by as isize).clamp(0, size as isize - 1) as usize;
-        (clamped(self.x, column, picture.width), clamped(self.y, row, picture.height))
-    }
-
-    /// Columns and rows of a picture that are shown in it.
-    pub(crate) fn part(self, picture: &Picture) -> (Range<usize>, Range<usize>) {
-        let (first, last) = (self.place(picture, 0, 0), self.place(picture, self.size.0 - 1, self.size.1 - 1));
-        (first.0..last.0 + 1, first.1..last.1 + 1)
-    }
-
-    /// A picture's samples there.
+    /// A picture's samples at a place in the square; beyond the border, those at the border.
     pub(crate) fn of(self, picture: &Picture, column: usize, row: usize) -> &[f32] {
-        let (column, row) = self.place(picture, column, row);
+        let clamped = |start: isize, by: usize, size: usize| (start + by as isize).clamp(0, size as isize - 1) as usize;
+        let (column, row) = (clamped(self.x, column, picture.width), clamped(self.y, row, picture.height));
         let at = row * picture.width + column;
         &picture.data[at * picture.channels..(at + 1) * picture.channels]
     }

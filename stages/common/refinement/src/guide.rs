@@ -6,15 +6,11 @@ use rayon::prelude::*;
 use crate::refiner::{GUIDED_INPUTS, INPUTS};
 use crate::view::{KnownView, Rendered};
 
-/// A rectangle of a view: columns and rows.
-pub(crate) type Part = (Range<usize>, Range<usize>);
-
-/// What references know of a part of a view: how the colour they show there differs from the rendered one; how far they can be trusted,
+/// What references know of some rows of a view: how the colour they show there differs from the rendered one; how far they can be trusted,
 /// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered); and what their own rendered views
 /// lack there, which is of use even where they show a surface a little aside, or in another light.
 #[derive(Debug)]
-pub(crate) struct Guide {
-    part: Part,
+struct Guide {
     known: Vec<[f32; KNOWN]>,
     uses: Vec<Use>,
 }
@@ -77,17 +73,12 @@ struct Shown {
 }
 
 impl Guide {
-    /// What references know of a part; without `occlusion` as if nothing stood before anything.
-    pub(crate) fn new<'a>(
-        rendered: &Rendered,
-        references: impl Iterator<Item = &'a KnownView>,
-        part: Part,
-        occlusion: bool,
-    ) -> Self {
-        let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); part.0.len() * part.1.len()];
+    /// What references know of rows; without `occlusion` as if nothing stood before anything.
+    fn new(rendered: &Rendered, references: &[&KnownView], rows: Range<usize>, occlusion: bool) -> Self {
+        let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
         let mut uses = Vec::new();
         for reference in references {
-            let trusted = trusted(rendered, reference, &part, occlusion);
+            let trusted = trusted(rendered, reference, &rows, occlusion);
             let mut of_use = Use::default();
             for ((sum, lacks, weights, confidence), Shown { difference, lacking, sight, trust, .. }) in
                 sums.iter_mut().zip(trusted)
@@ -107,22 +98,15 @@ impl Guide {
             let ([r, g, b], [x, y, z]) = (sum.map(|v| v / weights), lacks.map(|v| v / weights));
             if weights > 0.0 { [r, g, b, confidence, x, y, z] } else { [0.0; KNOWN] }
         };
-        Self { known: sums.into_iter().map(known).collect(), part, uses }
-    }
-
-    /// At a pixel of the part.
-    pub(crate) fn at(&self, (column, row): (usize, usize)) -> [f32; KNOWN] {
-        let (columns, rows) = &self.part;
-        self.known[(row - rows.start) * columns.len() + column - columns.start]
+        Self { known: sums.into_iter().map(known).collect(), uses }
     }
 }
 
-/// What a reference shows of a part, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
+/// What a reference shows of rows, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
 /// highlight) or comes from here and there (noisy depth, an edge).
-fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part, occlusion: bool) -> Vec<Shown> {
+fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, occlusion: bool) -> Vec<Shown> {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    let grown = |range: &Range<usize>, size: usize| range.start.saturating_sub(AROUND)..(range.end + AROUND).min(size);
-    let (wide, high) = (grown(columns, width), grown(rows, height));
+    let high = rows.start.saturating_sub(AROUND)..(rows.end + AROUND).min(height);
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
     let show = |column: usize, row: usize| {
         let sight =
@@ -139,18 +123,18 @@ fn trusted(rendered: &Rendered, reference: &KnownView, (columns, rows): &Part, o
         if is_shown { Shown { difference, lacking, place: sight.place, sight: well, trust: well } } else { Shown::default() }
     };
     let shown: Vec<Shown> =
-        high.clone().flat_map(|row| wide.clone().map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
-    let means = Sums::new(&shown, wide.len());
-    let mut all = Vec::with_capacity(columns.len() * rows.len());
+        high.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
+    let means = Sums::new(&shown, width);
+    let mut all = Vec::with_capacity(width * rows.len());
     for row in rows.clone() {
-        for column in columns.clone() {
-            let (x, y) = (column - wide.start, row - high.start);
-            let mut own = shown[y * wide.len() + x];
+        let y = row - high.start;
+        for x in 0..width {
+            let mut own = shown[y * width + x];
             if own.trust > 0.0 {
                 let apart = means.around(x, y) / DIFFERENT;
                 let neighbour = |dx: isize, dy: isize| {
                     let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
-                    let other = (x < wide.len() && y < high.len()).then(|| shown[y * wide.len() + x])?;
+                    let other = (x < width && y < high.len()).then(|| shown[y * width + x])?;
                     (other.trust > 0.0).then_some(other.place)
                 };
                 let bend = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
@@ -208,7 +192,7 @@ pub fn guided(rendered: &Rendered, references: &[&KnownView], occlusion: bool) -
     let mut data = vec![0.0; width * height * GUIDED_INPUTS];
     let band = |(i, out): (usize, &mut [f32])| {
         let rows = i * BAND..(i * BAND + BAND).min(height);
-        let guide = Guide::new(rendered, references.iter().copied(), (0..width, rows.clone()), occlusion);
+        let guide = Guide::new(rendered, references, rows.clone(), occlusion);
         let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&guide.known);
         for (out, (pixel, known)) in out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels) {
             out[..INPUTS].copy_from_slice(pixel);
@@ -312,18 +296,14 @@ mod tests {
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
     }
 
-    /// Parts have what the whole has.
+    /// Bands have what the whole has.
     #[test]
-    fn parts_are_those_of_the_whole() {
+    fn bands_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let whole = guided(&view.rendered, &[&reference], true).view;
-        let part = Guide::new(&view.rendered, [&reference].into_iter(), (30..50, 7..41), true);
-        for row in 7..41 {
-            for column in 30..50 {
-                let expected = &whole.data[(row * WIDTH + column) * GUIDED_INPUTS + INPUTS..][..KNOWN];
-                let found = part.at((column, row));
-                assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
-            }
+        let band = Guide::new(&view.rendered, &[&reference], 7..41, true);
+        for (found, expected) in band.known.iter().zip(whole.data[7 * WIDTH * GUIDED_INPUTS..].chunks_exact(GUIDED_INPUTS)) {
+            assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
         }
     }
 }

@@ -9,8 +9,8 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
-use crate::guide::{Guide, Use, guided};
-use crate::refiner::{Architecture, OUTPUTS, Refiner};
+use crate::guide::{Use, guided};
+use crate::refiner::{Architecture, GUIDED_INPUTS, OUTPUTS, Refiner};
 use crate::view::KnownView;
 
 /// A training, step by step, that can be interrupted.
@@ -51,6 +51,31 @@ pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
     adam: Adam,
+    /// What a guided network is shown now.
+    pool: Option<Pool>,
+}
+
+/// Examples with what drawn references know of them: where references show a view is looked up once for all squares of it that are drawn, and
+/// no more views than these are kept.
+struct Pool {
+    round: u64,
+    /// Which example, and as the network takes it.
+    views: Vec<(usize, Picture)>,
+}
+
+impl Pool {
+    fn new(round: u64, options: &RefinerTraining, occlusion: bool, examples: &[KnownView]) -> Self {
+        let view = |i: u64| {
+            let mut draws = Draws::new(options.seed, POOLS, round * POOL + i);
+            let mut draw = || draws.below(examples.len() as u64) as usize;
+            let (chosen, drawn): (usize, Vec<usize>) = (draw(), (0..options.references).map(|_| draw()).collect());
+            let alone = draws.below(ALONE) == 0;
+            // A view is no reference for itself.
+            let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
+            (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), occlusion).view)
+        };
+        Self { round, views: (0..POOL).map(view).collect() }
+    }
 }
 
 /// Shards of a step: fixed, so that sums have one order at any thread count.
@@ -62,9 +87,13 @@ const CONTRAST: f32 = 0.08;
 const REDRAWS: usize = 8;
 /// A guided network gets no reference once in so many times, so that it can do without.
 const ALONE: u64 = 8;
+/// Views that squares are drawn from at a time where there are references, and steps until they are drawn anew.
+const POOL: u64 = 32;
+const ROUND: u64 = 200;
 /// Purposes of draws.
 const SQUARES: u64 = 301;
 const SCORES: u64 = 302;
+const POOLS: u64 = 303;
 
 /// How well views are rendered and refined.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -83,7 +112,7 @@ impl RefinerTrainer {
     /// Starts from a refiner.
     pub fn new(refiner: Refiner, options: RefinerTraining) -> Result<Self, RefinementError> {
         let adam = Adam::new(refiner.parameters())?;
-        Ok(Self { refiner, options, adam })
+        Ok(Self { refiner, options, adam, pool: None })
     }
 
     /// The refiner as it is now.
@@ -146,10 +175,19 @@ impl Training for RefinerTrainer {
         let shards: Vec<(Refiner, Range<usize>)> =
             (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
         let (step, options) = (self.steps(), self.options);
+        let Architecture { guided: is_guided, occlusion, .. } = self.refiner.architecture();
+        let round = step / ROUND;
+        if is_guided && self.pool.as_ref().is_none_or(|pool| pool.round != round) {
+            self.pool = Some(Pool::new(round, &options, occlusion, examples));
+        }
+        let subjects: Vec<Subject<'_>> = match &self.pool {
+            Some(pool) => pool.views.iter().map(|(i, view)| Subject { view, truth: &examples[*i].truth }).collect(),
+            None => examples.iter().map(|example| Subject { view: &example.rendered.view, truth: &example.truth }).collect(),
+        };
         let parts: Vec<(f64, Vec<Tensor>)> = shards
             .into_par_iter()
             .filter(|(_, range)| !range.is_empty())
-            .map(|(refiner, range)| shard(&refiner, &options, step, range, examples))
+            .map(|(refiner, range)| shard(&refiner, &options, step, range, &subjects))
             .collect::<Result<_, _>>()?;
         let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>();
         let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
@@ -182,14 +220,14 @@ fn shard(
     options: &RefinerTraining,
     step: u64,
     range: Range<usize>,
-    examples: &[KnownView],
+    subjects: &[Subject<'_>],
 ) -> Result<(f64, Vec<Tensor>), TchError> {
     let (mut inputs, mut lacks) = (Vec::new(), Vec::new());
     let size = (options.square, options.square);
     let around = Square { x: 0, y: 0, size }.grown(refiner.reach());
     let square = Square { x: 0, y: 0, size };
     for i in range {
-        let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, examples);
+        let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, subjects);
         drawn.append(refiner, &mut inputs, &mut lacks);
     }
     let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
@@ -200,15 +238,20 @@ fn shard(
     Ok((loss.f_double_value(&[])?, gradients))
 }
 
-/// A square of an example, as it is shown to the network.
+/// A view as the network takes it, beside what it should look like.
+#[derive(Clone, Copy)]
+struct Subject<'a> {
+    view: &'a Picture,
+    truth: &'a Picture,
+}
+
+/// A square of a view, as it is shown to the network.
 struct Drawn<'a> {
-    example: &'a KnownView,
+    subject: Subject<'a>,
     square: Square,
     turn: Turn,
     /// Which channel comes first, second, third.
     order: [usize; OUTPUTS],
-    /// Examples that are its references.
-    references: Vec<&'a KnownView>,
     /// Contrast; negative for the negative.
     gain: f32,
     offset: f32,
@@ -216,24 +259,24 @@ struct Drawn<'a> {
 
 impl<'a> Drawn<'a> {
     /// The square with that number.
-    fn new(options: &RefinerTraining, number: u64, examples: &'a [KnownView]) -> Self {
+    fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
         let mut draws = Draws::new(options.seed, SQUARES, number);
         let mut place = || {
-            let example = &examples[draws.below(examples.len() as u64) as usize];
+            let subject = subjects[draws.below(subjects.len() as u64) as usize];
             // On even pixels, as the folds of whole views lie.
             let mut start =
                 |size: usize| (draws.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
-            let (x, y) = (start(example.rendered.view.width), start(example.rendered.view.height));
-            (example, Square { x, y, size: (options.square, options.square) })
+            let (x, y) = (start(subject.view.width), start(subject.view.height));
+            (subject, Square { x, y, size: (options.square, options.square) })
         };
         let mut placed = place();
         for _ in 0..REDRAWS {
-            if contrast(placed.0, placed.1) >= CONTRAST {
+            if contrast(placed.0.truth, placed.1) >= CONTRAST {
                 break;
             }
             placed = place();
         }
-        let (example, square) = placed;
+        let (subject, square) = placed;
         let turn = Turn::ALL[draws.below(Turn::ALL.len() as u64) as usize];
         let mut order = [0, 1, 2];
         (1..OUTPUTS).for_each(|i| order.swap(i, draws.below(i as u64 + 1) as usize));
@@ -241,31 +284,24 @@ impl<'a> Drawn<'a> {
         let sign = if draws.below(2) == 1 { -1.0 } else { 1.0 };
         // Around the middle of all colours.
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
-        let alone = draws.below(ALONE) == 0;
-        let count = if alone { 0 } else { options.references };
-        let drawn = (0..count).map(|_| &examples[draws.below(examples.len() as u64) as usize]);
-        // A view is no reference for itself.
-        let references = drawn.filter(|other| !std::ptr::eq(*other, example)).collect();
-        Self { example, square, turn, order, references, gain, offset }
+        Self { subject, square, turn, order, gain, offset }
     }
 
     /// Appends what the network gets, which reaches farther than the square, and what it should add.
     fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
-        let KnownView { rendered, truth } = self.example;
-        let view = &rendered.view;
+        let Subject { view, truth } = self.subject;
         let around = self.square.grown(refiner.reach());
-        let Architecture { guided, occlusion, .. } = refiner.architecture();
-        let guide = guided.then(|| Guide::new(rendered, self.references.iter().copied(), around.part(view), occlusion));
         around.fold(|x, y| {
             let (x, y) = self.turn.source(around, x, y);
             let pixel = around.of(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
-            if let Some(guide) = &guide {
-                let known = guide.at(around.place(view, x, y));
-                inputs.extend(self.order.map(|c| self.gain * known[c]));
-                inputs.push(known[OUTPUTS]);
-                inputs.extend(self.order.map(|c| self.gain * known[OUTPUTS + 1 + c]));
+            if view.channels == GUIDED_INPUTS {
+                let [.., r, g, b, trust, x, y, z] = pixel else { unreachable!("a guided view has that many channels") };
+                let (differences, lacking) = ([r, g, b], [x, y, z]);
+                inputs.extend(self.order.map(|c| self.gain * differences[c]));
+                inputs.push(*trust);
+                inputs.extend(self.order.map(|c| self.gain * lacking[c]));
             }
         });
         self.square.fold(|x, y| {
@@ -277,10 +313,10 @@ impl<'a> Drawn<'a> {
 }
 
 /// Range of the green in a square of the truth.
-fn contrast(example: &KnownView, square: Square) -> f32 {
+fn contrast(truth: &Picture, square: Square) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
     square.fold(|x, y| {
-        let green = square.of(&example.truth, x, y)[1];
+        let green = square.of(truth, x, y)[1];
         (low, high) = (low.min(green), high.max(green));
     });
     high - low
@@ -291,7 +327,6 @@ mod tests {
     use scene::{Camera, Intrinsics};
 
     use super::*;
-    use crate::refiner::GUIDED_INPUTS;
     use crate::{Architecture, Rendered};
 
     /// Stripes, and the same blurred by a pixel.
