@@ -18,7 +18,7 @@ use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, r
 use refinement::{
     Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
 };
-use scene::{Background, VIEWS_FILE, View, Views};
+use scene::{Background, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -226,26 +226,33 @@ impl Job<'_> {
     /// Refines one view: its files are written, and named in it. Whether it was made to agree with its own photograph.
     fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
-        let (mut rendered, image) = read(self.input, view, self.background)?;
-        let mut own = None;
-        if let Some(photographs) = &self.photographs {
-            own = photographs.of(&view.camera)?.map(|own| (photographs, own));
-        }
-        let agree = |picture: Picture| match &own {
-            Some((photographs, own)) => photographs.agree(&picture, own),
-            None => picture,
-        };
-        if self.agreeing {
-            let colours = agree(rendered.colours());
-            rendered = rendered.with_colours(&colours);
-        }
-        let refined = agree(self.redraw(&rendered, uses)?);
+        let (rendered, image, own) = self.shown(view)?;
+        let refined = self.agree(self.redraw(&rendered, uses)?, own.as_ref());
         let path = format!("images/{name}.exr");
         self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;
         view.image = Some(path.clone());
         view.depth = view.depth.as_ref().map(|_| path);
         Ok(own.is_some())
+    }
+
+    /// A view as the network takes it, its file's channels, and its own photograph.
+    fn shown(&self, view: &View) -> anyhow::Result<(Rendered, ExrImage, Option<Photograph>)> {
+        let (rendered, image) = read(self.input, view, self.background)?;
+        let own = self.photographs.as_ref().map(|photographs| photographs.of(&view.camera)).transpose()?.flatten();
+        if !self.agreeing {
+            return Ok((rendered, image, own));
+        }
+        let colours = self.agree(rendered.colours(), own.as_ref());
+        Ok((rendered.with_colours(&colours), image, own))
+    }
+
+    /// A picture of a view that agrees with its own photograph, where there is one.
+    fn agree(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
+        match self.photographs.as_ref().zip(own) {
+            Some((photographs, own)) => photographs.agree(&picture, own),
+            None => picture,
+        }
     }
 
     /// What the network makes of a view: colours in 0..1. What each reference was of use for is added to `uses`.
@@ -276,7 +283,7 @@ impl Job<'_> {
         let mut uses = vec![Use::default(); self.references.len()];
         let references: Vec<&KnownView> = self.references.iter().collect();
         for view in views.views.iter().step_by(every) {
-            let guided = guided(&read(self.input, view, self.background)?.0, &references, occlusion);
+            let guided = guided(&self.shown(view)?.0, &references, occlusion);
             uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
         let mut uses = uses.iter();
