@@ -91,7 +91,7 @@ for name, settings in PARTS[: options.variants]:
     for scene in options.scenes:
         print("==", scene, name, flush=True)
         file = trained(scene, settings)
-        rows.append({"variant": name, "scene": scene, "rendered": file["rendered_psnr"], "refined": file["refined_psnr"], "trusted": file["trusted"]})
+        rows.append({"variant": name, "scene": scene, "rendered": file["rendered_psnr"], "refined": file["refined_psnr"]})
         cells.write(options.out, rows)
 
 print(f"Views of the rehearsal left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")

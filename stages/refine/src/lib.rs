@@ -204,6 +204,10 @@ impl AnyRefiner {
 /// Something must be wrong with a reference that is trusted with less than this share of what those of the rehearsal were.
 const LITTLE: f64 = 0.75;
 
+/// Unless it is trusted so many times as much as with all depths nearer or farther by that share.
+const SENSITIVE: f64 = 1.1;
+const ELSEWHERE: f32 = 0.1;
+
 /// Views, spread over all, by which that is judged.
 const JUDGES: usize = 8;
 
@@ -277,30 +281,45 @@ impl Job<'_> {
         }
     }
 
-    /// Leaves references out that are trusted with less than a share of what they see: they look otherwise than what is rendered.
+    /// Leaves references out that look otherwise than what is rendered: those that are trusted with less than a share of what they see, unless they would
+    /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
+    /// far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, Guidance { occlusion }: Guidance, least: f64) -> anyhow::Result<()> {
+        let trusted = self.trusted(&self.references, views, occlusion, 1.0)?;
+        let references = std::mem::take(&mut self.references);
+        for (reference, share) in references.into_iter().zip(trusted) {
+            // At another depth a reference sees nothing by its own.
+            let through = |by: f32| anyhow::Ok(self.trusted(std::slice::from_ref(&reference), views, false, by)?[0]);
+            let is_right = || -> anyhow::Result<bool> {
+                let elsewhere = f64::max(through(1.0 - ELSEWHERE)?, through(1.0 + ELSEWHERE)?);
+                Ok(through(1.0)? >= SENSITIVE * elsewhere)
+            };
+            if share >= least || is_right()? {
+                self.references.push(reference);
+                continue;
+            }
+            let name = &reference.rendered.camera.name;
+            self.context.say(format!(
+                "reference {name} looks otherwise than what is rendered ({:.0} % agree) and is left out: wrong depth, a wrong pose, or \
+                 something that moved?",
+                100.0 * share
+            ));
+        }
+        Ok(())
+    }
+
+    /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
+    fn trusted(&self, references: &[KnownView], views: &Views, occlusion: bool, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
-        let mut uses = vec![Use::default(); self.references.len()];
-        let references: Vec<&KnownView> = self.references.iter().collect();
+        let mut uses = vec![Use::default(); references.len()];
+        let references: Vec<&KnownView> = references.iter().collect();
         for view in views.views.iter().step_by(every) {
-            let guided = guided(&self.shown(view)?.0, &references, occlusion);
+            let mut shown = self.shown(view)?.0;
+            shown.depth.iter_mut().for_each(|depth| *depth *= depths);
+            let guided = guided(&shown, &references, occlusion);
             uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
-        let mut uses = uses.iter();
-        let context = self.context;
-        self.references.retain(|reference| {
-            let trusted = uses.next().map_or(1.0, Use::trusted);
-            if trusted < least {
-                let name = &reference.rendered.camera.name;
-                context.say(format!(
-                    "reference {name} looks otherwise than what is rendered ({:.0} % agree) and is left out: wrong depth, a wrong pose, or \
-                     something that moved?",
-                    100.0 * trusted
-                ));
-            }
-            trusted >= least
-        });
-        Ok(())
+        Ok(uses.iter().map(Use::trusted).collect())
     }
 
     /// Says which references were of no use; in a word or two, of what use all were.
