@@ -302,6 +302,7 @@ mod tests {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let whole = guided(&view.rendered, &[&reference], true).view;
         let band = Guide::new(&view.rendered, &[&reference], 7..41, true);
+        assert_eq!(band.known.len(), 34 * WIDTH);
         for (found, expected) in band.known.iter().zip(whole.data[7 * WIDTH * GUIDED_INPUTS..].chunks_exact(GUIDED_INPUTS)) {
             assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
         }
