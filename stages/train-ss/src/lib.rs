@@ -105,7 +105,7 @@ impl Stage for TrainSs {
             ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
             (
                 "references",
-                Input::optional(&["scene/references", "views"], "HR pictures of some views, to be trained on beside the LR ones"),
+                Input::optional(&["scene/references"], "HR pictures of some views, to be trained on beside the LR ones"),
             ),
         ]
     }
