@@ -78,7 +78,7 @@ PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
 quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" SET="seed=1" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) --set $(if $(RAYS),rays=$(RAYS)) $(SET) \
+	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) $(if $(ENLARGED),--enlarged) --set $(if $(RAYS),rays=$(RAYS)) $(SET) \
 	  --out $(or $(OUT),out/quality.json)
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr

@@ -29,15 +29,8 @@ def run(
     return row
 
 
-def run_refined(
-    nerf_sr: str, page: pathlib.Path, scene: pathlib.Path | None, settings: list[str], weights: pathlib.Path | None = None
-) -> list[dict]:
-    """The same with the refined views: a row for what was rendered, a row for what was refined."""
-    return run_target("refined", nerf_sr, page, scene, settings, weights)
-
-
 def run_target(target: str, nerf_sr: str, page: pathlib.Path, scene, settings: list[str], weights, inputs: dict = {}) -> list[dict]:
-    """The same of any target; `inputs` are further ones, by name."""
+    """The same of any target, a row for each of its evaluations; `inputs` are further ones, by name."""
     return [figures(row) for row in results(target, nerf_sr, page, scene, settings, weights, inputs)]
 
 
@@ -71,8 +64,8 @@ def figures(row: dict) -> dict:
         "ssim": row["mean"]["ssim"],
         "lpips": row["mean"].get("lpips"),
         "train_s": seconds(row, "train-ss", "rehearsal-field", "rehearsal-views", "train-refine", "train-joined", "train-referenced"),
-        "render_s": seconds(row, "render-depth", "referenced-views", "refine", "refine-referenced"),
-        "refine_s": seconds(row, "refine", "refine-referenced"),
+        "render_s": seconds(row, "render-depth", "referenced-views", "refine", "refine-referenced", "upsample", "refine-enlarged"),
+        "refine_s": seconds(row, "refine", "refine-referenced", "upsample", "refine-enlarged"),
         "views": row["views"],
         "rays_per_s": log["rays"] / train["seconds"],
         "samples_per_ray": log["samples_per_ray"],

@@ -21,29 +21,40 @@ parser.add_argument("--supervision", nargs="+", default=["average", "kernel"])
 parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/quality.json"))
 parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
 parser.add_argument("--refined", action="store_true", help="a second row for every cell: its views refined")
+parser.add_argument("--enlarged", action="store_true", help="a third: means of those and of photographs that IMDN enlarged (needs its weights)")
 parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further parameters for every cell")
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
 options = parser.parse_args()
 
+# A cell's rows: what they are of, and what tells them apart.
+ROWS = [
+    ("", {"refined": False, "enlarged": False}),
+    (", refined", {"refined": True, "enlarged": False}),
+    (", refined, with enlarged photographs", {"refined": True, "enlarged": True}),
+]
+TARGETS = ["report", "refined", "enlarged"]
+COUNT = 3 if options.enlarged else 2 if options.refined else 1
+
 
 def cell(scene: str, protocol: str, supervision: str) -> list[dict]:
     page = options.out.parent / "quality" / "-".join([scene, protocol, supervision] + [options.split] * bool(options.split))
-    chosen = protocols.settings(protocol, supervision, options.refined)
+    chosen = protocols.settings(protocol, supervision, refined=COUNT > 1)
     chosen |= {"split": options.split} if options.split else {}
     chosen |= dict(setting.split("=", 1) for setting in options.set)
     settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
-    run = cells.run_refined if options.refined else lambda *how: [cells.run(*how)]
-    results = run(options.nerf_sr, page, folder, settings, options.data / "weights")
+    weights = options.data / "weights"
+    inputs = {"upsample.weights": weights} if options.enlarged and weights.is_dir() else {}
+    results = cells.run_target(TARGETS[COUNT - 1], options.nerf_sr, page, folder, settings, weights, inputs)
     name = {"scene": scene, "protocol": protocol, "supervision": supervision}
     name |= {"split": options.split} if options.split else {}
-    return [name | {"refined": refined} | row for refined, row in zip([False, True], results)]
+    return [name | kind | row for (_, kind), row in zip(ROWS, results)]
 
 
-def line(name: str, protocol: str, row: dict) -> str:
+def line(name: str, protocol: str, views: str, row: dict) -> str:
     lpips = f"{row['lpips']:.4f}" if row.get("lpips") is not None else "–"
     return (
-        f"| {protocol} | {name} | {row['supervision']}{', refined' * row['refined']} | {row['psnr']:.2f} | {row['ssim']:.4f} | {lpips} "
+        f"| {protocol} | {name} | {row['supervision']}{views} | {row['psnr']:.2f} | {row['ssim']:.4f} | {lpips} "
         f"| {row['train_s'] / 60:.1f} min | {row['render_s']:.1f} s | {row['rays_per_s'] / 1000:.0f} k |"
     )
 
@@ -58,10 +69,10 @@ for protocol in options.protocols:
 print("| LR × scale | scene | supervision | PSNR | SSIM | LPIPS | training | rendering | rays/s |")
 print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
 for protocol in options.protocols:
-    for supervision, refined in itertools.product(options.supervision, [False, True]):
-        kind = {"protocol": protocol, "supervision": supervision, "refined": refined}
+    for supervision, (views, kind) in itertools.product(options.supervision, ROWS[:COUNT]):
+        kind = {"protocol": protocol, "supervision": supervision} | kind
         mine = [row for row in rows if kind.items() <= row.items()]
         for row in mine:
-            print(line(row["scene"], protocol, row))
+            print(line(row["scene"], protocol, views, row))
         if len(mine) > 1:
-            print(line(f"**mean of {len(mine)}**", protocol, cells.mean(mine) | kind))
+            print(line(f"**mean of {len(mine)}**", protocol, views, cells.mean(mine) | kind))

@@ -26,6 +26,17 @@ const REFINED: &str = "
   refined:
     run: report
     inputs: {run: eval, refined: eval-refined}
+  upsample:
+    inputs: {views: prep/train, cameras: prep/train-cameras}
+  refine-enlarged:
+    like: refine
+    inputs: {views: render-depth, refiner: train-refine, photographs: prep/train, enlarged: upsample}
+  eval-enlarged:
+    like: eval
+    inputs: {views: refine-enlarged, truth: prep/truth}
+  enlarged:
+    run: report
+    inputs: {run: eval, refined: eval-refined, enlarged: eval-enlarged}
   train-joined:
     like: train-ss
     inputs: {scene: prep/train, references: prep/references}
@@ -167,6 +178,55 @@ fn views_agree_with_their_own_photographs() {
     let alone = Finished::of(command.output().unwrap());
     assert_eq!(alone.code, 0, "{}", alone.stderr);
     assert!(alone.stderr.contains("trained on views that agree with LR photographs of their own"), "{}", alone.stderr);
+}
+
+/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and agrees with the photograph.
+#[test]
+fn views_are_means_with_their_enlarged_photographs() {
+    let project = project();
+    let split = ["enlarged", "-p", "split=paper"];
+    project.ok(&[&["run"], &split[..]].concat());
+    let folder = |stage: &str| project.artifact(stage, &split);
+    let summary = std::fs::read_to_string(folder("refine-enlarged").join("summary.txt")).unwrap();
+    assert!(summary.contains("14 are means") && summary.contains("14 of them agree"), "{summary}");
+
+    let (views, refiner, enlarged) = (folder("render-depth"), folder("train-refine"), project.path("enlarged"));
+    let (train, cameras) = (folder("prep").join("train"), folder("prep").join("train-cameras"));
+    // Half of one photograph doesn't count.
+    let name = "r_1";
+    let photographs = changed(&project, "photographs", &train, "json", &|path| {
+        let mut list: serde_json::Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+        for view in list["views"].as_array_mut().into_iter().flatten().filter(|view| view["camera"]["name"] == name) {
+            view["mask"] = "masks/it.png".into();
+        }
+        std::fs::write(path, list.to_string()).unwrap();
+    });
+    let counts = (0..24 * 24).map(|i| i % 24 < 12).collect();
+    let mask = pixels::Mask { width: 24, height: 24, counts };
+    std::fs::create_dir(photographs.join("masks")).unwrap();
+    pixels::write_png(&photographs.join("masks/it.png"), &mask.to_rgba8()).unwrap();
+    let inputs = [("views", photographs.as_path()), ("cameras", &cameras)];
+    assert_eq!(stage("upsample", "{}", &inputs, &enlarged, &[]).code, 0);
+
+    let refine = |name: &str, enlarged: Option<&Path>| {
+        let mut inputs = vec![("views", views.as_path()), ("refiner", &refiner)];
+        inputs.extend(enlarged.map(|enlarged| ("enlarged", enlarged)));
+        let output = project.path(name);
+        (stage("refine", "{}", &inputs, &output, &[]), output)
+    };
+    let (plain, mean) = (refine("plain", None).1, refine("mean", Some(&enlarged)).1);
+    let green = |folder: &Path| {
+        let file = folder.join(format!("images/{name}.exr"));
+        pixels::read_premultiplied(&file).unwrap().over(1.0).channel(1)
+    };
+    let (plain, mean, large) = (green(&plain), green(&mean), green(&enlarged));
+    for (i, ((plain, mean), large)) in plain.iter().zip(&mean).zip(&large).enumerate() {
+        let expected = if i % 48 < 24 { 0.5 * (plain + large) } else { *plain };
+        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {large}");
+    }
+    assert!(plain.iter().zip(&large).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
+    // Of another size.
+    refine("no", Some(&photographs)).0.fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
 }
 
 #[test]
@@ -336,12 +396,14 @@ fn tables_have_rendered_and_refined_rows() {
     assert_eq!(rows, [("ss".into(), 0), ("refine".into(), 0), ("refine".into(), 1), ("refine".into(), 2)]);
 
     let quality =
-        ["--scenes", "demo", "--protocols", "24x2", "--supervision", "kernel", "--refined", "--out", "out/quality.json"];
+        ["--scenes", "demo", "--protocols", "24x2", "--supervision", "kernel", "--enlarged", "--out", "out/quality.json"];
     let made = project.script("quality.py", &[&quality[..], &more].concat());
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| 24x2 | demo | kernel, refined |"), "{}", made.stdout);
-    let refined: Vec<bool> = read("out/quality.json").iter().map(|r| r["refined"].as_bool().unwrap()).collect();
-    assert_eq!(refined, [false, true]);
+    let rows = read("out/quality.json");
+    let kinds: Vec<(bool, bool)> =
+        rows.iter().map(|r| (r["refined"].as_bool().unwrap(), r["enlarged"].as_bool().unwrap())).collect();
+    assert_eq!(kinds, [(false, false), (true, false), (true, true)]);
 
     let ours = ["--protocol", "24x2", "--variants", "3", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
     let parts = [&["--scenes", "demo"], &ours[..], &["--set", "rehearsal-field.rays=30000"]].concat();

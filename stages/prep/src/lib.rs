@@ -6,9 +6,9 @@
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
 //!
-//! The scene has five subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `rehearsal/` (the
-//! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `cameras/` (the test cameras at HR size, no
-//! pictures), `truth/` (HR test images, depth), `references/` (HR training images).
+//! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `rehearsal/` (the
+//! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `train-cameras/` and `cameras/` (the training
+//! and the test cameras at HR size, no pictures), `truth/` (HR test images, depth), `references/` (HR training images).
 
 mod bounds;
 mod degrade;
@@ -211,6 +211,7 @@ impl Stage for Prep {
         Output::kind("scene")
             .with_subtree("train", "scene/train")
             .with_subtree("rehearsal", "scene/train")
+            .with_subtree("train-cameras", "scene/cameras")
             .with_subtree("cameras", "scene/cameras")
             .with_subtree("truth", "scene/truth")
             .with_subtree("references", "scene/references")
@@ -465,6 +466,8 @@ impl Job<'_> {
         }
 
         let high = |c: &Camera| self.resized(c, |s| s.hr);
+        let enlarged = train_cameras.iter().map(|c| View::camera_only(high(c))).collect();
+        self.context.write_json(&format!("train-cameras/{VIEWS_FILE}"), &Views::new(background, bounds, enlarged))?;
         let reference_views = references
             .iter()
             .map(|&i| View {

@@ -5,6 +5,8 @@
 //!
 //! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches instead of adding to the view.
 //!
+//! What a network that learnt from other pictures makes of a view's own photograph (input `enlarged`) errs in another way: the mean of both is taken.
+//!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
 //! as it takes to agree with that; before, too, where the network learnt on views that do.
 //!
@@ -18,7 +20,7 @@ use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, r
 use refinement::{
     Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
 };
-use scene::{Background, Photograph, VIEWS_FILE, View, Views};
+use scene::{Background, Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -63,6 +65,13 @@ impl Stage for Refine {
                 "photographs",
                 Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made to agree with its own"),
             ),
+            (
+                "enlarged",
+                Input::optional(
+                    &["views"],
+                    "photographs enlarged to the views' size; a view of the same camera becomes the mean of both",
+                ),
+            ),
         ]
     }
 
@@ -96,6 +105,7 @@ impl Stage for Refine {
             overlap: params.overlap as usize,
             references,
             photographs,
+            enlarged: context.optional_input("enlarged").map(Enlarged::read).transpose()?,
             agreeing: file.agreeing,
         };
         if let Some(guidance) = job.network.guidance().filter(|_| !job.references.is_empty()) {
@@ -115,7 +125,14 @@ impl Stage for Refine {
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
         let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
-        context.write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{own}", views.views.len()))
+        let is_mean =
+            |view: &&View| job.enlarged.as_ref().is_some_and(|enlarged| enlarged.views.taken_by(&view.camera).is_some());
+        let means = match views.views.iter().filter(is_mean).count() {
+            0 => String::new(),
+            count => format!("; {count} are means with their enlarged photographs"),
+        };
+        context
+            .write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{means}{own}", views.views.len()))
     }
 }
 
@@ -163,6 +180,38 @@ fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Ren
     let file = view.image.as_ref().ok_or_else(|| Failure::BadInput(format!("view {name}: it has no picture")))?;
     let image = read_exr(&input.path(file)).bad_input(format!("view {name}"))?;
     Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
+}
+
+/// Photographs enlarged by a method that looks at each alone.
+struct Enlarged<'a> {
+    input: &'a GivenInput,
+    views: Views,
+}
+
+impl<'a> Enlarged<'a> {
+    fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
+        Ok(Self { input, views: Views::read(input)? })
+    }
+
+    /// The mean of a picture and what was made of the same camera's photograph, where its mask leaves it; the picture where there is none.
+    fn mean(&self, mut picture: Picture, camera: &Camera) -> anyhow::Result<Picture> {
+        let Some(view) = self.views.taken_by(camera) else { return Ok(picture) };
+        let place = || format!("input enlarged: view {}", camera.name);
+        let Some(photograph) = view.read_photograph(self.input).bad_input(place())? else { return Ok(picture) };
+        let Photograph { picture: mut other, mask } = photograph.over(self.views.background.shown());
+        if (other.width, other.height) != (picture.width, picture.height) {
+            let sizes = format!(
+                "{}×{} pixels where the view to refine has {}×{}",
+                other.width, other.height, picture.width, picture.height
+            );
+            return Err(Failure::BadInput(format!("{}: {sizes}", place())).into());
+        }
+        if let Some(mask) = mask {
+            mask.fill(&mut other, &picture);
+        }
+        picture.data.iter_mut().zip(&other.data).for_each(|(v, other)| *v = 0.5 * (*v + other));
+        Ok(picture)
+    }
 }
 
 /// How a network takes references.
@@ -222,6 +271,7 @@ struct Job<'a> {
     overlap: usize,
     references: Vec<KnownView>,
     photographs: Option<OwnPhotographs<'a>>,
+    enlarged: Option<Enlarged<'a>>,
     /// Whether the network was trained on views that agree with their own photographs.
     agreeing: bool,
 }
@@ -231,7 +281,12 @@ impl Job<'_> {
     fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
         let name = view.camera.name.clone();
         let (rendered, image, own) = self.shown(view)?;
-        let refined = self.agree(self.redraw(&rendered, uses)?, own.as_ref());
+        let redrawn = self.redraw(&rendered, uses)?;
+        let mean = match &self.enlarged {
+            Some(enlarged) => enlarged.mean(redrawn, &view.camera)?,
+            None => redrawn,
+        };
+        let refined = self.agree(mean, own.as_ref());
         let path = format!("images/{name}.exr");
         self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;

@@ -1,4 +1,5 @@
-//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each picture alone: the baselines of the paper's tables.
+//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each picture alone: the baselines of the paper's tables, and
+//! photographs whose views `refine` is to bring nearer to them.
 //!
 //! * `bicubic`: Pillow's, on 8 bits, to the last bit.
 //! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much smaller.
@@ -6,7 +7,7 @@
 //!
 //! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py` makes them from released checkpoints);
 //! every tensor's shape is checked. Pictures are composited on their background, enlarged as display-encoded sRGB, and are opaque
-//! afterwards: there is no depth to them.
+//! afterwards: there is no depth to them. What doesn't count of a photograph, by its mask, doesn't when it is enlarged.
 //!
 //! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on how many there are.
 
@@ -20,9 +21,9 @@ mod swinir;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use nets::Weights;
-use pixels::{Filter, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_premultiplied, resize_pillow, write_exr, write_png};
+use pixels::{Filter, Mask, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png};
 use rayon::prelude::*;
-use scene::{Camera, VIEWS_FILE, View, Views};
+use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
@@ -64,7 +65,7 @@ impl Stage for Upsample {
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras = ["scene/cameras", "scene/truth", "cameras"];
         vec![
-            ("views", Input::required(&["views"], "rendered views, at LR")),
+            ("views", Input::required(&["views", "scene/train"], "rendered views, or photographs, at LR")),
             ("cameras", Input::required(&cameras, "their cameras, at HR: how large the views become")),
             ("weights", Input::optional(&["weights"], "folder with the network's safetensors file")),
         ]
@@ -85,19 +86,20 @@ impl Stage for Upsample {
         let work = networks.into_par_iter().enumerate().map(|(lane, network)| -> anyhow::Result<()> {
             for (view, camera) in pairs.iter().skip(lane).step_by(lanes) {
                 context.check_interrupt()?;
-                let file = view.image.as_ref().with_context(|| format!("view {}: it has no picture", camera.name));
-                let low = read_premultiplied(&input.path(file.bad_input("input views")?));
-                let low = low.bad_input(format!("view {}", camera.name))?.over(views.background.shown());
-                let large = enlarge(network.as_deref(), &low, camera).with_context(|| format!("view {}", camera.name))?;
-                write(context, &camera.name, &large)?;
+                let place = || format!("view {}", camera.name);
+                let photograph =
+                    view.read_photograph(input).bad_input(place())?.with_context(|| format!("{}: it has no picture", place()));
+                let Photograph { picture: low, mask } = photograph.bad_input("input views")?.over(views.background.shown());
+                let large = enlarge(network.as_deref(), &low, camera).with_context(place)?;
+                write(context, &camera.name, &large, mask.map(|mask| mask.resized((large.width, large.height), 0)))?;
                 progress.add(1);
             }
             Ok(())
         });
         work.collect::<anyhow::Result<Vec<_>>>()?;
-        let large = pairs.iter().map(|(_, camera)| {
+        let large = pairs.iter().map(|(view, camera)| {
             let image = Some(format!("images/{}.exr", camera.name));
-            View { image, ..View::camera_only((*camera).clone()) }
+            View { image, mask: view.mask.as_ref().map(|_| mask_file(&camera.name)), ..View::camera_only((*camera).clone()) }
         });
         let large = Views { hull: None, ..Views::new(views.background, views.bounds, large.collect()) };
         context.write_json(VIEWS_FILE, &large)?;
@@ -187,8 +189,15 @@ fn enlarge(network: Option<&dyn Network>, low: &Picture, camera: &Camera) -> any
     Ok(nets::picture_of(&large)?)
 }
 
-/// A view's files: opaque colours, and a preview.
-fn write(context: &Context, name: &str, large: &Picture) -> anyhow::Result<()> {
+fn mask_file(name: &str) -> String {
+    format!("masks/{name}.png")
+}
+
+/// A view's files: opaque colours, a preview, and what counts of them.
+fn write(context: &Context, name: &str, large: &Picture, mask: Option<Mask>) -> anyhow::Result<()> {
+    if let Some(mask) = mask {
+        write_png(&context.output_path(&mask_file(name))?, &mask.to_rgba8())?;
+    }
     let channels = &VIEW_CHANNELS[..4];
     let path = context.output_path(&format!("images/{name}.exr"))?;
     write_exr(&path, (large.width, large.height), channels, VIEW_NOTE, |first, rows, samples| {
