@@ -76,7 +76,7 @@ pub struct RefinerFile {
     pub agreeing: bool,
 }
 
-/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (He et al. 2016), one out. It pads
+/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (Lim et al. 2017), one out. It pads
 /// nothing: borders are gone on with before it, and what it predicts depends on nothing but what it sees.
 #[derive(Debug)]
 pub struct Refiner {
@@ -170,7 +170,7 @@ impl Refiner {
             let middle = x.f_narrow(2, 2, height - 4)?.f_narrow(3, 2, width - 4)?;
             x = middle.f_add(&layer(&inner, 2 + 2 * block)?)?;
         }
-        layer(&x.f_relu()?, 1 + 2 * self.architecture.blocks as usize)
+        layer(&x, 1 + 2 * self.architecture.blocks as usize)
     }
 
     /// The view (for a guided network [`guided`](crate::guided)) with `strength` times what the network adds: a picture of three channels in
@@ -307,6 +307,19 @@ mod tests {
                 }
             });
         }
+    }
+
+    /// A rehearsal with little to learn pushes features below 0 everywhere. What the network adds must still follow what it sees, or it would never
+    /// learn again.
+    #[test]
+    fn a_network_does_not_fall_silent() {
+        nets::deterministic();
+        let refiner = random(Architecture { channels: 6, blocks: 1, guided: false, occlusion: true });
+        no_grad(|| refiner.parameters[1].shallow_clone().fill_(-10.0));
+        let (dark, view) = (Picture::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), picture(16, 16));
+        let added = |view: &Picture| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
+        let apart = added(&dark).iter().zip(added(&view)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(apart > 0.01, "{apart}");
     }
 
     /// Asked in all eight ways, a network treats a turned view as it treats the view itself.
