@@ -175,7 +175,12 @@ fn pipelines_that_cannot_be_used() {
         ("{dataset: demo-scene}", "{dataset: demo}", 7, "no stage \"demo\""),
         ("{dataset: demo-scene}", "{}", 6, "input dataset is missing"),
         ("{dataset: demo-scene}", "{dataset: demo-scene, masks: ./m}", 7, "no input \"masks\""),
-        ("prep/train}", "prep/test}", 10, "no folder \"test\"; known: cameras, references, rehearsal, train, train-cameras, truth"),
+        (
+            "prep/train}",
+            "prep/test}",
+            10,
+            "no folder \"test\"; known: cameras, references, rehearsal, train, train-cameras, truth",
+        ),
         ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
         ("{dataset: demo-scene}", "{dataset: render-depth}", 7, "takes dataset, but render-depth is views"),
         ("lr: 24", "lr: twenty", 8, "parameter lr"),
