@@ -83,7 +83,8 @@ weights = options.weights or options.data / "weights"
 def blocks(method: str, protocol: str, rays: int, sub_rays: int) -> dict:
     """The pipeline's blocks that a method needs besides those of pipeline.yaml; eval-METHOD scores it."""
     lr, scale = protocol.split("x")
-    plain = {"supersample": 1, "supervision": "average"}
+    average = {"supervision": "average", "rays": round(rays * protocols.AVERAGE_RAYS)}
+    plain = average | {"supersample": 1}
     cameras, truth = "prep/cameras", "prep/truth"
 
     def field(name: str, parameters: dict, scene: str = "prep/train") -> dict:
@@ -98,9 +99,9 @@ def blocks(method: str, protocol: str, rays: int, sub_rays: int) -> dict:
     if method == "nerf":
         return field(method, plain)
     if method == "nerf-epochs":
-        return field(method, plain | {"rays": rays // sub_rays})
+        return field(method, plain | {"rays": average["rays"] // sub_rays})
     if method == "ss":
-        return field(method, {"supervision": "average", "rays": round(rays * protocols.AVERAGE_RAYS)})
+        return field(method, average)
     if method == "hr":
         prep = {"like": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr": round(int(lr) * float(scale)), "scale": 1}}
         return {"prep-hr": prep} | field(method, plain, "prep-hr/train")
