@@ -38,10 +38,13 @@ else
 endif
 	cargo test --release --workspace --doc
 
-lint: setup ## rustfmt, clippy with and without libtorch; cargo-deny and typos where installed
+lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets; cargo-deny and typos where installed
 	cargo fmt --all --check
+	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
 	cargo clippy --release -p train-ss -p render-depth -p locate -p eval --no-default-features --all-targets -- -D warnings
+	@python3 tests/fuzz/seeds.py out/fuzz/seeds
+	$(IN_FUZZ) cargo clippy --release -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
 	@if command -v typos >/dev/null; then typos; else echo "typos is not installed: skipped"; fi
 
@@ -50,9 +53,10 @@ FUZZ_FLAGS := -Cpasses=sancov-module $(addprefix -Cllvm-args=-sanitizer-coverage
 FUZZ_HOST = $(shell rustc -vV | sed -n 's/^host: //p')
 FUZZ_TARGETS ?= colmap llff transforms picture field
 FUZZ_SECONDS ?= 60
+IN_FUZZ = cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz
 fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
-	@cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
+	@$(IN_FUZZ) RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
 	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target; \
 	  target/fuzz/$(FUZZ_HOST)/release/$$target -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=2048 -max_len=4096 \
 	    -artifact_prefix=out/fuzz/$$target- out/fuzz/corpus/$$target out/fuzz/seeds/$$target 2>&1 | tee out/fuzz/$$target.log | tail -3; \
@@ -76,7 +80,7 @@ sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE
 SCENES ?= lego chair
 PROTOCOLS ?= 100x2 100x4 200x2 200x4
 SUPERVISION ?= average kernel
-quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" SET="seed=1" OUT=FILE
+quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 (or ENLARGED=1) SET="seed=1" OUT=FILE
 	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) $(if $(ENLARGED),--enlarged) --set $(if $(RAYS),rays=$(RAYS)) $(SET) \
 	  --out $(or $(OUT),out/quality.json)

@@ -26,29 +26,28 @@ parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="
 parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
 options = parser.parse_args()
 
-# A cell's rows: what they are of, and what tells them apart.
+# A cell's rows: the target that adds each to those before it, what it is of, and what tells them apart.
 ROWS = [
-    ("", {"refined": False, "enlarged": False}),
-    (", refined", {"refined": True, "enlarged": False}),
-    (", refined, with enlarged photographs", {"refined": True, "enlarged": True}),
-]
-TARGETS = ["report", "refined", "enlarged"]
-COUNT = 3 if options.enlarged else 2 if options.refined else 1
+    ("report", "", {"refined": False, "enlarged": False}),
+    ("refined", ", refined", {"refined": True, "enlarged": False}),
+    ("enlarged", ", refined, with enlarged photographs", {"refined": True, "enlarged": True}),
+][: 3 if options.enlarged else 2 if options.refined else 1]
+TARGET = ROWS[-1][0]
 
 
 def cell(scene: str, protocol: str, supervision: str) -> list[dict]:
     page = options.out.parent / "quality" / "-".join([scene, protocol, supervision] + [options.split] * bool(options.split))
-    chosen = protocols.settings(protocol, supervision, refined=COUNT > 1)
+    chosen = protocols.settings(protocol, supervision, refined=TARGET != "report")
     chosen |= {"split": options.split} if options.split else {}
     chosen |= dict(setting.split("=", 1) for setting in options.set)
     settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
     weights = options.data / "weights"
     inputs = {"upsample.weights": weights} if options.enlarged and weights.is_dir() else {}
-    results = cells.run_target(TARGETS[COUNT - 1], options.nerf_sr, page, folder, settings, weights, inputs)
+    results = cells.run_target(TARGET, options.nerf_sr, page, folder, settings, weights, inputs)
     name = {"scene": scene, "protocol": protocol, "supervision": supervision}
     name |= {"split": options.split} if options.split else {}
-    return [name | kind | row for (_, kind), row in zip(ROWS, results)]
+    return [name | kind | row for (_, _, kind), row in zip(ROWS, results)]
 
 
 def line(name: str, protocol: str, views: str, row: dict) -> str:
@@ -69,7 +68,7 @@ for protocol in options.protocols:
 print("| LR × scale | scene | supervision | PSNR | SSIM | LPIPS | training | rendering | rays/s |")
 print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
 for protocol in options.protocols:
-    for supervision, (views, kind) in itertools.product(options.supervision, ROWS[:COUNT]):
+    for supervision, (_, views, kind) in itertools.product(options.supervision, ROWS):
         kind = {"protocol": protocol, "supervision": supervision} | kind
         mine = [row for row in rows if kind.items() <= row.items()]
         for row in mine:

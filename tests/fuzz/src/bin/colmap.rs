@@ -9,7 +9,7 @@ use libfuzzer_sys::fuzz_target;
 static FOLDERS: LazyLock<[Folder; 2]> = LazyLock::new(|| {
     let [binary, text] = [Folder::new(), Folder::new()];
     for (name, bytes) in colmap_model() {
-        binary.write(&format!("sparse/0/{name}"), &bytes);
+        binary.write(&format!("sparse/0/{name}"), bytes);
     }
     text.write("sparse/0/cameras.txt", b"1 PINHOLE 4 3 5 5 2 1.5\n");
     text.write("sparse/0/images.txt", b"1 1 0 0 0 0.1 0.2 1 1 a.png\n\n2 1 0 0 0 0.1 0.2 2 1 b.png\n\n");
