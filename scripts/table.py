@@ -85,47 +85,42 @@ def blocks(method: str, protocol: str, rays: int, sub_rays: int) -> dict:
     lr, scale = protocol.split("x")
     average = {"supervision": "average", "rays": round(rays * protocols.AVERAGE_RAYS)}
     plain = average | {"supersample": 1}
-    cameras, truth = "prep/cameras", "prep/truth"
+    # By the kernel, ours are pipeline.yaml's own.
+    views = {"kernel": "render-depth", "refine": "refine"}.get(method, f"views-{method}")
+    score = {f"eval-{method}": {"like": "eval", "inputs": {"views": views, "truth": "prep/truth"}}}
 
     def field(name: str, parameters: dict, scene: str = "prep/train") -> dict:
         # Plain NeRF has a ray a pixel in training and in rendering.
         rendering = {"sub_rays": 1} if name.startswith("nerf") else {}
         return {
             f"field-{name}": {"like": "train-ss", "inputs": {"scene": scene}, "parameters": parameters},
-            f"views-{name}": {"like": "render-depth", "inputs": {"field": f"field-{name}", "cameras": cameras}, "parameters": rendering},
-            f"eval-{name}": {"like": "eval", "inputs": {"views": f"views-{name}", "truth": truth}},
+            f"views-{name}": {"like": "render-depth", "inputs": {"field": f"field-{name}", "cameras": "prep/cameras"}, "parameters": rendering},
         }
 
     if method == "nerf":
-        return field(method, plain)
+        return score | field(method, plain)
     if method == "nerf-epochs":
-        return field(method, plain | {"rays": average["rays"] // sub_rays})
+        return score | field(method, plain | {"rays": average["rays"] // sub_rays})
     if method == "ss":
-        return field(method, average)
+        return score | field(method, average)
     if method == "hr":
         prep = {"like": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr": round(int(lr) * float(scale)), "scale": 1}}
-        return {"prep-hr": prep} | field(method, plain, "prep-hr/train")
+        return score | {"prep-hr": prep} | field(method, plain, "prep-hr/train")
     if method in ("mlp", "mlp-nerf"):
         paper = {"field": "mlp", "rays": options.mlp_rays, "members": 1, "supervision": "average"}
-        return field(method, paper | {"supersample": 1 if method == "mlp-nerf" else 2})
+        return score | field(method, paper | {"supersample": 1 if method == "mlp-nerf" else 2})
     if method in ("bicubic", *NETWORKS):
-        low = {"like": "render-depth", "inputs": {"field": "field-nerf", "cameras": cameras}}
+        low = {"like": "render-depth", "inputs": {"field": "field-nerf", "cameras": "prep/cameras"}}
         low["parameters"] = {"size": int(lr), "sub_rays": 1}
-        enlarged = {"run": "upsample", "inputs": {"views": "views-low", "cameras": cameras}, "parameters": {"method": method}}
+        enlarged = {"run": "upsample", "inputs": {"views": "views-low", "cameras": "prep/cameras"}, "parameters": {"method": method}}
         if method in NETWORKS:
             enlarged["inputs"]["weights"] = f"{weights.resolve()}"
-        return field("nerf", plain) | {
-            "views-low": low,
-            f"views-{method}": enlarged,
-            f"eval-{method}": {"like": "eval", "inputs": {"views": f"views-{method}", "truth": truth}},
-        }
-    return {}
+        return score | field("nerf", plain) | {"views-low": low, views: enlarged}
+    return score
 
 
 # Blocks that others are like, which therefore may be meant without being run themselves.
 OF = {"supervision": "train-ss", "rays": "train-ss", "members": "train-ss", "sub_rays": "render-depth"}
-# The blocks of pipeline.yaml that score these.
-SCORED_BY = {"kernel": "eval", "refine": "eval-refined"}
 
 
 def missing(method: str, protocol: str) -> str | None:
@@ -163,8 +158,7 @@ def cell(scene: str, protocol: str) -> list[dict]:
     made: dict = {}
     for method in run:
         made |= blocks(method, protocol, int(chosen["rays"]), sub_rays)
-    scored = {method: SCORED_BY.get(method, f"eval-{method}") for method in run}
-    inputs = {"run": scored[run[0]]} | {method: scored[method] for method in run[1:]}
+    inputs = {"run" if method == run[0] else method: f"eval-{method}" for method in run}
     shown = {"compare": options.view} if options.view else {}
     shown |= {"crop": options.crop} if options.crop else {}
     made["table"] = {"run": "report", "inputs": inputs, "parameters": shown}
@@ -186,13 +180,13 @@ def cell(scene: str, protocol: str) -> list[dict]:
     rows = []
     for method in options.methods:
         row = {"scene": scene, "protocol": protocol, "method": method}
-        if method not in scored:
+        if method not in run:
             rows.append(row | {"missing": missing(method, protocol)})
             continue
-        result = results[scored[method]]
+        result = results[f"eval-{method}"]
         train, render = seconds(result["stages"])
         used.update({stage["folder"]: stage["seconds"] for stage in result["stages"].values()})
-        metrics = json.loads((pathlib.Path(result["stages"][scored[method]]["folder"]) / "metrics.json").read_text())
+        metrics = json.loads((pathlib.Path(result["stages"][f"eval-{method}"]["folder"]) / "metrics.json").read_text())
         conventions.update(metrics["conventions"])
         rows.append(row | {name: result["mean"].get(name) for name in METRICS} | {"train_s": train, "render_s": render})
     return rows

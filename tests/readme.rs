@@ -1,12 +1,20 @@
-//! The README tells the truth: its commands parse and plan, its pipeline blocks are valid, the files it names are there.
+//! The README and what it leads to tell the truth: commands parse and plan, pipeline blocks are valid, the files they name are there.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::path::Path;
+
 use common::Project;
 
-fn readme() -> String {
-    std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).unwrap()
+const DOCUMENTS: [&str; 2] = ["README.md", "docs/results.md"];
+
+fn read(path: impl AsRef<Path>) -> String {
+    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+}
+
+fn documents() -> String {
+    DOCUMENTS.map(read).concat()
 }
 
 /// Contents of the fenced blocks of a language.
@@ -17,8 +25,7 @@ fn blocks(text: &str, language: &str) -> Vec<String> {
 
 #[test]
 fn every_command_plans() {
-    let project =
-        Project::new(&std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("pipeline.yaml")).unwrap());
+    let project = Project::new(&read("pipeline.yaml"));
     // Folders that the examples name.
     for folder in ["my-scene", "my-photographs", "weights", "../shared/data/nerf_synthetic/lego", "../shared/data/weights"] {
         let target = project.path("project").join(folder);
@@ -27,7 +34,7 @@ fn every_command_plans() {
     }
     std::fs::rename(project.path("pipeline.yaml"), project.path("project/pipeline.yaml")).unwrap();
     let mut planned = 0;
-    for block in blocks(&readme(), "sh") {
+    for block in blocks(&documents(), "sh") {
         let joined = block.replace("\\\n", " ");
         for line in joined.lines().map(|l| l.split('#').next().unwrap().trim()) {
             let Some(rest) = line.strip_prefix("nerf-sr ").or_else(|| line.strip_prefix("target/release/nerf-sr ")) else {
@@ -59,8 +66,8 @@ fn every_command_plans() {
 
 #[test]
 fn every_make_target_exists() {
-    let makefile = std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("Makefile")).unwrap();
-    for block in blocks(&readme(), "sh") {
+    let makefile = read("Makefile");
+    for block in blocks(&documents(), "sh") {
         for line in block.lines().filter_map(|l| l.trim().strip_prefix("make ")) {
             let target = line.split_whitespace().next().unwrap();
             assert!(makefile.contains(&format!("\n{target}:")), "no make target {target}");
@@ -70,12 +77,12 @@ fn every_make_target_exists() {
 
 #[test]
 fn pipeline_blocks_are_valid() {
-    let blocks = blocks(&readme(), "yaml");
+    let blocks = blocks(&documents(), "yaml");
     assert!(!blocks.is_empty());
     for block in blocks {
         let project = Project::tiny();
         std::fs::create_dir(project.path("scripts")).unwrap();
-        let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
         std::fs::copy(script, project.path("scripts/example-eval.py")).unwrap();
         // Each block replaces the stage of its name.
         let name = block.lines().next().unwrap().trim().trim_end_matches(':').to_owned();
@@ -91,9 +98,10 @@ fn pipeline_blocks_are_valid() {
 
 #[test]
 fn links_lead_somewhere() {
-    let text = readme();
-    for target in text.split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(target);
-        assert!(path.exists(), "{target} is not there");
+    for document in DOCUMENTS {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(document).parent().unwrap().to_owned();
+        for target in read(document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
+            assert!(folder.join(target).exists(), "{document}: {target} is not there");
+        }
     }
 }

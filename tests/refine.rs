@@ -87,7 +87,7 @@ fn refined_views_stand_beside_rendered_ones() {
     let run = project.ok(&["run", "refined"]);
     assert!(run.contains("out/refined/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/refined/index.html")).unwrap();
-    assert!(page.contains("Views · eval-refined") && page.contains("Views · eval<"), "the page lacks one of both");
+    assert!(page.contains("Views · refined") && page.contains("Views · eval<"), "the page lacks one of both");
     let rows: serde_json::Value =
         serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
     let stages: Vec<&str> = rows.as_array().unwrap().iter().map(|r| r["stage"].as_str().unwrap()).collect();

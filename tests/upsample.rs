@@ -112,7 +112,7 @@ fn the_table_has_every_method_side_by_side() {
     let lines = std::fs::read_to_string(project.path("out/table.csv")).unwrap();
     assert_eq!(lines.lines().count(), 1 + methods.len());
     let page = std::fs::read_to_string(project.path("out/table/demo-24x2/table/index.html")).unwrap();
-    assert!(page.contains("Side by side") && page.contains("alt=\"eval-bicubic"), "the page compares nothing");
+    assert!(page.contains("Side by side") && page.contains("alt=\"bicubic"), "the page compares nothing");
     assert!(std::fs::read_to_string(project.path("out/table.html")).unwrap().contains("table/demo-24x2/table/index.html"));
     // Again: all is there.
     let again = project.script("table.py", &arguments.concat());

@@ -113,14 +113,15 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     }
 }
 
-/// What tells a point from the others: its values in the sweep and, where several blocks score, whose scores they are.
+/// What tells a point from the others: its values in the sweep and, where several blocks score, whose scores they are (`eval-refined`: refined).
 pub(crate) fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
     let (stage, values) = (point.node.stage.as_str(), point.node.point.as_str());
+    let whose = stage.strip_prefix("eval-").unwrap_or(stage);
     match (points.iter().any(|p| p.node.stage != stage), values) {
         (false, "") => "default".to_owned(),
         (false, values) => values.to_owned(),
-        (true, "") => stage.to_owned(),
-        (true, values) => format!("{stage}, {values}"),
+        (true, "") => whose.to_owned(),
+        (true, values) => format!("{whose}, {values}"),
     }
 }
 
