@@ -36,9 +36,9 @@ PARTS = [
 # The same of the paper's network, with or without the perceptual loss; and its size, unless --set says another.
 PAPER_PARTS = [
     ("paper's network", [], True),
+    ("patches side by side", ["refine-paper.overlap=0"], True),
     ("L1 alone, no perceptual loss", [], False),
     ("one reference patch", ["train-paper.patches=1"], True),
-    ("patches side by side", ["refine-paper.overlap=0"], True),
 ]
 PAPER_SIZE = {"train-paper.channels": 32, "train-paper.batch": 8}
 
