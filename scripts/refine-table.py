@@ -33,10 +33,10 @@ def cell(scene: str, protocol: str, references: int) -> list[dict]:
     chosen = protocols.settings(protocol, "kernel", refined=True)
     chosen |= {"prep.references": max(options.references)}
     chosen |= {f"{stage}.references": references for stage in ("train-joined", "train-referenced", "refine-referenced")}
-    # Half of what the field has, so that all that references need takes less time than the field.
-    chosen |= {"train-joined.rays": chosen["rays"] // 2}
     chosen |= {"split": options.split} if options.split else {}
-    chosen |= dict(setting.split("=", 1) for setting in options.set)
+    given = dict(setting.split("=", 1) for setting in options.set)
+    # Half of what the field has, so that all that references need takes less time than the field.
+    chosen |= {"train-joined.rays": int(given.get("rays", chosen["rays"])) // 2} | given
     settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
     results = cells.results("referenced", options.nerf_sr, page, folder, settings, options.data / "weights")

@@ -380,6 +380,7 @@ fn tables_have_rendered_and_refined_rows() {
     let made = project.script("refine-table.py", &[&table[..], &more].concat());
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| 24x2 | demo | refine | 2 |"), "{}", made.stdout);
+    assert!(made.stdout.contains("train-joined.rays=30000"), "half of what is set: {}", made.stdout);
     let read =
         |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
     let rows: Vec<(String, u64)> = read("out/table.json")
