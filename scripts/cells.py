@@ -64,7 +64,7 @@ def figures(row: dict) -> dict:
         "ssim": row["mean"]["ssim"],
         "lpips": row["mean"].get("lpips"),
         "train_s": seconds(row, "train-ss", "rehearsal-field", "rehearsal-views", "train-refine", "train-joined", "train-referenced"),
-        "render_s": seconds(row, "render-depth", "referenced-views", "refine", "refine-referenced", "upsample", "refine-enlarged"),
+        "render_s": seconds(row, "render-depth", "joined-views", "refine", "refine-referenced", "upsample", "refine-enlarged"),
         "refine_s": seconds(row, "refine", "refine-referenced", "upsample", "refine-enlarged"),
         "views": row["views"],
         "rays_per_s": log["rays"] / train["seconds"],

@@ -45,15 +45,13 @@ def cell(scene: str, protocol: str, references: int) -> list[dict]:
     near = views_near_references(pathlib.Path(results[0]["stages"]["prep"]["folder"]))
     kinds = [("ss", 0, "render_s"), ("refine", 0, "refine_s"), ("refine", references, "refine_s")]
     rows = []
-    # What views by two fields take more than those by one counts as refining.
-    second = max(0, cells.seconds(results[-1], "referenced-views") - cells.seconds(results[0], "render-depth"))
     for (method, count, spent), result in zip(kinds, results):
         row, views = cells.figures(result), cells.view_psnr(result)
         name = {"scene": scene, "protocol": protocol, "method": method, "references": count}
         scores = {key: row[key] for key in ("psnr", "ssim", "lpips")}
         scores |= {"near_views": len(near), "near_psnr": sum(views[view] for view in near) / len(near) if near else None}
         scores |= {"least_gain": min(views[view] - rendered[view] for view in views)}
-        rows.append(name | scores | {"seconds_per_view": (row[spent] + (second if count else 0)) / row["views"]})
+        rows.append(name | scores | {"seconds_per_view": row[spent] / row["views"]})
     return rows
 
 

@@ -35,6 +35,12 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     }
     assert_eq!(manifest(&one), manifest(&stopped));
 
+    // What goes on from it isn't it.
+    let (on, inputs) = (project.path("on"), [("scene", train.as_path()), ("field", &one)]);
+    assert_eq!(stage("train-ss", &PARAMS.replace("40000", "2000"), &inputs, &on, &[]).code, 0);
+    let weights = |folder: &std::path::Path| std::fs::read(folder.join("field-0.safetensors")).unwrap();
+    assert!(weights(&on) != weights(&one));
+
     // `render-depth` doesn't know which field it has.
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
     let rendered = stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);

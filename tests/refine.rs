@@ -39,10 +39,10 @@ const REFINED: &str = "
     inputs: {run: eval, refined: eval-refined, enlarged: eval-enlarged}
   train-joined:
     like: train-ss
-    inputs: {scene: prep/train, references: prep/references}
-  referenced-views:
+    inputs: {scene: prep/train, references: prep/references, field: train-ss}
+  joined-views:
     like: render-depth
-    inputs: {field: train-ss, beside: train-joined, cameras: prep/cameras}
+    inputs: {field: train-joined, cameras: prep/cameras}
   reference-views:
     like: render-depth
     inputs: {field: train-ss, cameras: prep/references}
@@ -52,7 +52,7 @@ const REFINED: &str = "
     parameters: {references: 2}
   refine-referenced:
     like: refine
-    inputs: {views: referenced-views, refiner: train-referenced, references: prep/references, reference-views: reference-views}
+    inputs: {views: joined-views, refiner: train-referenced, references: prep/references, reference-views: reference-views}
   eval-referenced:
     like: eval
     inputs: {views: refine-referenced, truth: prep/truth}
@@ -234,7 +234,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
-    let (views, refiner) = (folder("referenced-views"), folder("train-referenced"));
+    let (views, refiner) = (folder("joined-views"), folder("train-referenced"));
     let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
         let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
@@ -318,7 +318,7 @@ fn bad_references_do_no_harm() {
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner, prep, reference_views) =
-        (folder("referenced-views"), folder("train-referenced"), folder("prep"), folder("reference-views"));
+        (folder("joined-views"), folder("train-referenced"), folder("prep"), folder("reference-views"));
     println!("{}", project.json("train-referenced", "refiner.json", &target));
     let references = prep.join("references");
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
@@ -430,6 +430,15 @@ fn references_join_a_training() {
   eval-joined:
     like: eval
     inputs: {views: joined-views, truth: prep/truth}
+  train-on:
+    like: train-ss
+    inputs: {scene: prep/train, references: prep/references, field: train-ss}
+  on-views:
+    like: render-depth
+    inputs: {field: train-on, cameras: prep/cameras}
+  eval-on:
+    like: eval
+    inputs: {views: on-views, truth: prep/truth}
 ";
     project.write("pipeline.yaml", &(text + joined));
     let arguments = ["eval", "eval-joined", "-p", "prep.references=6", "-p", "train-ss.rays=200000"];
@@ -440,11 +449,50 @@ fn references_join_a_training() {
     };
     println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
+    // Half as many rays do, where the training goes on from what LR pictures gave. Few rays, or one reference alone, lose nothing of that.
+    let on = |rays: &str, references: &str| {
+        let (rays, references) = (format!("train-on.rays={rays}"), format!("train-on.references={references}"));
+        let more = ["-p", "prep.references=6", "-p", "train-ss.rays=200000", "-p", &rays, "-p", &references];
+        let arguments = [&["eval-on"], &more[..]].concat();
+        project.ok(&[&["run"], &arguments[..]].concat());
+        let on = project.json("eval-on", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
+        println!("{on:.2} dB, {rays}, {references}");
+        on
+    };
+    assert!(on("100000", "6") > psnr("eval") + 0.2);
+    assert!(on("8000", "6") > psnr("eval") - 0.02);
+    assert!(on("100000", "1") > psnr("eval") - 0.02);
     // None of them, and all is as without.
     let none = [&arguments[..], &["-p", "train-joined.references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
     let weights = |stage: &str| std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap();
     assert!(weights("train-joined") == weights("train-ss"));
+}
+
+/// Only a field that the same parameters give of the same scene can be gone on from.
+#[test]
+fn other_fields_are_not_gone_on_from() {
+    let project = Project::tiny();
+    project.ok(&["run", "train-ss"]);
+    let folder = |stage: &str| project.artifact(stage, &["train-ss"]);
+    let (scene, field) = (folder("prep").join("train"), folder("train-ss"));
+    let file = std::fs::read_to_string(field.join("field.json")).unwrap();
+    let fails = |parameters: &str, field: &Path, words: &[&str]| {
+        stage("train-ss", parameters, &[("scene", scene.as_path()), ("field", field)], &project.path("no"), &[]).fails(3, words);
+        assert!(!project.path("no").exists());
+    };
+    fails("{}", &field, &["input field: it is made of something else than the parameters ask for"]);
+    let with = |name: &str, file: &str| {
+        let field = changed(&project, name, &field, "none", &|_| ());
+        std::fs::write(field.join("field.json"), file).unwrap();
+        field
+    };
+    let own = r#"{"rays": 8000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 128}"#;
+    fails(own, &with("black", &file.replace("\"white\"", "\"black\"")), &["input field: it has another background"]);
+    fails(own, &with("far", &file.replace("\"far\": ", "\"far\": 1")), &["input field: it lies elsewhere"]);
+    let cut = with("cut", &file);
+    std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
+    fails(own, &cut, &["input field", "field-0.safetensors"]);
 }
 
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.

@@ -43,7 +43,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { strength: None, references: None, turns: 8, overlap: OVERLAP as u32 }
+        Self { strength: None, references: None, turns: 4, overlap: OVERLAP as u32 }
     }
 }
 

@@ -1,7 +1,7 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
 //! A field may have several members, trained apart; what they render is averaged: each errs in its own way where the pictures
-//! leave it open. So are members of a second field (input `beside`), one that references joined, say.
+//! leave it open.
 //!
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
@@ -62,7 +62,6 @@ impl Stage for RenderDepth {
         let cameras = ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
-            ("beside", Input::optional(&["field"], "another of the same scene; what both render is averaged")),
             ("cameras", Input::required(&cameras, "folder with views.json: the cameras to render")),
         ]
     }
@@ -72,16 +71,7 @@ impl Stage for RenderDepth {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        let input = context.input("field")?;
-        let Members { file, mut fields } = Members::read(input, &context.device)?;
-        if let Some(beside) = context.optional_input("beside") {
-            let other = Members::read(beside, &context.device)?;
-            if other.file.background != file.background {
-                let message = "input beside: another background than the field's; train both from one prep";
-                return Err(Failure::BadInput(message.to_owned()).into());
-            }
-            fields.extend(other.fields);
-        }
+        let Members { file, fields } = Members::read(context.input("field")?, &context.device)?;
         let cameras = Views::read(context.input("cameras")?)?;
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();

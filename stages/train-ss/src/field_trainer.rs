@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::Failure;
+use artifact::{Failure, FailureExt as _};
 use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
@@ -39,10 +39,11 @@ impl std::fmt::Display for Collapsed {
 
 impl std::error::Error for Collapsed {}
 
-/// A training that hasn't begun. `hull` are 128³ cells that alone may hold something; `epoch` counts the rays of all pixels.
+/// A training that hasn't begun, from fog or from weights that another training wrote (`from`). `hull` are 128³ cells that alone may hold
+/// something; `epoch` counts the rays of all pixels.
 pub(crate) fn start(
     params: &Params,
-    model: FieldModel,
+    (model, from): (FieldModel, Option<&Path>),
     bounds: Bounds,
     device: &str,
     hull: Option<Vec<u8>>,
@@ -51,7 +52,10 @@ pub(crate) fn start(
     let rays = params.rays(epoch);
     match model {
         FieldModel::Grid(architecture) => {
-            let field = Field::new(architecture, bounds, params.seed);
+            let field = match from {
+                Some(weights) => Field::read(weights, architecture, bounds).bad_input("input field")?,
+                None => Field::new(architecture, bounds, params.seed),
+            };
             if device != "cpu" {
                 return start_grid_on(device, &field, params.grid_training(rays), hull);
             }
@@ -69,7 +73,10 @@ pub(crate) fn start(
             }
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
-            let field = torch_field::Mlp::new(architecture, bounds, params.seed, device)?;
+            let field = match from {
+                Some(weights) => torch_field::Mlp::read(weights, architecture, bounds, device).bad_input("input field")?,
+                None => torch_field::Mlp::new(architecture, bounds, params.seed, device)?,
+            };
             Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(rays, epoch))?))
         }
         #[cfg(not(feature = "torch"))]
@@ -78,6 +85,28 @@ pub(crate) fn start(
             Err(Failure::Usage(message.to_owned()).into())
         }
     }
+}
+
+/// Makes trained weights the mean of those and of the ones that the training went on from: what either makes up evens out, as if both fields were rendered,
+/// and little is lost of what was known before.
+pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &Path) -> anyhow::Result<()> {
+    match model {
+        FieldModel::Grid(architecture) => {
+            let mut field = Field::read(trained, architecture, bounds)?;
+            field.average_with(&Field::read(from, architecture, bounds)?);
+            field.write(trained)?;
+        }
+        #[cfg(feature = "torch")]
+        FieldModel::Mlp(architecture) => {
+            let read = |path| anyhow::Ok(torch_field::Mlp::read(path, architecture, bounds, nets::device("cpu")?)?);
+            let field = read(trained)?;
+            field.average_with(&read(from)?)?;
+            field.write(trained)?;
+        }
+        #[cfg(not(feature = "torch"))]
+        FieldModel::Mlp(_) => {} // Nor could it be trained.
+    }
+    Ok(())
 }
 
 /// The same grid and the same training through libtorch.

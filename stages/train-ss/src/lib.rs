@@ -19,8 +19,10 @@ mod params;
 mod references;
 mod supervision;
 
+use std::path::PathBuf;
+
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{DEGRADATION_FILE, Degradation, Filter};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Intrinsics, Photograph, Space, Views};
@@ -107,6 +109,13 @@ impl Stage for TrainSs {
                 "references",
                 Input::optional(&["scene/references"], "HR pictures of some views, to be trained on beside the LR ones"),
             ),
+            (
+                "field",
+                Input::optional(
+                    &["field"],
+                    "a field that the same parameters gave of the same scene, to go on from; its weights' and the trained ones' mean is kept",
+                ),
+            ),
         ]
     }
 
@@ -120,20 +129,24 @@ impl Stage for TrainSs {
         let references = context.optional_input("references");
         let views = Views::read(input)?;
         let epoch = epoch(&views, params);
+        let begun = context.optional_input("field");
+        let params = if begun.is_some() { &params.going_on() } else { params };
         let params = &params.suited(&views.bounds.space, views.background, epoch);
         let model = match params.field {
             FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
+        let file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
+        let begun = begun.map(|input| Begun::read(input, &file)).transpose()?;
         let all = params.rays(epoch);
         let progress = context.progress("training", all);
         let mut log = TrainingLog::default();
         for index in 0..params.members {
-            let member = Member::new(context, params.member(index, all), model, index, log.rays)?;
+            let from = begun.as_ref().map(|begun| begun.member(index));
+            let member = Member::new(context, params.member(index, all), (model, from), index, log.rays)?;
             log.add(member.run(input, references, &views, &progress)?);
             progress.set(log.rays, "");
         }
-        let file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
         context.write_json(FIELD_FILE, &file)?;
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
@@ -143,6 +156,34 @@ impl Stage for TrainSs {
             log.steps,
             log.samples_per_ray
         ))
+    }
+}
+
+/// A field to go on from.
+struct Begun<'a> {
+    input: &'a GivenInput,
+    members: u32,
+}
+
+impl<'a> Begun<'a> {
+    /// Reads what it says of itself, which must be what is to be trained.
+    fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
+        let file: FieldFile = input.read_json(FIELD_FILE)?;
+        file.check().map_err(|reason| Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display())))?;
+        let differs = [
+            ("lies elsewhere; train both from one prep", file.bounds != wanted.bounds),
+            ("has another background; train both from one prep", file.background != wanted.background),
+            ("is made of something else than the parameters ask for; give those it was trained with", file.field != wanted.field),
+        ];
+        match differs.iter().find(|(_, differs)| *differs) {
+            Some((what, _)) => Err(Failure::BadInput(format!("input field: it {what}")).into()),
+            None => Ok(Self { input, members: file.members }),
+        }
+    }
+
+    /// Weights of a member; where it has fewer of them, they are gone on from in turn.
+    fn member(&self, index: u32) -> PathBuf {
+        self.input.path(&FieldFile::member(index % self.members))
     }
 }
 

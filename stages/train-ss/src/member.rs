@@ -6,7 +6,7 @@ use radiance::{FieldFile, FieldModel};
 use scene::Views;
 
 use crate::checkpoint::Checkpoints;
-use crate::field_trainer::{Collapsed, start};
+use crate::field_trainer::{Collapsed, average, start};
 use crate::{Params, Photographs, TrainingLog, epoch, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
@@ -14,6 +14,8 @@ pub(crate) struct Member<'a> {
     context: &'a Context,
     params: Params,
     model: FieldModel,
+    /// Weights to go on from.
+    from: Option<PathBuf>,
     /// Where its weights go.
     output: PathBuf,
     work: Option<PathBuf>,
@@ -26,10 +28,16 @@ const DONE_WEIGHTS: &str = "field.safetensors";
 const DONE_LOG: &str = "training.json";
 
 impl<'a> Member<'a> {
-    pub(crate) fn new(context: &'a Context, params: Params, model: FieldModel, index: u32, before: u64) -> anyhow::Result<Self> {
+    pub(crate) fn new(
+        context: &'a Context,
+        params: Params,
+        (model, from): (FieldModel, Option<PathBuf>),
+        index: u32,
+        before: u64,
+    ) -> anyhow::Result<Self> {
         let output = context.output_path(&FieldFile::member(index))?;
         let work = context.work().map(|w| w.join(format!("member-{index}")));
-        Ok(Self { context, params, model, output, work, before })
+        Ok(Self { context, params, model, from, output, work, before })
     }
 
     /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
@@ -91,7 +99,7 @@ impl<'a> Member<'a> {
             return Err(Failure::Usage(message).into());
         }
         let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
-        let mut trainer = start(params, self.model, views.bounds, &context.device, hull, epoch)?;
+        let mut trainer = start(params, (self.model, self.from.as_deref()), views.bounds, &context.device, hull, epoch)?;
         if let Some(work) = work {
             std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
         }
@@ -124,6 +132,9 @@ impl<'a> Member<'a> {
         log.exposures = supervision.exposures().to_vec();
         log.poses = refined.iter().map(|camera| camera.camera_to_world).collect();
         trainer.finish(&self.output)?;
+        if let Some(from) = &self.from {
+            average(self.model, views.bounds, from, &self.output).context("cannot average the weights")?;
+        }
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;
             artifact::write_json(&work.join(DONE_LOG), &log)?;

@@ -271,6 +271,11 @@ impl Params {
         }
     }
 
+    /// How to go on from a field that the same parameters gave: its rough shape is known.
+    pub fn going_on(&self) -> Self {
+        Self { coarse: Some(0.0), crop_steps: Some(0), ..self.clone() }
+    }
+
     /// What is said for a field, or that field's own default.
     fn or<T>(&self, given: Option<T>, grid: T, mlp: T) -> T {
         given.unwrap_or(match self.field {

@@ -258,6 +258,13 @@ impl Field {
         self.layers.all().iter().map(|l| l.inputs * l.outputs).sum()
     }
 
+    /// Makes every parameter the mean of its own and of another field's of the same architecture. Where one was trained on from the other, that is nearly
+    /// what the mean of both's colours is (Wortsman et al. 2022, "Robust fine-tuning"). Where there may be something stays as it is.
+    pub fn average_with(&mut self, other: &Self) {
+        let own = self.grid.iter_mut().chain(&mut self.network);
+        own.zip(other.grid.iter().chain(&other.network)).for_each(|(own, other)| *own = 0.5 * (*own + other));
+    }
+
     /// Whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())
@@ -333,4 +340,22 @@ pub(crate) fn read_u8(tensors: &SafeTensors<'_>, name: &str, len: usize) -> Resu
         return Err(format!("tensor {name}: {:?} {:?} where {len} u8 are expected", tensor.dtype(), tensor.shape()));
     }
     Ok(tensor.data().to_vec())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every parameter is the mean of both fields', and rays are stopped where the field's own were.
+    #[test]
+    fn fields_are_averaged() {
+        let architecture = Architecture { finest: 32, levels: 4, log2_entries: 10, steps: 64, ..Architecture::default() };
+        let [mut mean, own, other] = [3, 3, 4].map(|seed| Field::new(architecture, Bounds::default(), seed));
+        mean.occupancy.set(|cell| cell % 3 == 0);
+        mean.average_with(&other);
+        let all = |field: &Field| -> Vec<f32> { field.grid.iter().chain(&field.network).copied().collect() };
+        let expected = all(&own).into_iter().zip(all(&other)).map(|(own, other)| 0.5 * (own + other));
+        assert!(all(&mean).into_iter().eq(expected) && all(&own) != all(&other));
+        assert!(mean.occupancy.cells().all(|cell| cell % 3 == 0));
+    }
 }

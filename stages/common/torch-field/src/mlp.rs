@@ -138,6 +138,16 @@ impl Mlp {
         named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
     }
 
+    /// Makes every parameter the mean of its own and of another field's of the same architecture.
+    pub fn average_with(&self, other: &Self) -> Result<(), TorchFieldError> {
+        no_grad(|| {
+            for (mut own, other) in self.parameters().zip(other.parameters()) {
+                own.f_copy_(&own.f_add(&other)?.f_mul_scalar(0.5)?)?;
+            }
+            Ok(())
+        })
+    }
+
     /// Numbers in both networks.
     pub fn parameter_count(&self) -> usize {
         self.parameters().map(|p| p.numel()).sum()
@@ -319,5 +329,17 @@ mod tests {
         let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
         let away = field.render(&[ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0])]).unwrap()[0];
         assert_eq!((away.colour, away.opacity), ([0.1, 0.2, 0.3], 0.0));
+    }
+
+    /// Every number of both networks is the mean of both fields'.
+    #[test]
+    fn fields_are_averaged() {
+        let architecture = MlpArchitecture { depth: 5, width: 16, ..MlpArchitecture::default() };
+        let [a, b, mean] = [3, 4, 3].map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
+        mean.average_with(&b).unwrap();
+        for ((mean, a), b) in mean.parameters().zip(a.parameters()).zip(b.parameters()) {
+            let (mean, a, b) = (host(&mean).unwrap(), host(&a).unwrap(), host(&b).unwrap());
+            assert!(mean.iter().zip(a.iter().zip(&b)).all(|(m, (a, b))| (m - 0.5 * (a + b)).abs() < 1e-6));
+        }
     }
 }
