@@ -53,7 +53,11 @@ pub(crate) fn start(
     match model {
         FieldModel::Grid(architecture) => {
             let field = match from {
-                Some(weights) => Field::read(weights, architecture, bounds).bad_input("input field")?,
+                Some(weights) => {
+                    let mut field = Field::read(weights, architecture, bounds).bad_input("input field")?;
+                    field.limit_to_occupied();
+                    field
+                }
                 None => Field::new(architecture, bounds, params.seed),
             };
             if device != "cpu" {

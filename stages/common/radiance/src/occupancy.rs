@@ -70,7 +70,26 @@ impl Occupancy {
             let [x, y, z] = corner(cell);
             covered(2, z).any(|k| covered(1, y).any(|j| covered(0, x).any(|i| hull[i + GRID * (j + GRID * k)] != 0)))
         };
-        let mask: Vec<bool> = (0..CELLS).into_par_iter().map(kept).collect();
+        let mask = (0..CELLS).into_par_iter().map(kept).collect();
+        self.limit_to(mask);
+    }
+
+    /// Limits it to the cells that are occupied and those around them: for a training that goes on where the rest is known to be empty.
+    pub fn limit_to_occupied(&mut self) {
+        let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
+        let kept = |cell: usize| {
+            let [x, y, z] = corner(cell);
+            around(z).any(|k| around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k)))))
+        };
+        let mask = (0..CELLS).into_par_iter().map(kept).collect();
+        self.limit_to(mask);
+    }
+
+    /// Limits it to cells, besides what limits it already; all that is left may be occupied.
+    fn limit_to(&mut self, mut mask: Vec<bool>) {
+        if let Some(hull) = &self.hull {
+            mask.iter_mut().zip(hull).for_each(|(kept, hull)| *kept &= hull);
+        }
         self.set(|cell| mask[cell]);
         self.hull = Some(mask);
     }
@@ -272,6 +291,25 @@ mod tests {
             assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());
             assert!(found.iter().all(|t| expected.contains(t)));
         }
+    }
+
+    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is found elsewhere, and within a visual hull.
+    #[test]
+    fn going_on_stays_where_something_was() {
+        let mut occupancy = Occupancy::full();
+        let cell = |x: usize, y: usize, z: usize| x + GRID * (y + GRID * z);
+        let (inside, corner) = (cell(5, 60, 70), cell(0, GRID - 1, 0));
+        occupancy.set(|c| c == inside || c == corner);
+        occupancy.limit_to_occupied();
+        assert_eq!(occupancy.cells().count(), 27 + 8);
+        let mut hull = vec![1; CELLS];
+        hull[cell(6, 61, 71)] = 0;
+        occupancy.limit_to_hull(&Bounds::default(), &hull);
+        assert_eq!(occupancy.cells().count(), 26 + 8);
+        let all: Vec<u32> = (0..CELLS as u32).collect();
+        assert_eq!(occupancy.looks(EVERY).len(), 26 + 8);
+        occupancy.learn(&all, &vec![1e3; CELLS], 0.003);
+        assert_eq!(occupancy.cells().count(), 26 + 8);
     }
 
     #[test]
