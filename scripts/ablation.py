@@ -40,6 +40,7 @@ PARTS = [
     ("256 steps along the diagonal", ["train-ss.steps=256"]),
     ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
     ("distortion loss 0.01", ["distortion=0.01"]),
+    ("no haze loss", ["haze=0"]),
     ("all levels' rates alike", ["level_rate=1"]),
     ("no weight decay", ["network_decay=0"]),
     ("alpha supervision, averaged", ["background=alpha"]),

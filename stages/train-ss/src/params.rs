@@ -77,6 +77,10 @@ pub struct Params {
     /// in NDC with nothing behind the scene (an opaque background), which else becomes fog; 0 elsewhere, where it costs detail.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub distortion: Option<f64>,
+    /// `grid`: weight of the haze loss, the opacity of what has the background's colour: before that colour no picture tells whether it is
+    /// there, and from elsewhere it hides the scene. Without it: 0.001 before white or black, 0 before what has no colour of its own.
+    #[schemars(range(min = 0.0, max = 10.0))]
+    pub haze: Option<f64>,
     /// `grid`: weight decay of the networks.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub network_decay: f64,
@@ -157,6 +161,7 @@ impl Default for Params {
             schedule: RateSchedule::Code,
             averaging: 0.97,
             distortion: None,
+            haze: None,
             network_decay: 1e-6,
             levels: grid.levels,
             coarsest: grid.coarsest,
@@ -204,6 +209,8 @@ const EPOCHS: u64 = 20;
 const EPOCHS_IN_NDC: u64 = 30;
 /// Weight of the distortion loss in NDC with nothing behind the scene.
 const DISTORTION_IN_NDC: f64 = 0.004;
+/// Weight of the haze loss before a background that has one colour.
+const HAZE: f64 = 0.001;
 
 impl Params {
     /// Fails on parameters that can't be meant together.
@@ -237,6 +244,7 @@ impl Params {
                 ("network_rate", self.network_rate != default.network_rate),
                 ("averaging", self.averaging != default.averaging),
                 ("distortion", self.distortion != default.distortion),
+                ("haze", self.haze != default.haze),
                 ("network_decay", self.network_decay != default.network_decay),
                 ("levels", self.levels != default.levels),
                 ("coarsest", self.coarsest != default.coarsest),
@@ -255,7 +263,7 @@ impl Params {
     }
 
     /// With what suits a scene where nothing else is said: the paper's field is trained otherwise on photographs in NDC, as published, and a grid
-    /// is kept from becoming fog there. `epoch` counts the rays of all pixels.
+    /// is kept from becoming fog, there and before one colour. `epoch` counts the rays of all pixels.
     pub fn suited(&self, space: &Space, background: Background, epoch: u64) -> Self {
         match self.field {
             FieldKind::Mlp if matches!(space, Space::Ndc(_)) => Self {
@@ -266,6 +274,9 @@ impl Params {
             },
             FieldKind::Grid if matches!(space, Space::Ndc(_)) && background == Background::Opaque => {
                 Self { distortion: self.distortion.or(Some(DISTORTION_IN_NDC)), ..self.clone() }
+            }
+            FieldKind::Grid if matches!(background, Background::White | Background::Black) => {
+                Self { haze: self.haze.or(Some(HAZE)), ..self.clone() }
             }
             _ => self.clone(),
         }
@@ -378,6 +389,7 @@ impl Params {
             warm_up: 100,
             averaging: self.averaging as f32,
             distortion: self.distortion.unwrap_or(0.0) as f32,
+            haze: self.haze.unwrap_or(0.0) as f32,
             network_decay: self.network_decay as f32,
             seed: self.seed,
         }
@@ -430,8 +442,12 @@ mod tests {
 
         let grid = Params::default();
         assert!(grid.suited(&ndc, Background::Opaque, 100).distortion > Some(0.0));
-        for (space, background) in [(&ndc, Background::White), (&Space::Contraction, Background::Opaque)] {
+        for (space, background) in [(&Space::Box, Background::Alpha), (&Space::Contraction, Background::Opaque)] {
             assert_eq!(grid.suited(space, background, 100), grid);
+        }
+        for (space, background) in [(&ndc, Background::White), (&Space::Box, Background::Black)] {
+            let suited = grid.suited(space, background, 100);
+            assert!(suited.haze > Some(0.0) && Params { haze: None, ..suited } == grid);
         }
         // No more cells along z there than there are samples.
         let cells = |params: &Params, space: &Space| params.grid(340.0, space).finest_z;

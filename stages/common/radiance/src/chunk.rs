@@ -1,6 +1,8 @@
 //! A few rays at a time through the whole field and back, in buffers that are reused: nothing is allocated once they have grown.
 
-use crate::composite::{MAX_RAW, add_distortion_gradients, optical_depth_gradients, optical_depths, weights};
+use crate::composite::{
+    MAX_RAW, Regularisers, add_distortion_gradients, likeness, optical_depth_gradients, optical_depths, weights,
+};
 use crate::field::{COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, encode};
 use crate::math::{exp, sigmoid};
@@ -287,7 +289,7 @@ impl Chunk {
         }
     }
 
-    /// Goes back from each ray's colour gradient, and from the distortion loss times `distortion`: adds to the networks' partial sums
+    /// Goes back from each ray's colour gradient, and from the distortion and haze losses times their factors: adds to the networks' partial sums
     /// (`lanes`) and appends to `into`. `transposed` are the weights output by output.
     #[allow(clippy::too_many_arguments, reason = "what a pass reads and where it adds; a struct of them would have one use")]
     pub(crate) fn backward(
@@ -296,7 +298,7 @@ impl Chunk {
         transposed: &[f32],
         colour_gradients: &[[f32; 3]],
         backgrounds: &[[f32; 3]],
-        distortion: f32,
+        regularisers: Regularisers,
         lanes: &mut [f32],
         into: &mut FeatureGradients,
     ) {
@@ -336,8 +338,14 @@ impl Chunk {
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
             let len = places.len();
-            if distortion > 0.0 {
-                add_distortion_gradients(&t[..len], &weight[..len], field.step(), distortion, &mut shade[..len]);
+            if regularisers.haze > 0.0 {
+                for (shade, &k) in shade.iter_mut().zip(places) {
+                    let colour = std::array::from_fn(|c| self.colour[c * m + k as usize]);
+                    *shade = regularisers.haze.mul_add(likeness(colour, background), *shade);
+                }
+            }
+            if regularisers.distortion > 0.0 {
+                add_distortion_gradients(&t[..len], &weight[..len], field.step(), regularisers.distortion, &mut shade[..len]);
             }
             optical_depth_gradients(&shade[..len], &transmittance[..len], &weight[..len], behind, &mut by_depth[..len]);
             for (&k, &gradient) in places.iter().zip(&by_depth[..len]) {

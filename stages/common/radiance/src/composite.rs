@@ -37,6 +37,25 @@ pub(crate) fn optical_depth_gradients(shade: &[f32], transmittance: &[f32], weig
     }
 }
 
+/// Weights of what is asked of rays beside their colours, for one ray.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Regularisers {
+    /// Of the distortion loss.
+    pub(crate) distortion: f32,
+    /// Of the haze loss: Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which would make haze darker instead of thinner.
+    pub(crate) haze: f32,
+}
+
+/// How far apart colours at most are for matter to pass for the background.
+pub const LIKE_BACKGROUND: f32 = 0.1;
+
+/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether it is there no picture
+/// tells that sees it before the background alone.
+pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
+    let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();
+    (1.0 - squared / (LIKE_BACKGROUND * LIKE_BACKGROUND)).max(0.0)
+}
+
 /// Adds to `shade`, the gradient of a loss by each weight of a ray, that of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq.
 /// 15) times `factor`: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i². It draws a ray's weights together. `t` rises.
 pub(crate) fn add_distortion_gradients(t: &[f32], weight: &[f32], step: f32, factor: f32, shade: &mut [f32]) {

@@ -43,6 +43,7 @@ mod spherical;
 mod tally;
 mod trainer;
 
+pub use composite::LIKE_BACKGROUND;
 pub use field::{Architecture, Field, FieldError, Pixel, RayField};
 pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
 pub use occupancy::Occupancy;

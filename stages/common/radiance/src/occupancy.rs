@@ -304,7 +304,7 @@ mod tests {
         assert_eq!(occupancy.cells().count(), 27 + 8);
         let mut hull = vec![1; CELLS];
         hull[cell(6, 61, 71)] = 0;
-        occupancy.limit_to_hull(&Bounds::default(), &hull);
+        occupancy.limit_to_hull(&Bounds { max: [1.0; 3], ..Bounds::default() }, &hull);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
         assert_eq!(occupancy.looks(EVERY).len(), 26 + 8);

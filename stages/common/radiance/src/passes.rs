@@ -1,4 +1,5 @@
 use crate::chunk::{Chunk, FeatureGradients};
+use crate::composite::Regularisers;
 use crate::field::{CHUNK_RAYS, Field};
 use crate::ray::{Ray, clip};
 use crate::simd::LANES;
@@ -38,7 +39,15 @@ impl Passes {
             if backward {
                 let backgrounds = [[1.0; 3]; CHUNK_RAYS];
                 let gradients = [[1.0; 3]; CHUNK_RAYS];
-                self.chunk.backward(field, &self.transposed, &gradients, &backgrounds, 0.0, &mut self.lanes, &mut self.into);
+                self.chunk.backward(
+                    field,
+                    &self.transposed,
+                    &gradients,
+                    &backgrounds,
+                    Regularisers::default(),
+                    &mut self.lanes,
+                    &mut self.into,
+                );
             }
         }
         samples

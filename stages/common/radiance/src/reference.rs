@@ -3,6 +3,7 @@
 use scene::Bounds;
 
 use crate::chunk::{Chunk, FeatureGradients};
+use crate::composite::{Regularisers, likeness};
 use crate::field::{Architecture, COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
@@ -71,21 +72,26 @@ impl Judge<'_> {
         [0, 1, 2].map(|c| 1.0 / (1.0 + (-raw[c]).exp()))
     }
 
-    /// Colour of a ray over its background; samples whose number isn't in `kept` are dark, as in the fused pass.
-    fn ray(&self, ray: &Ray, samples: &[[f32; 3]], kept: &[bool]) -> [f64; 3] {
+    /// Weight and colour of a ray's samples, and the light that comes through; samples that aren't `kept` are dark, as in the fused pass.
+    fn shaded(&self, ray: &Ray, samples: &[[f32; 3]], kept: &[bool]) -> (Vec<(f64, [f64; 3])>, f64) {
         let step = f64::from(self.field.step());
-        let (mut depth, mut colour) = (0.0f64, [0.0; 3]);
+        let (mut depth, mut shaded) = (0.0f64, Vec::new());
         for (p, kept) in samples.iter().zip(kept) {
             let density = self.density(p.map(f64::from));
             let tau = density[0].exp() * step;
             if *kept {
-                let weight = (-depth).exp() * -(-tau).exp_m1();
-                let own = self.colour(&density, ray.direction);
-                (0..3).for_each(|c| colour[c] += weight * own[c]);
+                shaded.push(((-depth).exp() * -(-tau).exp_m1(), self.colour(&density, ray.direction)));
             }
             depth += tau;
         }
-        std::array::from_fn(|c| colour[c] + (-depth).exp() * f64::from(ray.background[c]))
+        (shaded, (-depth).exp())
+    }
+
+    /// Colour of a ray over its background.
+    fn ray(&self, ray: &Ray, samples: &[[f32; 3]], kept: &[bool]) -> [f64; 3] {
+        let (shaded, transmittance) = self.shaded(ray, samples, kept);
+        let sum = |c: usize| shaded.iter().map(|(weight, colour)| weight * colour[c]).sum::<f64>();
+        std::array::from_fn(|c| transmittance.mul_add(f64::from(ray.background[c]), sum(c)))
     }
 }
 
@@ -111,7 +117,7 @@ fn example() -> (Field, Vec<Ray>) {
 
 #[test]
 fn fused_passes_equal_the_plain_ones() {
-    let (field, rays) = example();
+    let (field, mut rays) = example();
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
     chunk.forward(&field, &clipped, &[0.5; 20]);
@@ -130,13 +136,33 @@ fn fused_passes_equal_the_plain_ones() {
     assert!(samples.iter().map(Vec::len).sum::<usize>() > 100);
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let mut judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
+    // Each ray's background is like one of its samples.
+    for (i, ray) in rays.iter_mut().enumerate() {
+        let (shaded, _) = judge.shaded(ray, &samples[i], &kept[i]);
+        if let Some((_, colour)) = shaded.get(shaded.len() / 2) {
+            ray.background = colour.map(|c| c as f32 + 0.02);
+        }
+    }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g.
+    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and haze, whose likeness to the background isn't learnt from.
+    let regularisers = Regularisers { haze: 0.3, ..Regularisers::default() };
+    let likenesses: Vec<Vec<f64>> = (0..rays.len())
+        .map(|i| {
+            let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);
+            shaded.iter().map(|(_, colour)| f64::from(likeness(colour.map(|c| c as f32), rays[i].background))).collect()
+        })
+        .collect();
+    let like = likenesses.iter().flatten().filter(|l| **l > 0.0).count();
+    println!("{like} samples of {} pass for the background", likenesses.iter().flatten().count());
+    assert!(like > 20);
     let mut draws = Draws::new(1, 1, 1);
     let g: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| draws.uniform() - 0.5)).collect();
     let loss = |judge: &Judge<'_>| -> f64 {
         let dot = |i: usize| -> f64 {
-            judge.ray(&rays[i], &samples[i], &kept[i]).iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum()
+            let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);
+            let haze: f64 = shaded.iter().zip(&likenesses[i]).map(|((weight, _), likeness)| weight * likeness).sum();
+            let colour = judge.ray(&rays[i], &samples[i], &kept[i]);
+            colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>() + f64::from(regularisers.haze) * haze
         };
         (0..rays.len()).map(dot).sum()
     };
@@ -153,7 +179,7 @@ fn fused_passes_equal_the_plain_ones() {
     let mut lanes = vec![0.0; field.network.len() * LANES];
     let mut features = FeatureGradients::default();
     let backgrounds: Vec<[f32; 3]> = rays.iter().map(|r| r.background).collect();
-    chunk.backward(&field, &transposed, &g, &backgrounds, 0.0, &mut lanes, &mut features);
+    chunk.backward(&field, &transposed, &g, &backgrounds, regularisers, &mut lanes, &mut features);
     let mut network = vec![0.0; field.network.len()];
     drain_lanes(&mut lanes, &mut network);
     let mut grid = vec![0.0f32; field.grid.len()];
@@ -238,8 +264,17 @@ fn every_family_renders_and_trains_to_equal_bits() {
         let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
         let mut lanes = vec![0.0; field.network.len() * LANES];
         let mut features = FeatureGradients::default();
-        let backgrounds = vec![[1.0; 3]; rays.len()];
-        chunk.backward(&field, &field.network, &vec![[0.3, -0.2, 0.1]; rays.len()], &backgrounds, 0.2, &mut lanes, &mut features);
+        let backgrounds = vec![[0.5; 3]; rays.len()];
+        let regularisers = Regularisers { distortion: 0.2, haze: 0.3 };
+        chunk.backward(
+            &field,
+            &field.network,
+            &vec![[0.3, -0.2, 0.1]; rays.len()],
+            &backgrounds,
+            regularisers,
+            &mut lanes,
+            &mut features,
+        );
         bits.extend(lanes.iter().map(|x| x.to_bits()));
         for (level, gradients) in field.levels.iter().zip(&features.levels) {
             let mut grid = vec![0.0f32; level.entries * FEATURES];

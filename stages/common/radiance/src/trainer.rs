@@ -6,6 +6,7 @@ use safetensors::SafeTensors;
 
 use crate::adam::{AdamStep, adam};
 use crate::chunk::{Chunk, FeatureGradients, densities};
+use crate::composite::Regularisers;
 use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
@@ -54,6 +55,8 @@ pub struct TrainingOptions {
     pub averaging: f32,
     /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision gives.
     pub distortion: f32,
+    /// Weight of the haze loss, the mean over all rays: opacity that has the background's colour.
+    pub haze: f32,
     /// Weight decay of the networks.
     pub network_decay: f32,
     /// Seed of everything that is drawn.
@@ -452,6 +455,8 @@ impl Shard {
         worker.lanes.resize(field.network.len() * LANES, 0.0);
         let chunk_groups = (CHUNK_RAYS / group).max(1);
         let scale = 1.0 / groups as f32;
+        let of_ray = |weight: f32| weight * scale / group as f32;
+        let regularisers = Regularisers { distortion: of_ray(options.distortion), haze: of_ray(options.haze) };
         let mut next = range.start;
         while next < range.end {
             let here = next..(next + chunk_groups).min(range.end);
@@ -486,12 +491,78 @@ impl Shard {
                 transposed,
                 &worker.gradients,
                 &worker.backgrounds,
-                options.distortion * scale / group as f32,
+                regularisers,
                 &mut worker.lanes,
                 &mut self.features,
             );
             next = here.end;
         }
         drain_lanes(&mut worker.lanes, &mut self.network);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Architecture;
+    use crate::random::Draws;
+    use scene::Bounds;
+
+    /// Rays through the cube, before black or white, that should all be white.
+    struct White {
+        background: f32,
+    }
+
+    impl Supervision for White {
+        fn rays_per_group(&self) -> usize {
+            1
+        }
+
+        fn cast(&self, group: u64, rays: &mut [Ray]) {
+            let mut draws = Draws::new(1, 2, group);
+            let [x, y] = [0, 1].map(|_| 1.6 * draws.uniform() - 0.8);
+            rays[0] = Ray { origin: [x, y, 4.0], direction: [0.0, 0.0, -1.0], background: [self.background; 3] };
+        }
+
+        fn judge(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+            gradients[0] = colours[0].map(|c| 2.0 * (c - 1.0));
+            colours[0].iter().map(|c| f64::from((c - 1.0) * (c - 1.0))).sum()
+        }
+    }
+
+    /// A white cloud before white is as good as nothing to the pictures, and stays; by the haze loss it goes.
+    #[test]
+    fn what_passes_for_the_background_goes() {
+        let architecture =
+            Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
+        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
+        let trained = |field: Field, background: f32, haze: f32| {
+            let options = TrainingOptions {
+                rays: 80 * 256,
+                batch: 256,
+                samples: 1 << 20,
+                rate: 1e-2,
+                level_rate: 0.8,
+                network_rate: 1e-2,
+                final_rate: 0.25,
+                warm_up: 5,
+                averaging: 0.0,
+                distortion: 0.0,
+                haze,
+                network_decay: 0.0,
+                seed: 9,
+            };
+            let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
+            while trainer.step(&mut white).unwrap().is_some() {}
+            let mut rays = [Ray::default(); 64];
+            (0..).zip(&mut rays).for_each(|(group, ray)| white.cast(group, std::slice::from_mut(ray)));
+            let field = trainer.finish();
+            let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
+            (field, opacity)
+        };
+        let (cloud, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0);
+        let ((_, without), (_, with)) = (trained(cloud.clone(), 1.0, 0.0), trained(cloud, 1.0, 1e-3));
+        println!("opacity {opacity} before black, then before white {without}, with the haze loss {with}");
+        assert!(opacity > 0.5 && without > 0.5 * opacity && with < 0.1 * without);
     }
 }

@@ -53,6 +53,10 @@ pub(crate) struct GridSeen {
     pub(crate) t: Tensor,
     /// n × steps, bool: samples that count.
     pub(crate) counted: Tensor,
+    /// Samples that got a colour: it (s × 3), their weights (s × 1), and whose ray's they are (s).
+    pub(crate) shaded_colour: Tensor,
+    pub(crate) shaded_weight: Tensor,
+    pub(crate) shaded_ray: Tensor,
     /// Samples where there may be something.
     pub(crate) samples: usize,
     courses: Courses,
@@ -243,15 +247,27 @@ impl TorchGrid {
 
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
         let at = kept.f_index_select(0, &shaded)?;
-        let basis = harmonics(&courses.view)?.f_index_select(0, &at.f_div_scalar_mode(count, "floor")?)?;
+        let ray = at.f_div_scalar_mode(count, "floor")?;
+        let basis = harmonics(&courses.view)?.f_index_select(0, &ray)?;
         let input = Tensor::f_cat(&[&raw.f_index_select(0, &shaded)?.f_narrow(1, 1, RAW - 1)?, &basis], -1)?;
         let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let colour = hidden.f_matmul(&self.layers[4])?.f_sigmoid()?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
         let blank = Tensor::f_zeros([n, 3], (Kind::Float, self.device))?;
-        let premultiplied = blank.f_index_add(0, &at.f_div_scalar_mode(count, "floor")?, &weight.f_mul(&colour)?)?;
+        let premultiplied = blank.f_index_add(0, &ray, &weight.f_mul(&colour)?)?;
         let transmittance = through.i((.., count - 1)).f_neg()?.f_exp()?;
-        Ok(GridSeen { premultiplied, transmittance, weights, t, counted, samples: kept.numel(), courses })
+        Ok(GridSeen {
+            premultiplied,
+            transmittance,
+            weights,
+            t,
+            counted,
+            shaded_colour: colour,
+            shaded_weight: weight,
+            shaded_ray: ray,
+            samples: kept.numel(),
+            courses,
+        })
     }
 
     /// Colour, opacity and depth of each ray, in pieces as large as memory allows.

@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{Field, Occupancy, StepReport, Supervision, Tally, TrainingOptions};
+use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervision, Tally, TrainingOptions};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -134,6 +134,10 @@ impl GridTrainer {
         if self.options.distortion > 0.0 {
             let share = f64::from(self.options.distortion) / (step.groups * step.group) as f64;
             towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
+        }
+        if self.options.haze > 0.0 {
+            let share = f64::from(self.options.haze) / (step.groups * step.group) as f64;
+            towards = towards.f_add(&haze(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
         }
         let gradients = if towards.requires_grad() {
             Tensor::f_run_backward(&[towards], &self.grid.parameters(), false, false)?
@@ -286,6 +290,15 @@ fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
+/// The haze loss, summed over all rays: Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours.
+fn haze(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
+    let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
+    let squared =
+        seen.shaded_colour.f_detach()?.f_sub(&behind)?.f_square()?.f_sum_dim_intlist([1i64].as_slice(), true, None::<Kind>)?;
+    let likeness = squared.f_mul_scalar(-1.0 / f64::from(LIKE_BACKGROUND).powi(2))?.f_add_scalar(1.0)?.f_relu()?;
+    seen.shaded_weight.f_mul(&likeness)?.f_sum(None::<Kind>)
+}
+
 #[cfg(test)]
 mod tests {
     use radiance::{Architecture, Draws, Ray, Trainer};
@@ -344,6 +357,7 @@ mod tests {
             warm_up: 5,
             averaging: 0.9,
             distortion: 0.02,
+            haze: 0.01,
             network_decay: 1e-4,
             seed: 9,
         }
