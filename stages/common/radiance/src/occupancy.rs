@@ -75,7 +75,7 @@ impl Occupancy {
     }
 
     /// Limits it to the cells that are occupied and those around them: for a training that goes on where the rest is known to be empty.
-    pub fn limit_to_occupied(&mut self) {
+    pub(crate) fn limit_to_occupied(&mut self) {
         let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
         let kept = |cell: usize| {
             let [x, y, z] = corner(cell);

@@ -318,13 +318,15 @@ mod tests {
 
         fn cast(&self, group: u64, rays: &mut [Ray]) {
             let mut draws = Draws::new(1, 2, group);
+            // White, or like the fog before it.
+            let background = [[1.0; 3], [0.5; 3]][group as usize % 2];
             let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
             for ray in rays {
                 let (from, to) = (around(0.3), around(0.7));
                 let origin = [from[0], from[1], from[2] + 4.0];
                 let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
                 let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-                *ray = Ray { origin, direction: d.map(|x| x / length), background: [1.0; 3] };
+                *ray = Ray { origin, direction: d.map(|x| x / length), background };
             }
         }
 
