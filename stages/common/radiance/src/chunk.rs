@@ -338,10 +338,11 @@ impl Chunk {
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
             let len = places.len();
-            if regularisers.haze > 0.0 {
+            let haze = regularisers.haze * self.sums[r].transmittance;
+            if haze > 0.0 {
                 for (shade, &k) in shade.iter_mut().zip(places) {
                     let colour = std::array::from_fn(|c| self.colour[c * m + k as usize]);
-                    *shade = regularisers.haze.mul_add(likeness(colour, background), *shade);
+                    *shade = haze.mul_add(likeness(colour, background), *shade);
                 }
             }
             if regularisers.distortion > 0.0 {

@@ -144,12 +144,14 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and haze, whose likeness to the background isn't learnt from.
+    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and haze, where neither likeness to the background nor what comes through
+    // to it is learnt from.
     let regularisers = Regularisers { haze: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
-            let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);
-            shaded.iter().map(|(_, colour)| f64::from(likeness(colour.map(|c| c as f32), rays[i].background))).collect()
+            let (shaded, through) = judge.shaded(&rays[i], &samples[i], &kept[i]);
+            let like = |colour: &[f64; 3]| f64::from(likeness(colour.map(|c| c as f32), rays[i].background));
+            shaded.iter().map(|(_, colour)| through * like(colour)).collect()
         })
         .collect();
     let like = likenesses.iter().flatten().filter(|l| **l > 0.0).count();

@@ -290,13 +290,14 @@ fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// The haze loss, summed over all rays: Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours.
+/// The haze loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours or the transmittance T.
 fn haze(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
     let squared =
         seen.shaded_colour.f_detach()?.f_sub(&behind)?.f_square()?.f_sum_dim_intlist([1i64].as_slice(), true, None::<Kind>)?;
     let likeness = squared.f_mul_scalar(-1.0 / f64::from(LIKE_BACKGROUND).powi(2))?.f_add_scalar(1.0)?.f_relu()?;
-    seen.shaded_weight.f_mul(&likeness)?.f_sum(None::<Kind>)
+    let through = seen.transmittance.f_detach()?.f_index_select(0, &seen.shaded_ray)?.f_unsqueeze(-1)?;
+    seen.shaded_weight.f_mul(&likeness)?.f_mul(&through)?.f_sum(None::<Kind>)
 }
 
 #[cfg(test)]
