@@ -116,7 +116,13 @@ impl Stage for Refine {
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
             context.check_interrupt()?;
-            agreed += usize::from(job.refine(view, &mut uses)?);
+            let name = &view.camera.name;
+            let [image, preview] = [format!("images/{name}.exr"), format!("previews/{name}.png")];
+            let made: Made = context.part(name, &[&image, &preview], || job.refine(view, &image, &preview))?;
+            agreed += usize::from(made.agreed);
+            uses.iter_mut().zip(&made.uses).for_each(|(sum, of_use)| sum.add(of_use));
+            view.depth = view.depth.as_ref().map(|_| image.clone());
+            view.image = Some(image);
             progress.add(1);
         }
         if job.agreeing && agreed < views.views.len() {
@@ -260,6 +266,15 @@ const ELSEWHERE: f32 = 0.1;
 /// Views, spread over all, by which that is judged.
 const JUDGES: usize = 8;
 
+/// How a view was refined.
+#[derive(Serialize, Deserialize)]
+struct Made {
+    /// Whether it was made to agree with its own photograph.
+    agreed: bool,
+    /// What each reference was of use for.
+    uses: Vec<Use>,
+}
+
 /// What all views share.
 struct Job<'a> {
     context: &'a Context,
@@ -277,22 +292,19 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Refines one view: its files are written, and named in it. Whether it was made to agree with its own photograph.
-    fn refine(&self, view: &mut View, uses: &mut [Use]) -> anyhow::Result<bool> {
-        let name = view.camera.name.clone();
-        let (rendered, image, own) = self.shown(view)?;
-        let redrawn = self.redraw(&rendered, uses)?;
+    /// Refines one view and writes its files.
+    fn refine(&self, view: &View, image: &str, preview: &str) -> anyhow::Result<Made> {
+        let (rendered, file, own) = self.shown(view)?;
+        let mut uses = vec![Use::default(); self.references.len()];
+        let redrawn = self.redraw(&rendered, &mut uses)?;
         let mean = match &self.enlarged {
             Some(enlarged) => enlarged.mean(redrawn, &view.camera)?,
             None => redrawn,
         };
         let refined = self.agree(mean, own.as_ref());
-        let path = format!("images/{name}.exr");
-        self.write(&self.context.output_path(&path)?, &image, &refined, &rendered.opacity)?;
-        write_png(&self.context.output_path(&format!("previews/{name}.png"))?, &refined.to_rgba8())?;
-        view.image = Some(path.clone());
-        view.depth = view.depth.as_ref().map(|_| path);
-        Ok(own.is_some())
+        self.write(&self.context.output_path(image)?, &file, &refined, &rendered.opacity)?;
+        write_png(&self.context.output_path(preview)?, &refined.to_rgba8())?;
+        Ok(Made { agreed: own.is_some(), uses })
     }
 
     /// A view as the network takes it, its file's channels, and its own photograph.

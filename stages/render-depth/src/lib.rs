@@ -1,6 +1,6 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
-//! A field may have several members, trained apart; what they render is averaged: each errs in its own way where the pictures
+//! A field may have several members, trained apart or one on from another; what they render is averaged: each errs in its own way where the pictures
 //! leave it open.
 //!
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
@@ -76,11 +76,13 @@ impl Stage for RenderDepth {
         let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
         let progress = context.progress("rendering", rows);
-        let mut views = Vec::with_capacity(resized.len());
+        let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
+            let [image, preview] = [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
             let job = Job { context, params, members: &fields, background: file.background, camera: &camera };
-            job.render(&progress)?;
-            let image = format!("images/{}.exr", camera.name);
+            context.part(&camera.name, &[&image, &preview], || job.render(&image, &preview, &progress))?;
+            done += u64::from(camera.intrinsics.height);
+            progress.set(done, "");
             views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
         }
         let count = views.len();
@@ -115,12 +117,12 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    fn render(&self, progress: &artifact::Progress) -> anyhow::Result<()> {
+    fn render(&self, image: &str, preview: &str, progress: &artifact::Progress) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
-        let exr = self.context.output_path(&format!("images/{}.exr", self.camera.name))?;
-        let mut png = PngRows::create(&self.context.output_path(&format!("previews/{}.png", self.camera.name))?, width, height)?;
+        let exr = self.context.output_path(image)?;
+        let mut png = PngRows::create(&self.context.output_path(preview)?, width, height)?;
         write_exr(&exr, (width, height), channels, VIEW_NOTE, |first, rows, samples| -> Result<(), Stopped> {
             self.context.check_interrupt().map_err(Stopped::Other)?;
             let bytes = self.band(first, rows, samples, channels.len()).map_err(Stopped::Other)?;

@@ -40,6 +40,7 @@ mod failure;
 mod fsio;
 mod manifest;
 mod parameters;
+mod parts;
 mod progress;
 mod run_record;
 mod stage;

@@ -12,6 +12,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
+use crate::canonical::hash_json;
 use crate::describe::{Description, Input, Output};
 use crate::failure::{Failure, FailureExt, exit_code, one_line};
 use crate::fsio::write_json;
@@ -115,6 +116,10 @@ pub struct Context {
     work: Option<PathBuf>,
     progress: ProgressMode,
     interrupted: Arc<AtomicBool>,
+    /// Hash of the parameters and of what the inputs are.
+    pub(crate) identity: String,
+    /// Whether it was said that something is there already.
+    pub(crate) goes_on: AtomicBool,
 }
 
 /// An input that was given: a folder, checked against its manifest where it has one.
@@ -122,6 +127,8 @@ pub struct Context {
 pub struct GivenInput {
     name: String,
     folder: PathBuf,
+    /// Its manifest's; where it has none, its path.
+    identity: String,
 }
 
 impl GivenInput {
@@ -131,18 +138,24 @@ impl GivenInput {
             return Err(Failure::BadInput(format!("input {name}: {}: no such folder", folder.display())).into());
         }
         let absolute = folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
-        if absolute.join(MANIFEST_FILE).is_file() {
-            Manifest::read(&absolute)
-                .and_then(|manifest| manifest.check_contents(&absolute))
-                .bad_input(format!("input {name}"))?;
+        let manifest = if absolute.join(MANIFEST_FILE).is_file() {
+            Some(Manifest::read(&absolute))
         } else if let (Some(parent), Some(subtree)) = (absolute.parent(), absolute.file_name().and_then(|n| n.to_str()))
             && parent.join(MANIFEST_FILE).is_file()
         {
-            Manifest::read(parent)
-                .and_then(|manifest| manifest.subtree(subtree).check_contents(&absolute))
-                .bad_input(format!("input {name}"))?;
-        }
-        Ok(Self { name: name.to_owned(), folder: folder.to_path_buf() })
+            Some(Manifest::read(parent).map(|manifest| manifest.subtree(subtree)))
+        } else {
+            None
+        };
+        let manifest = manifest.transpose().bad_input(format!("input {name}"))?;
+        let identity = match manifest {
+            Some(manifest) => {
+                manifest.check_contents(&absolute).bad_input(format!("input {name}"))?;
+                manifest.identity()
+            }
+            None => absolute.display().to_string(),
+        };
+        Ok(Self { name: name.to_owned(), folder: folder.to_path_buf(), identity })
     }
 
     /// The folder.
@@ -331,6 +344,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if let Some(work) = &arguments.work {
         fs::create_dir_all(work).with_context(|| format!("--work {}: cannot be made", work.display()))?;
     }
+    let made_from: BTreeMap<&str, &str> = inputs.iter().map(|(name, input)| (name.as_str(), input.identity.as_str())).collect();
+    let identity = hash_json(&(&params, made_from, &description.code));
     let context = Context {
         threads,
         device: arguments.device,
@@ -339,6 +354,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         work: arguments.work,
         progress: arguments.progress,
         interrupted,
+        identity,
+        goes_on: AtomicBool::new(false),
     };
     S::run(&context, &params)?;
     context.check_interrupt()?;

@@ -2,6 +2,7 @@ use std::ops::Range;
 
 use pixels::Picture;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use crate::refiner::{GUIDED_INPUTS, INPUTS};
 use crate::view::{KnownView, Rendered};
@@ -19,7 +20,7 @@ struct Guide {
 const KNOWN: usize = GUIDED_INPUTS - INPUTS;
 
 /// What of a view a reference was of use for.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Use {
     /// Pixels that it sees.
     pub seen: usize,
