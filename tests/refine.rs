@@ -4,8 +4,10 @@
 mod common;
 
 use std::path::Path;
+use std::process::Stdio;
+use std::time::SystemTime;
 
-use common::{Finished, Project, data, kill_again_and_again, manifest, stage, stage_command};
+use common::{Finished, Project, data, kill_again_and_again, manifest, signal, stage, stage_command, wait_until};
 
 const REFINED: &str = "
   rehearsal-field:
@@ -449,19 +451,29 @@ fn references_join_a_training() {
     };
     println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
-    // Half as many rays do, where the training goes on from what LR pictures gave. Few rays, or one reference alone, lose nothing of that.
-    let on = |rays: &str, references: &str| {
-        let (rays, references) = (format!("train-on.rays={rays}"), format!("train-on.references={references}"));
-        let more = ["-p", "prep.references=6", "-p", "train-ss.rays=200000", "-p", &rays, "-p", &references];
-        let arguments = [&["eval-on"], &more[..]].concat();
-        project.ok(&[&["run"], &arguments[..]].concat());
-        let on = project.json("eval-on", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
-        println!("{on:.2} dB, {rays}, {references}");
-        on
-    };
-    assert!(on("100000", "6") > psnr("eval") + 0.2);
-    assert!(on("8000", "6") > psnr("eval") - 0.02);
-    assert!(on("100000", "1") > psnr("eval") - 0.02);
+    // Half as many rays do, where the training goes on from what LR pictures gave and both fields, or their weights' mean, are kept. Few rays, or one
+    // reference alone, lose nothing of that.
+    let first = project.artifact("train-ss", &arguments);
+    for begun in ["beside", "averaged"] {
+        let on = |rays: &str, references: &str| {
+            let given = [("rays", rays), ("references", references), ("begun", begun)]
+                .map(|(name, value)| format!("train-on.{name}={value}"));
+            let more =
+                ["-p", "prep.references=6", "-p", "train-ss.rays=200000", "-p", &given[0], "-p", &given[1], "-p", &given[2]];
+            let arguments = [&["eval-on"], &more[..]].concat();
+            project.ok(&[&["run"], &arguments[..]].concat());
+            let on = project.json("eval-on", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
+            println!("{on:.2} dB, {given:?}");
+            let field = project.artifact("train-on", &arguments);
+            let weights = |field: &Path, member: u32| std::fs::read(field.join(format!("field-{member}.safetensors"))).ok();
+            assert_eq!(weights(&field, 1).is_some(), begun == "beside");
+            assert_eq!(weights(&field, 0) == weights(&first, 0), begun == "beside", "the field begun from is the first member");
+            on
+        };
+        assert!(on("100000", "6") > psnr("eval") + 0.2);
+        assert!(on("8000", "6") > psnr("eval") - 0.02);
+        assert!(on("100000", "1") > psnr("eval") - 0.02);
+    }
     // None of them, and all is as without.
     let none = [&arguments[..], &["-p", "train-joined.references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
@@ -493,6 +505,10 @@ fn other_fields_are_not_gone_on_from() {
     let cut = with("cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
     fails(own, &cut, &["input field", "field-0.safetensors"]);
+    // Nor can more than sixteen be kept.
+    let many = own.replace('{', r#"{"members": 16, "#);
+    stage("train-ss", &many, &[("scene", scene.as_path()), ("field", field.as_path())], &project.path("no"), &[])
+        .fails(2, &["parameter members: members = 17 is not in 1..=16 with those of input field beside", "begun averaged"]);
 }
 
 /// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
@@ -527,6 +543,67 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
         assert_eq!(last.code, 0, "{}", last.stderr);
     }
     assert_eq!(manifest(&output), manifest(&whole));
+}
+
+/// Views that were rendered or refined before a kill aren't made again, unless they are damaged or something else was asked for.
+#[test]
+fn views_that_were_finished_are_kept() {
+    let project = project();
+    project.ok(&["run", "refine-referenced", "-p", "prep.references=2"]);
+    let folder = |stage: &str| project.artifact(stage, &["refine-referenced", "-p", "prep.references=2"]);
+    let (prep, field, rendered) = (folder("prep"), folder("train-ss"), folder("reference-views"));
+    let (cameras, references, refiner) = (prep.join("train"), prep.join("references"), folder("train-referenced"));
+    let views = project.path("render-depth-whole");
+    let render = [("field", field.as_path()), ("cameras", &cameras)];
+    let refine = [("views", views.as_path()), ("refiner", &refiner), ("references", &references), ("reference-views", &rendered)];
+    let kept = |work: &Path| -> Vec<std::path::PathBuf> {
+        let found = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
+        let manifests = found.filter(|f| f.file_name() == "artifact.json").map(|f| f.path().parent().unwrap().to_owned());
+        manifests.filter(|part| !part.file_name().unwrap().to_string_lossy().starts_with('.')).collect()
+    };
+    for (name, inputs, params, other) in [
+        ("render-depth", &render[..], r#"{"size": 120}"#, r#"{"size": 40}"#),
+        ("refine", &refine, r#"{"turns": 8}"#, r#"{"turns": 1}"#),
+    ] {
+        let (work, output, whole) =
+            (project.path(&format!("{name}-work")), project.path(name), project.path(&format!("{name}-whole")));
+        let more = ["--work", work.to_str().unwrap()];
+        assert_eq!(stage(name, params, inputs, &whole, &[]).code, 0);
+        let mut child = stage_command(name, params, inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        wait_until(|| !kept(&work).is_empty() || child.try_wait().unwrap().is_some());
+        signal(&child, "-KILL");
+        child.wait().unwrap();
+        let written = |parts: &[std::path::PathBuf]| -> Vec<SystemTime> {
+            parts.iter().map(|part| part.join("artifact.json").metadata().unwrap().modified().unwrap()).collect()
+        };
+        let again = |output: &str, params: &str| {
+            let output = project.path(output);
+            let finished = stage(name, params, inputs, &output, &more);
+            assert_eq!(finished.code, 0, "{}", finished.stderr);
+            manifest(&output)
+        };
+        let before = kept(&work);
+        let times = written(&before);
+        assert!(!before.is_empty() && again("resumed", params) == manifest(&whole), "{name}");
+        assert_eq!(written(&before), times, "{name}: they were made again");
+        // One is damaged, one cut short, one was never begun.
+        let parts = kept(&work);
+        let times = written(&parts[3..]);
+        assert_eq!(parts.len(), 12, "{parts:?}");
+        let image =
+            walkdir::WalkDir::new(&parts[0]).into_iter().flatten().find(|f| f.path().extension().is_some_and(|e| e == "exr"));
+        let image = image.unwrap().path().to_owned();
+        let mut bytes = std::fs::read(&image).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::remove_file(&image).unwrap(); // it has another name in the output
+        std::fs::write(&image, bytes).unwrap();
+        std::fs::write(parts[1].join("artifact.json"), "{").unwrap();
+        std::fs::remove_dir_all(&parts[2]).unwrap();
+        assert_eq!(again("mended", params), manifest(&whole), "{name}");
+        assert!(kept(&work) == parts && written(&parts[3..]) == times, "{name}");
+        assert!(again("different", other) != manifest(&whole), "{name}: other parameters, other views");
+        ["resumed", "mended", "different"].iter().for_each(|output| std::fs::remove_dir_all(project.path(output)).unwrap());
+    }
 }
 
 #[test]

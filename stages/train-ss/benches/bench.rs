@@ -200,6 +200,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &scene.join("train"))?;
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
+        let params = &params.suited(&views.bounds.space, views.background, train_ss::epoch(&views, params));
         let mut supervision = train_ss::supervision(&input, params, Photographs::read(&input)?, None, &|_| ())?;
         let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width), &views.bounds.space);
         let training = params.grid_training(params.rays(0));

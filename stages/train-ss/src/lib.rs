@@ -30,7 +30,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use member::Member;
-pub use params::{FieldKind, Params, RateSchedule};
+pub use params::{Begun, FieldKind, Params, RateSchedule};
 pub use supervision::{Order, Supersampling, SupersamplingOptions, Supervision};
 
 /// `training.json`: how the training went, over all members one after the other.
@@ -113,7 +113,7 @@ impl Stage for TrainSs {
                 "field",
                 Input::optional(
                     &["field"],
-                    "a field that the same parameters gave of the same scene, to go on from; its weights' and the trained ones' mean is kept",
+                    "a field that the same parameters gave of the same scene, to go on from; parameter begun says what becomes of it",
                 ),
             ),
         ]
@@ -129,6 +129,7 @@ impl Stage for TrainSs {
         let references = context.optional_input("references");
         let views = Views::read(input)?;
         let epoch = epoch(&views, params);
+        let kept = params.begun(&views.bounds.space);
         let begun = context.optional_input("field");
         let params = if begun.is_some() { &params.going_on() } else { params };
         let params = &params.suited(&views.bounds.space, views.background, epoch);
@@ -136,14 +137,18 @@ impl Stage for TrainSs {
             FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
-        let file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
-        let begun = begun.map(|input| Begun::read(input, &file)).transpose()?;
+        let mut file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
+        let begun = begun.map(|input| BegunField::read(input, &file)).transpose()?;
+        let first = match (&begun, kept) {
+            (Some(begun), Begun::Beside) => begun.keep_beside(context, &mut file)?,
+            _ => 0,
+        };
         let all = params.rays(epoch);
         let progress = context.progress("training", all);
         let mut log = TrainingLog::default();
         for index in 0..params.members {
-            let from = begun.as_ref().map(|begun| begun.member(index));
-            let member = Member::new(context, params.member(index, all), (model, from), index, log.rays)?;
+            let from = begun.as_ref().map(|begun| (begun.member(index), kept));
+            let member = Member::new(context, params.member(index, all), (model, from), first + index, log.rays)?;
             log.add(member.run(input, references, &views, &progress)?);
             progress.set(log.rays, "");
         }
@@ -160,12 +165,12 @@ impl Stage for TrainSs {
 }
 
 /// A field to go on from.
-struct Begun<'a> {
+struct BegunField<'a> {
     input: &'a GivenInput,
     members: u32,
 }
 
-impl<'a> Begun<'a> {
+impl<'a> BegunField<'a> {
     /// Reads what it says of itself, which must be what is to be trained.
     fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
         let file: FieldFile = input.read_json(FIELD_FILE)?;
@@ -184,6 +189,21 @@ impl<'a> Begun<'a> {
     /// Weights of a member; where it has fewer of them, they are gone on from in turn.
     fn member(&self, index: u32) -> PathBuf {
         self.input.path(&FieldFile::member(index % self.members))
+    }
+
+    /// Writes all of its members before those of `file`, and returns how many they are.
+    fn keep_beside(&self, context: &Context, file: &mut FieldFile) -> anyhow::Result<u32> {
+        file.members += self.members;
+        file.check().map_err(|reason| {
+            let message =
+                format!("parameter members: {reason} with those of input field beside; lower it, or set begun averaged");
+            Failure::Usage(message)
+        })?;
+        for index in 0..self.members {
+            std::fs::copy(self.member(index), context.output_path(&FieldFile::member(index))?)
+                .context("cannot keep input field")?;
+        }
+        Ok(self.members)
     }
 }
 

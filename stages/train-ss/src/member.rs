@@ -7,15 +7,15 @@ use scene::Views;
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
-use crate::{Params, Photographs, TrainingLog, epoch, read_hull, supervision};
+use crate::{Begun, Params, Photographs, TrainingLog, epoch, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
     context: &'a Context,
     params: Params,
     model: FieldModel,
-    /// Weights to go on from.
-    from: Option<PathBuf>,
+    /// Weights to go on from, and what becomes of them.
+    from: Option<(PathBuf, Begun)>,
     /// Where its weights go.
     output: PathBuf,
     work: Option<PathBuf>,
@@ -31,7 +31,7 @@ impl<'a> Member<'a> {
     pub(crate) fn new(
         context: &'a Context,
         params: Params,
-        (model, from): (FieldModel, Option<PathBuf>),
+        (model, from): (FieldModel, Option<(PathBuf, Begun)>),
         index: u32,
         before: u64,
     ) -> anyhow::Result<Self> {
@@ -99,7 +99,8 @@ impl<'a> Member<'a> {
             return Err(Failure::Usage(message).into());
         }
         let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
-        let mut trainer = start(params, (self.model, self.from.as_deref()), views.bounds, &context.device, hull, epoch)?;
+        let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
+        let mut trainer = start(params, (self.model, from), views.bounds, &context.device, hull, epoch)?;
         if let Some(work) = work {
             std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
         }
@@ -132,7 +133,7 @@ impl<'a> Member<'a> {
         log.exposures = supervision.exposures().to_vec();
         log.poses = refined.iter().map(|camera| camera.camera_to_world).collect();
         trainer.finish(&self.output)?;
-        if let Some(from) = &self.from {
+        if let Some((from, Begun::Averaged)) = &self.from {
             average(self.model, views.bounds, from, &self.output).context("cannot average the weights")?;
         }
         if let Some(work) = &self.work {

@@ -77,8 +77,8 @@ pub struct Params {
     /// in NDC with nothing behind the scene (an opaque background), which else becomes fog; 0 elsewhere, where it costs detail.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub distortion: Option<f64>,
-    /// `grid`: weight of the haze loss, the opacity of what has the background's colour: before that colour no picture tells whether it is
-    /// there, and from elsewhere it hides the scene. Without it: 0.001 before white or black, 0 before what has no colour of its own.
+    /// `grid`: weight of the haze loss, the opacity of what has the background's colour and doesn't hide the background: before that colour no picture
+    /// tells whether it is there, and from elsewhere it hides the scene. Without it: 0.001 before white or black, 0 before what has no colour of its own.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub haze: Option<f64>,
     /// `grid`: weight decay of the networks.
@@ -133,6 +133,9 @@ pub struct Params {
     pub restarts: u32,
     /// At most so many of the references given, the first. Without it: all.
     pub references: Option<u32>,
+    /// What becomes of the field that the training goes on from (input `field`). Without it: `averaged` in NDC, where all cameras see the same and
+    /// both are as good; `beside` elsewhere, where what one reference teaches says nothing of a scene's other sides.
+    pub begun: Option<Begun>,
     /// Seed of everything that is drawn.
     pub seed: u64,
 }
@@ -179,6 +182,7 @@ impl Default for Params {
             noise: None,
             restarts: 0,
             references: None,
+            begun: None,
             seed: 0,
         }
     }
@@ -192,6 +196,17 @@ pub enum FieldKind {
     Grid,
     /// The paper's own two MLPs, through libtorch.
     Mlp,
+}
+
+/// What becomes of a field that a training went on from: what either makes up where pictures leave it open evens out, and little is lost of what was known
+/// before.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Begun {
+    /// Its weights' and the trained ones' mean is kept (Wortsman et al. 2022, "Robust fine-tuning"): one field to render.
+    Averaged,
+    /// It is kept as a member of its own, before the trained ones: the mean of what both render is better, and takes as long as two.
+    Beside,
 }
 
 /// How the paper's learning rate falls.
@@ -280,6 +295,11 @@ impl Params {
             }
             _ => self.clone(),
         }
+    }
+
+    /// What becomes of the field that a training goes on from.
+    pub fn begun(&self, space: &Space) -> Begun {
+        self.begun.unwrap_or(if matches!(space, Space::Ndc(_)) { Begun::Averaged } else { Begun::Beside })
     }
 
     /// How to go on from a field that the same parameters gave: its rough shape is known.

@@ -14,7 +14,7 @@ pub const FIELD_FILE: &str = "field.json";
 pub struct FieldFile {
     /// Which field, and what it is made of.
     pub field: FieldModel,
-    /// How many there are, trained apart on the same pictures: what they render is averaged.
+    /// How many there are, trained apart or one on from another: what they render is averaged.
     #[schemars(range(min = 1, max = 16))]
     pub members: u32,
     /// Where it lies, in scene units.
