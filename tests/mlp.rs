@@ -35,11 +35,16 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     }
     assert_eq!(manifest(&one), manifest(&stopped));
 
-    // What goes on from it isn't it.
-    let (on, inputs) = (project.path("on"), [("scene", train.as_path()), ("field", &one)]);
-    assert_eq!(stage("train-ss", &PARAMS.replace("40000", "2000"), &inputs, &on, &[]).code, 0);
-    let weights = |folder: &std::path::Path| std::fs::read(folder.join("field-0.safetensors")).unwrap();
-    assert!(weights(&on) != weights(&one));
+    // What goes on from it stands beside it, or their mean does.
+    let (beside, averaged) = (project.path("beside"), project.path("averaged"));
+    let inputs = [("scene", train.as_path()), ("field", one.as_path())];
+    let on = PARAMS.replace("40000", "2000");
+    assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
+    assert_eq!(stage("train-ss", &on.replace('{', r#"{"begun": "averaged", "#), &inputs, &averaged, &[]).code, 0);
+    let weights = |folder: &std::path::Path, member: u32| std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok();
+    let [begun, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
+    assert!(weights(&beside, 0) == begun && weights(&averaged, 1).is_none());
+    assert!(begun != trained && begun != mean && trained != mean);
 
     // `render-depth` doesn't know which field it has.
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
