@@ -16,7 +16,7 @@ const PARTS: &str = "parts";
 const VALUE: &str = "value.json";
 
 impl Context {
-    /// Makes a part of the output, `files`, unless an earlier run on the same inputs and parameters did and kept it in `--work`. What `make` returns
+    /// Makes a part of the output, `files`, unless an earlier run of the same code on the same inputs and parameters did and kept it in `--work`. What `make` returns
     /// is kept with it.
     ///
     /// ```no_run

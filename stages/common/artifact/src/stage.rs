@@ -116,7 +116,7 @@ pub struct Context {
     work: Option<PathBuf>,
     progress: ProgressMode,
     interrupted: Arc<AtomicBool>,
-    /// Hash of the parameters and of what the inputs are.
+    /// Hash of the parameters, of what the inputs are, of the stage's code and of where it computes.
     pub(crate) identity: String,
     /// Whether it was said that something is there already.
     pub(crate) goes_on: AtomicBool,
@@ -345,7 +345,7 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         fs::create_dir_all(work).with_context(|| format!("--work {}: cannot be made", work.display()))?;
     }
     let made_from: BTreeMap<&str, &str> = inputs.iter().map(|(name, input)| (name.as_str(), input.identity.as_str())).collect();
-    let identity = hash_json(&(&params, made_from, &description.code));
+    let identity = hash_json(&(&params, made_from, &description.code, &arguments.device));
     let context = Context {
         threads,
         device: arguments.device,
