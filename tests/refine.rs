@@ -602,6 +602,12 @@ fn views_that_were_finished_are_kept() {
         assert_eq!(again("mended", params), manifest(&whole), "{name}");
         assert!(kept(&work) == parts && written(&parts[3..]) == times, "{name}");
         assert!(again("different", other) != manifest(&whole), "{name}: other parameters, other views");
+        // Of an input that nothing vouches for, nothing is kept.
+        let bare = changed(&project, &format!("{name}-bare"), inputs[0].1, "none", &|_| ());
+        let known = kept(&work);
+        let others = [&[(inputs[0].0, bare.as_path())], &inputs[1..]].concat();
+        assert_eq!(stage(name, params, &others, &output, &more).code, 0);
+        assert!(kept(&work) == known && manifest(&output) == manifest(&whole), "{name}");
         ["resumed", "mended", "different"].iter().for_each(|output| std::fs::remove_dir_all(project.path(output)).unwrap());
     }
 }

@@ -17,7 +17,7 @@ const VALUE: &str = "value.json";
 
 impl Context {
     /// Makes a part of the output, `files`, unless an earlier run of the same code on the same inputs and parameters did and kept it in `--work`. What `make` returns
-    /// is kept with it.
+    /// is kept with it. Nothing is where an input has no manifest: it may have changed since.
     ///
     /// ```no_run
     /// # fn of(context: &artifact::Context) -> anyhow::Result<()> {
@@ -37,7 +37,8 @@ impl Context {
         files: &[&str],
         make: impl FnOnce() -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        let Some(folder) = self.work().map(|work| work.join(PARTS).join(&self.identity).join(name)) else { return make() };
+        let Some((work, identity)) = self.work().zip(self.identity.as_deref()) else { return make() };
+        let folder = work.join(PARTS).join(identity).join(name);
         if let Some(value) = self.restored(&folder, files) {
             if !self.goes_on.swap(true, Ordering::Relaxed) {
                 self.say("going on after what an earlier run has made");

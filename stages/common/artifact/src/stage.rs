@@ -116,8 +116,8 @@ pub struct Context {
     work: Option<PathBuf>,
     progress: ProgressMode,
     interrupted: Arc<AtomicBool>,
-    /// Hash of the parameters, of what the inputs are, of the stage's code and of where it computes.
-    pub(crate) identity: String,
+    /// Hash of the parameters, of what the inputs are, of the stage's code and of where it computes; none where an input has no manifest.
+    pub(crate) identity: Option<String>,
     /// Whether it was said that something is there already.
     pub(crate) goes_on: AtomicBool,
 }
@@ -127,8 +127,8 @@ pub struct Context {
 pub struct GivenInput {
     name: String,
     folder: PathBuf,
-    /// Its manifest's; where it has none, its path.
-    identity: String,
+    /// Its manifest's, where it has one.
+    identity: Option<String>,
 }
 
 impl GivenInput {
@@ -148,13 +148,10 @@ impl GivenInput {
             None
         };
         let manifest = manifest.transpose().bad_input(format!("input {name}"))?;
-        let identity = match manifest {
-            Some(manifest) => {
-                manifest.check_contents(&absolute).bad_input(format!("input {name}"))?;
-                manifest.identity()
-            }
-            None => absolute.display().to_string(),
-        };
+        if let Some(manifest) = &manifest {
+            manifest.check_contents(&absolute).bad_input(format!("input {name}"))?;
+        }
+        let identity = manifest.map(|manifest| manifest.identity());
         Ok(Self { name: name.to_owned(), folder: folder.to_path_buf(), identity })
     }
 
@@ -344,8 +341,9 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if let Some(work) = &arguments.work {
         fs::create_dir_all(work).with_context(|| format!("--work {}: cannot be made", work.display()))?;
     }
-    let made_from: BTreeMap<&str, &str> = inputs.iter().map(|(name, input)| (name.as_str(), input.identity.as_str())).collect();
-    let identity = hash_json(&(&params, made_from, &description.code, &arguments.device));
+    let made_from: Option<BTreeMap<&str, &str>> =
+        inputs.iter().map(|(name, input)| Some((name.as_str(), input.identity.as_deref()?))).collect();
+    let identity = made_from.map(|inputs| hash_json(&(&params, inputs, &description.code, &arguments.device)));
     let context = Context {
         threads,
         device: arguments.device,
