@@ -25,6 +25,7 @@ PARTS = [
     ("one reference", [ONE]),
     ("no reference", ["train-refine.references=0"]),
     ("one reference, no occlusion test", [ONE, "train-refine.occlusion=false"]),
+    ("one reference, aligned", [ONE, "train-refine.alignment=true"]),
     ("one reference, expected depth", [ONE, "rehearsal-views.depth=expected"]),
     ("one reference, lens ignored", [ONE, "prep.lens=ignore"]),
     ("two references", ["train-refine.references=2"]),

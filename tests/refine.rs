@@ -408,14 +408,19 @@ fn tables_have_rendered_and_refined_rows() {
         rows.iter().map(|r| (r["refined"].as_bool().unwrap(), r["enlarged"].as_bool().unwrap())).collect();
     assert_eq!(kinds, [(false, false), (true, false), (true, true)]);
 
-    let ours = ["--protocol", "24x2", "--variants", "3", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
+    let ours = ["--protocol", "24x2", "--variants", "4", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
     let parts = [&["--scenes", "demo"], &ours[..], &["--set", "rehearsal-field.rays=30000"]].concat();
     let made = project.script("refine-ablation.py", &parts);
     assert_eq!(made.code, 0, "{}", made.stderr);
-    assert!(made.stdout.contains("| one reference, no occlusion test |"), "{}", made.stdout);
+    for part in ["no occlusion test", "aligned"] {
+        assert!(made.stdout.contains(&format!("| one reference, {part} |")), "{}", made.stdout);
+    }
     let rows = read("out/ablation.json");
     let refined: Vec<f64> = rows.iter().map(|r| r["refined"].as_f64().unwrap()).collect();
-    assert!(refined.len() == 3 && refined[0] != refined[1] && refined.iter().all(|r| r.is_finite()), "{refined:?}");
+    assert!(
+        refined.len() == 4 && refined[0] != refined[1] && refined[0] != refined[3] && refined.iter().all(|r| r.is_finite()),
+        "{refined:?}"
+    );
 }
 
 /// HR references that join the training: what they show is learnt.

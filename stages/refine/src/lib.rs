@@ -18,7 +18,7 @@ use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Sta
 use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
-    Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
+    Guidance, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
 };
 use scene::{Background, Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -220,13 +220,6 @@ impl<'a> Enlarged<'a> {
     }
 }
 
-/// How a network takes references.
-#[derive(Clone, Copy)]
-struct Guidance {
-    /// Whether they show only what they see by their own depth.
-    occlusion: bool,
-}
-
 /// Either network.
 enum AnyRefiner {
     Compact(Refiner),
@@ -247,8 +240,7 @@ impl AnyRefiner {
     /// How it takes references, where it is ours and does.
     fn guidance(&self) -> Option<Guidance> {
         let Self::Compact(network) = self else { return None };
-        let Architecture { guided, occlusion, .. } = network.architecture();
-        guided.then_some(Guidance { occlusion })
+        network.architecture().guidance
     }
 
     fn takes_references(&self) -> bool {
@@ -331,10 +323,10 @@ impl Job<'_> {
         let references: Vec<&KnownView> = self.references.iter().collect();
         match &self.network {
             AnyRefiner::Compact(network) => {
-                let Some(Guidance { occlusion }) = self.network.guidance() else {
+                let Some(guidance) = self.network.guidance() else {
                     return Ok(network.refine_by(&rendered.view, self.strength, self.turns)?);
                 };
-                let guided = guided(rendered, &references, occlusion);
+                let guided = guided(rendered, &references, guidance);
                 uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
                 Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
             }
@@ -351,12 +343,13 @@ impl Job<'_> {
     /// Leaves references out that look otherwise than what is rendered: those that are trusted with less than a share of what they see, unless they would
     /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
     /// far aside, surfaces look otherwise.
-    fn leave_out(&mut self, views: &Views, Guidance { occlusion }: Guidance, least: f64) -> anyhow::Result<()> {
-        let trusted = self.trusted(&self.references, views, occlusion, 1.0)?;
+    fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
+        let trusted = self.trusted(&self.references, views, guidance, 1.0)?;
         let references = std::mem::take(&mut self.references);
         for (reference, share) in references.into_iter().zip(trusted) {
             // At another depth a reference sees nothing by its own.
-            let through = |by: f32| anyhow::Ok(self.trusted(std::slice::from_ref(&reference), views, false, by)?[0]);
+            let blind = Guidance { occlusion: false, ..guidance };
+            let through = |by: f32| anyhow::Ok(self.trusted(std::slice::from_ref(&reference), views, blind, by)?[0]);
             let is_right = || -> anyhow::Result<bool> {
                 let elsewhere = f64::max(through(1.0 - ELSEWHERE)?, through(1.0 + ELSEWHERE)?);
                 Ok(through(1.0)? >= SENSITIVE * elsewhere)
@@ -376,14 +369,14 @@ impl Job<'_> {
     }
 
     /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
-    fn trusted(&self, references: &[KnownView], views: &Views, occlusion: bool, depths: f32) -> anyhow::Result<Vec<f64>> {
+    fn trusted(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
         for view in views.views.iter().step_by(every) {
             let mut shown = self.shown(view)?.0;
             shown.depth.iter_mut().for_each(|depth| *depth *= depths);
-            let guided = guided(&shown, &references, occlusion);
+            let guided = guided(&shown, &references, guidance);
             uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
         Ok(uses.iter().map(Use::trusted).collect())

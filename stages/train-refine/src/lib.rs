@@ -23,8 +23,8 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr};
 use refinement::{
-    Architecture, KnownView, Network, OwnPhotographs, REFINER_FILE, RefinementError, Refiner, RefinerFile, RefinerTrainer,
-    RefinerTraining, Rendered, Training, WEIGHTS_FILE,
+    Architecture, Guidance, KnownView, Network, OwnPhotographs, REFINER_FILE, RefinementError, Refiner, RefinerFile,
+    RefinerTrainer, RefinerTraining, Rendered, Training, WEIGHTS_FILE,
 };
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -59,6 +59,8 @@ pub struct Params {
     pub references: u32,
     /// `compact`: whether a reference shows only what it sees by its own depth; without it also what something stands before (to be compared with).
     pub occlusion: bool,
+    /// `compact`: whether what a reference shows is moved, by up to two pixels, to fit what is rendered (to be compared with).
+    pub alignment: bool,
     /// `paper`: reference patches that a patch gets.
     #[schemars(range(min = 1, max = 64))]
     pub patches: u32,
@@ -78,6 +80,7 @@ impl Default for Params {
             blocks: 4,
             references: 0,
             occlusion: true,
+            alignment: false,
             patches: 8,
             seed: 0,
         }
@@ -155,8 +158,7 @@ impl Stage for TrainRefine {
         let architecture = Architecture {
             channels: params.channels.unwrap_or(32),
             blocks: params.blocks,
-            guided: params.references > 0,
-            occlusion: params.occlusion,
+            guidance: (params.references > 0).then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),
         };
         let options = RefinerTraining {
             steps: params.steps.unwrap_or(4000),

@@ -2,10 +2,30 @@ use std::ops::Range;
 
 use pixels::Picture;
 use rayon::prelude::*;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::align::align;
 use crate::refiner::{GUIDED_INPUTS, INPUTS};
+use crate::sums::{AROUND, Sums};
 use crate::view::{KnownView, Rendered};
+
+/// How references are looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Guidance {
+    /// Whether a reference shows only what it sees by its own depth; without it also what something stands before.
+    pub occlusion: bool,
+    /// Whether what a reference shows is moved, by up to two pixels, to fit what is rendered.
+    pub alignment: bool,
+}
+
+impl Default for Guidance {
+    /// By its own depth, and where geometry puts it.
+    fn default() -> Self {
+        Self { occlusion: true, alignment: false }
+    }
+}
 
 /// What references know of some rows of a view: how the colour they show there differs from the rendered one; how far they can be trusted,
 /// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered); and what their own rendered views
@@ -53,33 +73,44 @@ pub struct Guided {
     pub uses: Vec<Use>,
 }
 
-/// Pixels to each side over which what is shown is compared with what is rendered: in their mean the detail that rendering lacks evens out.
-const AROUND: usize = 5;
 /// A mean difference that halves the trust, twice; and how far, in pixels, a reference may jump between neighbours before it does.
 const DIFFERENT: f32 = 0.1;
 const JUMP: f32 = 1.0;
 
 /// What one reference shows of a pixel.
 #[derive(Clone, Copy, Default)]
-struct Shown {
+pub(crate) struct Shown {
     /// Difference to what is rendered.
-    difference: [f32; 3],
+    pub(crate) difference: [f32; 3],
     /// Difference to what is rendered for the reference.
-    lacking: [f32; 3],
-    place: [f32; 2],
+    pub(crate) lacking: [f32; 3],
+    /// Where in the reference, in pixels.
+    pub(crate) place: [f32; 2],
     /// By angle and size; 0 where it shows nothing.
-    sight: f32,
+    pub(crate) sight: f32,
     /// The same, less where it looks otherwise than what is rendered.
-    trust: f32,
+    pub(crate) trust: f32,
+}
+
+impl Shown {
+    /// What a reference shows at a place of it, for a pixel as rendered.
+    pub(crate) fn new(reference: &KnownView, place: [f32; 2], sight: f32, pixel: &[f32]) -> Self {
+        let (colour, theirs) = (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
+        let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
+        let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
+        // A picture with a hole in it shows nothing there.
+        let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
+        if is_shown { Self { difference, lacking, place, sight, trust: sight } } else { Self::default() }
+    }
 }
 
 impl Guide {
-    /// What references know of rows; without `occlusion` as if nothing stood before anything.
-    fn new(rendered: &Rendered, references: &[&KnownView], rows: Range<usize>, occlusion: bool) -> Self {
+    /// What references know of rows.
+    fn new(rendered: &Rendered, references: &[&KnownView], rows: Range<usize>, guidance: Guidance) -> Self {
         let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
         let mut uses = Vec::new();
         for reference in references {
-            let trusted = trusted(rendered, reference, &rows, occlusion);
+            let trusted = trusted(rendered, reference, &rows, guidance);
             let mut of_use = Use::default();
             for ((sum, lacks, weights, confidence), Shown { difference, lacking, sight, trust, .. }) in
                 sums.iter_mut().zip(trusted)
@@ -105,34 +136,43 @@ impl Guide {
 
 /// What a reference shows of rows, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
 /// highlight) or comes from here and there (noisy depth, an edge).
-fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, occlusion: bool) -> Vec<Shown> {
+fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidance: Guidance) -> Vec<Shown> {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    let high = rows.start.saturating_sub(AROUND)..(rows.end + AROUND).min(height);
+    // What is looked at around a pixel was itself moved by what lies around it.
+    let around = if guidance.alignment { 2 * AROUND } else { AROUND };
+    let high = rows.start.saturating_sub(around)..(rows.end + around).min(height);
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
     let show = |column: usize, row: usize| {
-        let sight =
-            if occlusion { surface.sight(column, row, &theirs) } else { surface.sight_through(column, row, theirs.camera) };
+        let sight = if guidance.occlusion {
+            surface.sight(column, row, &theirs)
+        } else {
+            surface.sight_through(column, row, theirs.camera)
+        };
         let Some(sight) = sight else { return Shown::default() };
-        let colour = reference.truth.colour_at(sight.place);
-        let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
-        let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
-        let theirs = reference.rendered.view.colour_at(sight.place);
-        let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
-        // A picture with a hole in it shows nothing there.
-        let is_shown = difference.iter().all(|d: &f32| d.is_finite());
         let well = sight.cosine.max(0.0) * sight.detail.min(1.0);
-        if is_shown { Shown { difference, lacking, place: sight.place, sight: well, trust: well } } else { Shown::default() }
+        Shown::new(reference, sight.place, well, &rendered.view.data[(row * width + column) * INPUTS..])
     };
-    let shown: Vec<Shown> =
+    let mut shown: Vec<Shown> =
         high.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
-    let means = Sums::new(&shown, width);
+    if guidance.alignment {
+        shown = align(&shown, rendered, reference, high.clone());
+    }
+    let terms = |pixel: &Shown| {
+        let [r, g, b] = pixel.difference.map(f64::from);
+        if pixel.trust > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
+    };
+    let sums = Sums::new(width, &shown.iter().map(terms).collect::<Vec<_>>());
+    let mean = |x: usize, y: usize| {
+        let [r, g, b, count] = sums.around(x, y);
+        [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
+    };
     let mut all = Vec::with_capacity(width * rows.len());
     for row in rows.clone() {
         let y = row - high.start;
         for x in 0..width {
             let mut own = shown[y * width + x];
             if own.trust > 0.0 {
-                let apart = means.around(x, y) / DIFFERENT;
+                let apart = mean(x, y) / DIFFERENT;
                 let neighbour = |dx: isize, dy: isize| {
                     let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
                     let other = (x < width && y < high.len()).then(|| shown[y * width + x])?;
@@ -151,49 +191,13 @@ fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, occl
     all
 }
 
-/// Sums over all that lies above and to the left: of the differences, and of the pixels that are shown.
-struct Sums {
-    sums: Vec<[f64; 4]>,
-    width: usize,
-    height: usize,
-}
-
-impl Sums {
-    fn new(shown: &[Shown], width: usize) -> Self {
-        let height = shown.len() / width.max(1);
-        let across = width + 1;
-        let mut sums = vec![[0.0; 4]; across * (height + 1)];
-        for (y, row) in shown.chunks_exact(width.max(1)).enumerate() {
-            let mut left = [0.0; 4];
-            for (x, pixel) in row.iter().enumerate() {
-                if pixel.trust > 0.0 {
-                    (0..3).for_each(|c| left[c] += f64::from(pixel.difference[c]));
-                    left[3] += 1.0;
-                }
-                sums[(y + 1) * across + x + 1] = std::array::from_fn(|c| sums[y * across + x + 1][c] + left[c]);
-            }
-        }
-        Self { sums, width, height }
-    }
-
-    /// Length of the mean difference around a pixel.
-    fn around(&self, x: usize, y: usize) -> f32 {
-        let (left, right) = (x.saturating_sub(AROUND), (x + AROUND + 1).min(self.width));
-        let (top, bottom) = (y.saturating_sub(AROUND), (y + AROUND + 1).min(self.height));
-        let at = |x: usize, y: usize, c: usize| self.sums[y * (self.width + 1) + x][c];
-        let sum = |c: usize| at(right, bottom, c) - at(left, bottom, c) - at(right, top, c) + at(left, top, c);
-        let count = sum(3).max(1.0);
-        (0..3).map(|c| (sum(c) / count).powi(2)).sum::<f64>().sqrt() as f32
-    }
-}
-
-/// A view with what references know of it, as a guided refiner takes it: with its [`crate::Architecture::occlusion`].
-pub fn guided(rendered: &Rendered, references: &[&KnownView], occlusion: bool) -> Guided {
+/// A view with what references know of it, as a guided refiner takes it: with its [`crate::Architecture::guidance`].
+pub fn guided(rendered: &Rendered, references: &[&KnownView], guidance: Guidance) -> Guided {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * GUIDED_INPUTS];
     let band = |(i, out): (usize, &mut [f32])| {
         let rows = i * BAND..(i * BAND + BAND).min(height);
-        let guide = Guide::new(rendered, references, rows.clone(), occlusion);
+        let guide = Guide::new(rendered, references, rows.clone(), guidance);
         let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&guide.known);
         for (out, (pixel, known)) in out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels) {
             out[..INPUTS].copy_from_slice(pixel);
@@ -252,8 +256,8 @@ mod tests {
     }
 
     /// Share of the view that is known of, trust there, and how far what is shown there is from the truth, weighted by the trust.
-    fn judged(view: &KnownView, reference: &KnownView) -> (f64, f64, f64) {
-        let Guided { view: guided, uses } = guided(&view.rendered, &[reference], true);
+    fn judged(view: &KnownView, reference: &KnownView, guidance: Guidance) -> (f64, f64, f64) {
+        let Guided { view: guided, uses } = guided(&view.rendered, &[reference], guidance);
         let (seen, trust) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].trust / uses[0].seen.max(1) as f64);
         let (mut sum, mut all) = (0.0, 0.0);
         for (pixel, truth) in guided.data.chunks_exact(GUIDED_INPUTS).zip(view.truth.data.chunks_exact(3)) {
@@ -267,23 +271,37 @@ mod tests {
     #[test]
     fn what_looks_otherwise_than_rendered_is_not_trusted() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let (seen, trust, off) = judged(&view, &reference);
+        let (seen, trust, off) = judged(&view, &reference, Guidance::default());
         assert!((0.7..0.8).contains(&seen) && trust > 0.85 && off < 0.01, "right: {seen} {trust} {off}");
         // A plane a third too far away: the reference shows what lies eight pixels to the side.
-        let (_, trust, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0));
+        let (_, trust, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), Guidance::default());
         assert!(trust < 0.5, "shifted: {trust}");
         // Depths with noise within what counts as the same surface, seen from far aside.
         let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
-        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0));
-        let (_, trust, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)));
+        let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), Guidance::default());
+        let (_, trust, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
         assert!(trust < 0.8 * calm, "noisy: {trust} of {calm}");
         // A reference of something else.
         let mut other = wall(24, |_| 2.0);
         other.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
-        let (_, trust, _) = judged(&view, &other);
+        let (_, trust, _) = judged(&view, &other, Guidance::default());
         assert!(trust < 0.5, "other: {trust}");
         // One that looks away.
-        assert_eq!(judged(&view, &wall(500, |_| 2.0)).0, 0.0);
+        assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
+    }
+
+    /// Depths a little off put what a reference shows a pixel and more to the side: it is moved back; where depths are right it stays.
+    #[test]
+    fn alignment_moves_what_is_shown_to_where_it_fits() {
+        let off = |depth: f32, alignment: bool| {
+            let guidance = Guidance { alignment, ..Guidance::default() };
+            judged(&wall(0, |_| depth), &wall(24, |_| depth), guidance).2
+        };
+        for depth in [1.9, 2.1] {
+            let (moved, was) = (off(depth, true), off(depth, false));
+            assert!(moved < 0.7 * was, "depth {depth}: {moved} off where it was {was}");
+        }
+        assert!(off(2.0, true) < 0.01, "{}", off(2.0, true));
     }
 
     /// What something stands before is shown only by references that needn't see it.
@@ -292,7 +310,10 @@ mod tests {
         // The reference has a plate before the middle third of its picture.
         let plate = |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
-        let seen = |occlusion: bool| guided(&view.rendered, &[&reference], occlusion).uses[0].seen;
+        let seen = |occlusion: bool| {
+            let guidance = Guidance { occlusion, ..Guidance::default() };
+            guided(&view.rendered, &[&reference], guidance).uses[0].seen
+        };
         let hidden = (seen(false) - seen(true)) as f64 / (WIDTH * HEIGHT) as f64;
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
     }
@@ -301,11 +322,14 @@ mod tests {
     #[test]
     fn bands_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let whole = guided(&view.rendered, &[&reference], true).view;
-        let band = Guide::new(&view.rendered, &[&reference], 7..41, true);
-        assert_eq!(band.known.len(), 34 * WIDTH);
-        for (found, expected) in band.known.iter().zip(whole.data[7 * WIDTH * GUIDED_INPUTS..].chunks_exact(GUIDED_INPUTS)) {
-            assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
+        for guidance in [Guidance::default(), Guidance { alignment: true, ..Guidance::default() }] {
+            let whole = guided(&view.rendered, &[&reference], guidance).view;
+            let band = Guide::new(&view.rendered, &[&reference], 7..41, guidance);
+            assert_eq!(band.known.len(), 34 * WIDTH);
+            let expected = whole.data[7 * WIDTH * GUIDED_INPUTS..].chunks_exact(GUIDED_INPUTS);
+            for (found, expected) in band.known.iter().zip(expected) {
+                assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
+            }
         }
     }
 }

@@ -8,7 +8,7 @@
 //! says where they show it, and whether they see it at all.
 //!
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
-//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes.
+//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes, [`Guidance`] says how.
 //! * [`OwnPhotographs`]: LR pictures that views are made to agree with.
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
@@ -22,7 +22,7 @@
 //! use pixels::Picture;
 //! use refinement::{Architecture, Refiner};
 //! nets::deterministic();
-//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided: false, occlusion: true }, 7)?;
+//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance: None }, 7)?;
 //! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
@@ -30,14 +30,16 @@
 //! ```
 
 mod agreement;
+mod align;
 mod folded;
 mod guide;
 mod refiner;
+mod sums;
 mod trainer;
 mod view;
 
 pub use agreement::OwnPhotographs;
-pub use guide::{Guided, Use, guided};
+pub use guide::{Guidance, Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
 pub use view::{KnownView, Rendered};

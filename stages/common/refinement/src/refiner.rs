@@ -9,6 +9,7 @@ use tch::{TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn, samples};
+use crate::guide::Guidance;
 
 /// Size of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -18,21 +19,14 @@ pub struct Architecture {
     pub channels: u32,
     /// Residual blocks of two layers each.
     pub blocks: u32,
-    /// Whether it sees what references know, too.
-    pub guided: bool,
-    /// Whether a reference shows only what it sees by its own depth; without it also what something stands before.
-    #[serde(default = "yes")]
-    pub occlusion: bool,
-}
-
-fn yes() -> bool {
-    true
+    /// How it sees what references know; without it they aren't looked at.
+    pub guidance: Option<Guidance>,
 }
 
 impl Architecture {
     /// Channels of what it takes.
     pub(crate) fn inputs(self) -> usize {
-        if self.guided { GUIDED_INPUTS } else { INPUTS }
+        if self.guidance.is_some() { GUIDED_INPUTS } else { INPUTS }
     }
 }
 
@@ -287,7 +281,7 @@ mod tests {
     #[test]
     fn tiles_leave_no_seams() {
         nets::deterministic();
-        let architecture = Architecture { channels: 6, blocks: 2, guided: false, occlusion: true };
+        let architecture = Architecture { channels: 6, blocks: 2, guidance: None };
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = picture(width, height);
@@ -314,7 +308,7 @@ mod tests {
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
-        let mut refiner = random(Architecture { channels: 6, blocks: 1, guided: false, occlusion: true });
+        let mut refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
         let (dark, view) = (Picture::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), picture(16, 16));
         let added = |view: &Picture| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
@@ -326,7 +320,7 @@ mod tests {
     #[test]
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
-        let refiner = random(Architecture { channels: 6, blocks: 1, guided: false, occlusion: true });
+        let refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
         let view = picture(150, 10);
         let mirrored = |p: &Picture| {
             let data =
@@ -346,7 +340,7 @@ mod tests {
     fn what_is_written_is_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
-        let architecture = Architecture { channels: 6, blocks: 1, guided: true, occlusion: true };
+        let architecture = Architecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();

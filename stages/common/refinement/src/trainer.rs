@@ -9,8 +9,8 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
-use crate::guide::{Use, guided};
-use crate::refiner::{Architecture, GUIDED_INPUTS, OUTPUTS, Refiner};
+use crate::guide::{Guidance, Use, guided};
+use crate::refiner::{GUIDED_INPUTS, OUTPUTS, Refiner};
 use crate::view::KnownView;
 
 /// A training, step by step, that can be interrupted.
@@ -64,7 +64,7 @@ struct Pool {
 }
 
 impl Pool {
-    fn new(round: u64, options: &RefinerTraining, occlusion: bool, examples: &[KnownView]) -> Self {
+    fn new(round: u64, options: &RefinerTraining, guidance: Guidance, examples: &[KnownView]) -> Self {
         let view = |i: u64| {
             let mut draws = Draws::new(options.seed, POOLS, round * POOL + i);
             let mut draw = || draws.below(examples.len() as u64) as usize;
@@ -72,7 +72,7 @@ impl Pool {
             let alone = draws.below(ALONE) == 0;
             // A view is no reference for itself.
             let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
-            (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), occlusion).view)
+            (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
         };
         Self { round, views: (0..POOL).map(view).collect() }
     }
@@ -125,13 +125,10 @@ impl RefinerTrainer {
     pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Picture {
-            let Architecture { guided: is_guided, occlusion, .. } = self.refiner.architecture();
-            if !is_guided {
-                return example.rendered.view.clone();
-            }
+            let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
             let mut draws = Draws::new(self.options.seed, SCORES, i as u64);
             let drawn = (0..self.options.references).map(|_| draws.below(references.len() as u64) as usize);
-            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), occlusion);
+            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
             guided.uses.iter().for_each(|of_use| uses.add(of_use));
             guided.view
         };
@@ -175,10 +172,11 @@ impl Training for RefinerTrainer {
         let shards: Vec<(Refiner, Range<usize>)> =
             (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
         let (step, options) = (self.steps(), self.options);
-        let Architecture { guided: is_guided, occlusion, .. } = self.refiner.architecture();
         let round = step / ROUND;
-        if is_guided && self.pool.as_ref().is_none_or(|pool| pool.round != round) {
-            self.pool = Some(Pool::new(round, &options, occlusion, examples));
+        if let Some(guidance) = self.refiner.architecture().guidance
+            && self.pool.as_ref().is_none_or(|pool| pool.round != round)
+        {
+            self.pool = Some(Pool::new(round, &options, guidance, examples));
         }
         let subjects: Vec<Subject<'_>> = match &self.pool {
             Some(pool) => pool.views.iter().map(|(i, view)| Subject { view, truth: &examples[*i].truth }).collect(),
@@ -357,10 +355,10 @@ mod tests {
         KnownView { rendered, truth: Picture::new(32, 32, 3, truth) }
     }
 
-    fn trained(guided: bool) -> (RefinerTrainer, Vec<KnownView>) {
+    fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
         let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guided, occlusion: true }, 3).unwrap();
+        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
@@ -369,8 +367,8 @@ mod tests {
 
     #[test]
     fn a_blur_is_unlearnt() {
-        for guided in [false, true] {
-            let (trainer, examples) = trained(guided);
+        for guidance in [None, Some(Guidance::default())] {
+            let (trainer, examples) = trained(guidance);
             let scores = trainer.score(&[example(5)], &examples).unwrap();
             assert!(scores.refined_psnr > scores.rendered_psnr + 6.0, "{scores:?}");
             assert!(scores.strength > 0.8, "{scores:?}");
@@ -381,7 +379,7 @@ mod tests {
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
-        let pixels = guided(&view.rendered, &[&other], true).view;
+        let pixels = guided(&view.rendered, &[&other], Guidance::default()).view;
         let (mut seen, mut worst) = (0, 0.0f32);
         for (i, pixel) in pixels.data.chunks_exact(GUIDED_INPUTS).enumerate() {
             let column = i % 32;
@@ -396,6 +394,8 @@ mod tests {
             assert!(pixel[7] > if (5..20).contains(&column) { 0.8 } else { 0.5 }, "column {column}: {}", pixel[7]);
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
-        assert!(guided(&view.rendered, &[], true).view.data.chunks_exact(GUIDED_INPUTS).all(|p| p[4..] == [0.0; 7]));
+        assert!(
+            guided(&view.rendered, &[], Guidance::default()).view.data.chunks_exact(GUIDED_INPUTS).all(|p| p[4..] == [0.0; 7])
+        );
     }
 }
