@@ -95,14 +95,15 @@ for name, settings in PARTS[: options.variants]:
         rows.append({"variant": name, "scene": scene, "rendered": file["rendered_psnr"], "refined": file["refined_psnr"]})
         cells.write(options.out, rows)
 
-print(f"Views of the rehearsal left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")
-print("| variant | rendered | refined | gain | against the first |")
-print("| --- | --- | --- | --- | --- |")
-of = lambda name: [row for row in rows if row["variant"] == name]
-gain = lambda name: sum(row["refined"] - row["rendered"] for row in of(name)) / len(of(name))
-for name, _ in PARTS[: options.variants]:
-    mean = cells.mean(of(name))
-    print(f"| {name} | {mean['rendered']:.2f} | {mean['refined']:.2f} | {gain(name):+.2f} | {gain(name) - gain(PARTS[0][0]):+.2f} |")
+if rows:
+    print(f"Views of the rehearsal left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")
+    print("| variant | rendered | refined | gain | against the first |")
+    print("| --- | --- | --- | --- | --- |")
+    of = lambda name: [row for row in rows if row["variant"] == name]
+    gain = lambda name: sum(row["refined"] - row["rendered"] for row in of(name)) / len(of(name))
+    for name, _ in PARTS[: options.variants]:
+        mean = cells.mean(of(name))
+        print(f"| {name} | {mean['rendered']:.2f} | {mean['refined']:.2f} | {gain(name):+.2f} | {gain(name) - gain(PARTS[0][0]):+.2f} |")
 
 if options.paper_steps:
     paper: list[dict] = []
