@@ -1,5 +1,3 @@
-use std::ops::Range;
-
 use crate::guide::Shown;
 use crate::refiner::INPUTS;
 use crate::sums::Sums;
@@ -8,9 +6,9 @@ use crate::view::{KnownView, Rendered};
 /// Pixels that a reference is moved at most.
 const FARTHEST: f64 = 2.0;
 
-/// What a reference shows of rows, each pixel from where what lies around it fits what is rendered: one step of Lucas and Kanade (1981) from
+/// What a reference shows of rows from one on, each pixel from where what lies around it fits what is rendered: one step of Lucas and Kanade (1981) from
 /// where geometry puts it, held back by the detail that rendering lacks, whose squares stand for how little a difference says of a place.
-pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView, rows: Range<usize>) -> Vec<Shown> {
+pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView, first_row: usize) -> Vec<Shown> {
     let view = &rendered.view;
     let width = view.width;
     let pixel = |x: usize, y: usize| &view.data[(y * width + x) * INPUTS..(y * width + x + 1) * INPUTS];
@@ -23,7 +21,7 @@ pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView,
     let terms = |(i, own): (usize, &Shown)| {
         let mut terms = [0.0; 6];
         for c in (0..3).filter(|_| own.trust > 0.0) {
-            let (x, y) = slope(i % width, rows.start + i / width, c);
+            let (x, y) = slope(i % width, first_row + i / width, c);
             let (apart, lacks) = (f64::from(own.difference[c]), f64::from(own.lacking[c]));
             let of_channel = [x * x, x * y, y * y, x * apart, y * apart, lacks * lacks];
             terms.iter_mut().zip(of_channel).for_each(|(sum, term)| *sum += term);
@@ -46,23 +44,22 @@ pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView,
             return *own;
         }
         let share = (FARTHEST / length).min(1.0);
-        let (across, down) = (step(shown, width, i, 1, x), step(shown, width, i, width, y));
+        let across = step((x > 0).then(|| &shown[i - 1]), own, (x + 1 < width).then(|| &shown[i + 1]));
+        let down = step(i.checked_sub(width).map(|above| &shown[above]), own, shown.get(i + width));
         let place = std::array::from_fn(|k| own.place[k] + (share * (dx * across[k] + dy * down[k])) as f32);
-        Shown::new(reference, place, own.sight, pixel(x, rows.start + y))
+        Shown::new(reference, place, own.sight, pixel(x, first_row + y))
     };
     shown.iter().enumerate().map(moved).collect()
 }
 
-/// How far what a reference shows moves in it from a pixel to the next one, `apart` of which lie between neighbours in the list: the shorter of the steps
-/// to both sides, for the other may lead over an edge. 0 where no neighbour is shown; `before`: how many there are.
-fn step(shown: &[Shown], width: usize, i: usize, apart: usize, before: usize) -> [f64; 2] {
-    let last = if apart == 1 { before + 1 == width } else { i + apart >= shown.len() };
+/// How far what a reference shows moves in it from one pixel to the next: the shorter of the steps from the one before and to the one after, for the
+/// other may lead over an edge; 0 where neither is shown.
+fn step(before: Option<&Shown>, own: &Shown, after: Option<&Shown>) -> [f64; 2] {
     let between = |from: &Shown, to: &Shown| {
         let is_shown = from.trust > 0.0 && to.trust > 0.0;
         is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
     };
-    let forward = (!last).then(|| between(&shown[i], &shown[i + apart])).flatten();
-    let backward = (before > 0).then(|| between(&shown[i - apart], &shown[i])).flatten();
+    let steps = [after.and_then(|after| between(own, after)), before.and_then(|before| between(before, own))];
     let length = |[x, y]: &[f64; 2]| x.hypot(*y);
-    [forward, backward].into_iter().flatten().min_by(|a, b| length(a).total_cmp(&length(b))).unwrap_or([0.0; 2])
+    steps.into_iter().flatten().min_by(|a, b| length(a).total_cmp(&length(b))).unwrap_or([0.0; 2])
 }

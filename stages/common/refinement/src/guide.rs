@@ -155,7 +155,7 @@ fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guid
     let mut shown: Vec<Shown> =
         high.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
     if guidance.alignment {
-        shown = align(&shown, rendered, reference, high.clone());
+        shown = align(&shown, rendered, reference, high.start);
     }
     let terms = |pixel: &Shown| {
         let [r, g, b] = pixel.difference.map(f64::from);
