@@ -14,9 +14,12 @@ mod key;
 mod pipeline;
 mod plan;
 mod process;
+mod session;
 mod sink;
 mod sources;
 mod stages;
+mod verbs;
+mod words;
 
 pub use cli::main;
 pub use pipeline::{Pipeline, PipelineError, StageBlock};

@@ -1,0 +1,49 @@
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::Store;
+
+use crate::pipeline::Pipeline;
+use crate::plan::{Plan, PlanError, Request, State};
+
+/// What every verb works with.
+pub(crate) struct Session {
+    pub(crate) pipeline: Pipeline,
+    pub(crate) store: Store,
+    pub(crate) device: String,
+}
+
+impl Session {
+    pub(crate) fn open(pipeline: &Path, store: Option<&Path>, device: &str) -> anyhow::Result<Self> {
+        let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
+        let root = store.map_or_else(|| pipeline.folder().join(".nerf-sr"), Path::to_path_buf);
+        std::fs::create_dir_all(&root)
+            .with_context(|| format!("cannot open the store {}; name another with --store", root.display()))?;
+        // Stages get absolute paths, whatever folder they run in.
+        let root = root.canonicalize().with_context(|| root.display().to_string())?;
+        let store = Store::open(&root).context("cannot open the store; name another with --store")?;
+        Ok(Self { pipeline, store, device: device.to_owned() })
+    }
+
+    pub(crate) fn plan(&self, what: &Request) -> anyhow::Result<Plan> {
+        Ok(Plan::new(&self.pipeline, &self.store, what)?)
+    }
+
+    pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {
+        Ok(plan.states(&self.store, &self.device)?)
+    }
+}
+
+/// The nodes of a stage, by the stage's name.
+pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
+    let found: Vec<usize> = (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
+    if found.is_empty() {
+        let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
+        return Err(PlanError::Usage(format!(
+            "no stage {stage:?} in this plan; there are: {}",
+            known.into_iter().collect::<Vec<_>>().join(", ")
+        )));
+    }
+    Ok(found)
+}

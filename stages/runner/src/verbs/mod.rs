@@ -1,0 +1,17 @@
+//! What the command line can ask for, a file each.
+
+mod gc;
+mod log;
+mod plan;
+mod run;
+mod status;
+mod verify;
+mod why;
+
+pub(crate) use gc::gc;
+pub(crate) use log::log;
+pub(crate) use plan::plan;
+pub(crate) use run::run;
+pub(crate) use status::status;
+pub(crate) use verify::verify;
+pub(crate) use why::why;

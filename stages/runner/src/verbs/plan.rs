@@ -1,0 +1,15 @@
+use std::process::ExitCode;
+
+use crate::plan::Request;
+use crate::session::Session;
+use crate::words::words;
+
+/// Shows what `run` would do.
+pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
+    let plan = session.plan(what)?;
+    let states = session.states(&plan)?;
+    for (i, state) in states.iter().enumerate() {
+        println!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+    }
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,34 @@
+use std::process::ExitCode;
+
+use artifact::hash_json;
+
+use crate::execute::seconds;
+use crate::graph::state_word;
+use crate::plan::{Request, State};
+use crate::session::Session;
+use crate::words::age;
+
+/// Shows every stage with its artifact, age and time.
+pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
+    let plan = session.plan(what)?;
+    for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
+        let detail = match &state {
+            State::Cached(record) => {
+                let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
+                format!(
+                    "{}  {:>9.1} MB  {:>9}  {}",
+                    &record.output[..10],
+                    size as f64 / 1e6,
+                    seconds(record.seconds),
+                    age(record)
+                )
+            }
+            State::WillRun { key_parts } if session.store.partial(&hash_json(key_parts)).join("work").exists() => {
+                "has a checkpoint to go on from".to_owned()
+            }
+            _ => String::new(),
+        };
+        println!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
+    }
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,53 @@
+//! States of nodes, in words.
+
+use std::collections::BTreeSet;
+
+use artifact::{Record, hash_json};
+
+use crate::execute::seconds;
+use crate::key;
+use crate::plan::{Plan, State};
+use crate::session::Session;
+
+/// The nodes that will run for sure and on which a waiting node depends, directly or not.
+pub(crate) fn causes(states: &[State], index: usize) -> Vec<usize> {
+    let mut found = BTreeSet::new();
+    let mut waiting = vec![index];
+    while let Some(i) = waiting.pop() {
+        if let State::Waits { on } = &states[i] {
+            waiting.extend(on);
+            found.extend(on.iter().copied().filter(|&p| matches!(states[p], State::WillRun { .. })));
+        }
+    }
+    found.into_iter().collect()
+}
+
+/// A node's state in words; with records, why it will run.
+pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State, records: &[Record]) -> String {
+    match state {
+        State::Cached(record) => format!("cached ({}, made in {})", age(record), seconds(record.seconds)),
+        State::Waits { on } => {
+            let names: Vec<String> = on.iter().map(|&p| plan.nodes[p].label()).collect();
+            format!("waits for {}; if that comes out as before, it stays cached", names.join(", "))
+        }
+        State::WillRun { .. } if records.is_empty() => "will run".to_owned(),
+        State::WillRun { key_parts } => match key::explain(key_parts, &plan.nodes[index].stage, records) {
+            None => "will run: it never ran before".to_owned(),
+            Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
+                Some(record) => format!("will run: its artifact {} is gone or incomplete", &record.output[..10]),
+                None => "will run".to_owned(),
+            },
+            Some(changes) => format!("will run: {}", changes.join("; ")),
+        },
+    }
+}
+
+pub(crate) fn age(record: &Record) -> String {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs());
+    match now.saturating_sub(record.started_unix) {
+        s if s < 120 => format!("{s} s ago"),
+        s if s < 7200 => format!("{} min ago", s / 60),
+        s if s < 172_800 => format!("{} h ago", s / 3600),
+        s => format!("{} days ago", s / 86_400),
+    }
+}
