@@ -4,6 +4,7 @@ use std::process::ExitCode;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 
 use crate::execute::Options;
+use crate::gc::Choice;
 use crate::graph::{ascii, dot, svg};
 use crate::plan::{PlanError, Request};
 use crate::session::Session;
@@ -95,16 +96,31 @@ enum Verb {
         #[arg(long)]
         remove: bool,
     },
-    /// Remove artifacts that the pipeline doesn't come to any more
+    /// Keep what targets have, whatever `gc` is told
+    Pin {
+        /// What to call it
+        name: String,
+        #[command(flatten)]
+        what: What,
+    },
+    /// Take a pin away
+    Unpin {
+        /// What it is called
+        name: String,
+    },
+    /// Delete artifacts that nothing needs: no pin, no run in progress or of late, no target
     Gc {
         #[command(flatten)]
         what: What,
         /// Only say what would go
         #[arg(long)]
         dry_run: bool,
-        /// Keep what was made within so many days
+        /// Keep what was made or used within so many days
         #[arg(long, default_value_t = 7, value_name = "N")]
         keep_days: u64,
+        /// Delete checkpoints, too, of stages that were stopped
+        #[arg(long)]
+        drop_unfinished: bool,
     },
     /// Print shell completions
     Completions {
@@ -176,7 +192,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         }
         Verb::Log { stage, what } => verbs::log(&session, &stage, &what.into()),
         Verb::Verify { remove } => verbs::verify(&session.store, remove),
-        Verb::Gc { what, dry_run, keep_days } => verbs::gc(&session, &what.into(), dry_run, keep_days),
+        Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
+        Verb::Unpin { name } => verbs::unpin(&session, &name),
+        Verb::Gc { what, dry_run, keep_days, drop_unfinished } => {
+            verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished })
+        }
         Verb::Completions { .. } => unreachable!("handled before the session"),
     }
 }

@@ -5,14 +5,17 @@ use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, mpsc};
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
-use artifact::{Event, Pace, Record, Store, hash_json};
+use artifact::{
+    Attempt, Entered, Event, Holder, KeyLock, Pace, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time,
+};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use crate::key;
-use crate::plan::{Node, Origin, Plan, PlanError, input_hashes};
+use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use crate::process::{Call, StageFailure, Watcher};
+use crate::waiting::{by, enter, until_held};
 
 /// How to run.
 pub(crate) struct Options {
@@ -46,7 +49,7 @@ enum Progress {
 /// What a worker reports: the node, its record and whether it had to run.
 type Report = (usize, Result<(Record, bool), StageFailure>);
 
-pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBool) -> Outcome {
+pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options, stop: &AtomicBool) -> Outcome {
     let count = plan.nodes.len();
     let mut outcome = Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() };
     let mut progress: Vec<Progress> = (0..count).map(|_| Progress::Pending).collect();
@@ -72,9 +75,9 @@ pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBo
                 let (sender, display) = (sender.clone(), &display);
                 let threads = (options.threads / together).max(1);
                 scope.spawn(move || {
-                    let job = Job { node: &plan.nodes[index], store, options, threads, display, stop };
-                    // The receiver lives as long as the scope.
-                    sender.send((index, job.run(&parents))).ok();
+                    let job = Job { node: &plan.nodes[index], store, file, options, threads, display, stop };
+                    // Whatever happens to a worker, the run hears of it. The receiver lives as long as the scope.
+                    sender.send((index, unwound(|| job.run(&parents)))).ok();
                 });
             }
             if running == 0 {
@@ -101,10 +104,23 @@ pub(crate) fn run(plan: &Plan, store: &Store, options: &Options, stop: &AtomicBo
     outcome
 }
 
+/// Turns a panic into a failure: a fault of ours ends the run, it doesn't hang it.
+fn unwound<T>(work: impl FnOnce() -> Result<T, StageFailure>) -> Result<T, StageFailure> {
+    std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).unwrap_or_else(|payload| {
+        let text = payload.downcast_ref::<String>().map(String::as_str).or_else(|| payload.downcast_ref::<&str>().copied());
+        let message = format!("internal error of nerf-sr: {}; please report it", text.unwrap_or("a panic"));
+        Err(StageFailure { code: INTERNAL_ERROR, message })
+    })
+}
+
+/// Exit code of a fault of ours.
+const INTERNAL_ERROR: u8 = 70;
+
 /// One node's work.
 struct Job<'a> {
     node: &'a Node,
     store: &'a Store,
+    file: &'a RunFile,
     options: &'a Options,
     threads: usize,
     display: &'a Display,
@@ -114,38 +130,57 @@ struct Job<'a> {
 impl Job<'_> {
     /// Finds the record or makes it. `parents` are the outputs of the plan's nodes.
     fn run(&self, parents: &[Option<String>]) -> Result<(Record, bool), StageFailure> {
-        let fail = |message: String| StageFailure { code: 1, message };
         let output_of = |index: usize| parents[index].clone().expect("a node runs after its parents");
         let hashes = input_hashes(self.node, self.store, output_of).map_err(|e| match e {
             PlanError::Source(message) => StageFailure { code: 3, message },
-            other => fail(other.to_string()),
+            other => fail(other),
         })?;
         let key_parts = key::parts(self.node, &hashes, &self.options.device);
         let key = hash_json(&key_parts);
-        if let Some(record) = self.store.hit(&key) {
+        if let Some(record) = self.find(&key)? {
             return Ok((record, false));
         }
-        let lock = self.store.lock(&key).map_err(|e| fail(e.to_string()))?;
-        // Another runner may have made it while this one waited.
-        if let Some(record) = self.store.hit(&key) {
-            return Ok((record, false));
-        }
-        let attempt = self.store.begin(&key, &self.node.parameters).map_err(|e| fail(e.to_string()))?;
-        let inputs: Vec<(String, PathBuf)> = self
-            .node
-            .inputs
-            .iter()
-            .map(|input| {
-                let folder = match &input.from {
-                    Origin::Node { index, subtree } => {
-                        let object = self.store.object(&output_of(*index));
-                        subtree.as_ref().map_or(object.clone(), |s| object.join(s))
-                    }
-                    Origin::Folder(folder) => folder.clone(),
-                };
-                (input.name.clone(), folder)
-            })
-            .collect();
+        let lock = until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || self.store.try_lock(&key))?;
+        let action =
+            Unfinished { stage: self.node.stage.clone(), point: self.node.point.clone(), key_parts, started_unix: unix_time() };
+        let attempt = {
+            let entered = self.enter()?;
+            // Another runner may have made it while this one waited.
+            let kind = &self.node.program.description.output.kind;
+            if let Some(record) = self.store.hit_or_repair(&entered, &key, kind) {
+                return Ok((record, false));
+            }
+            self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
+        };
+        self.make(&lock, attempt, action, &output_of).map(|record| (record, true))
+    }
+
+    /// The record, if the action was done. Either way it is written down that this run needs it, so that it can't go meanwhile.
+    fn find(&self, key: &str) -> Result<Option<Record>, StageFailure> {
+        let entered = self.enter()?;
+        self.file.needs(&entered, &self.node.stage, key).map_err(fail)?;
+        Ok(self.store.hit(key))
+    }
+
+    fn enter(&self) -> Result<Entered, StageFailure> {
+        enter(self.store, self.stop, &|text| self.display.line(&format!("{}: {text}", self.node.label())))
+    }
+
+    fn say_waiting(&self, holder: Option<&Holder>, waited: Duration) {
+        let waited = seconds(waited.as_secs_f64());
+        self.display.line(&format!("{}: is being made{}; waits for it, for {waited} now", self.node.label(), by(holder)));
+    }
+
+    /// Calls the stage and takes in what it made.
+    fn make(
+        &self,
+        lock: &KeyLock,
+        attempt: Attempt,
+        action: Unfinished,
+        output_of: &dyn Fn(usize) -> String,
+    ) -> Result<Record, StageFailure> {
+        let inputs: Vec<(String, PathBuf)> =
+            self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, output_of))).collect();
         let call = Call {
             program: &self.node.program,
             params: &attempt.params,
@@ -154,30 +189,44 @@ impl Job<'_> {
             work: Some(&attempt.work),
             device: &self.options.device,
             threads: self.threads,
-            lock: Some(&lock),
+            lock: Some(lock),
         };
         let label = self.node.label();
         let view = self.display.start(&label);
         let started = Instant::now();
-        let started_unix = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
         let result = call.run(&attempt.log, &view, self.stop);
         view.end();
         result?;
         let record = Record {
-            stage: self.node.stage.clone(),
-            point: self.node.point.clone(),
-            key_parts,
+            stage: action.stage,
+            point: action.point,
+            key_parts: action.key_parts,
             output: String::new(),
-            started_unix,
+            started_unix: action.started_unix,
             seconds: (started.elapsed().as_secs_f64() * 1e3).round() / 1e3,
             threads: self.threads,
-            host: std::fs::read_to_string("/proc/sys/kernel/hostname").map(|h| h.trim().to_owned()).unwrap_or_default(),
+            host: host_name(),
         };
-        let kind = &self.node.program.description.output.kind;
-        let record = self.store.publish(&attempt, kind, record).map_err(|e| fail(e.to_string()))?;
+        let checked = self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
+        let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
         self.display.line(&format!("{label}: done in {} → {}", seconds(record.seconds), &record.output[..10]));
-        Ok((record, true))
+        Ok(record)
     }
+
+    fn folder_of(&self, input: &NodeInput, output_of: &dyn Fn(usize) -> String) -> PathBuf {
+        match &input.from {
+            Origin::Node { index, subtree } => {
+                let object = self.store.object(&output_of(*index));
+                subtree.as_ref().map_or(object.clone(), |s| object.join(s))
+            }
+            Origin::Folder(folder) => folder.clone(),
+        }
+    }
+}
+
+/// A failure that is neither the input's nor the numbers'.
+fn fail(error: impl std::fmt::Display) -> StageFailure {
+    StageFailure { code: 1, message: error.to_string() }
 }
 
 /// A time as people say it.
@@ -264,5 +313,17 @@ impl Watcher for StageView<'_> {
 
     fn said(&self, line: &str) {
         self.display.line(&format!("{}: {line}", self.label));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_panic_of_a_worker_is_a_failure() {
+        let failure = unwound::<()>(|| panic!("{} went wrong", "this")).unwrap_err();
+        assert_eq!((failure.code, failure.message.contains("this went wrong")), (INTERNAL_ERROR, true));
+        assert_eq!(unwound(|| Ok(3)).unwrap(), 3);
     }
 }

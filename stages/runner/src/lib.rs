@@ -14,11 +14,14 @@ mod key;
 mod pipeline;
 mod plan;
 mod process;
+mod publish;
 mod session;
+mod signals;
 mod sink;
 mod sources;
 mod stages;
 mod verbs;
+mod waiting;
 mod words;
 
 pub use cli::main;

@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Record, Schema, Store};
+use artifact::{Record, Schema, Store, Waiting};
 use serde_json::{Map, Value};
 
 use crate::key;
@@ -109,6 +109,14 @@ impl Node {
     /// Stage and point, as people read it.
     pub fn label(&self) -> String {
         if self.point.is_empty() { self.stage.clone() } else { format!("{} [{}]", self.stage, self.point) }
+    }
+
+    /// What a record of it looks like, while its inputs aren't known.
+    pub(crate) fn waiting(&self) -> Waiting {
+        Waiting {
+            program: self.program.description.name.clone(),
+            parameters: self.parameters.as_object().cloned().unwrap_or_default(),
+        }
     }
 
     /// The nodes it needs.

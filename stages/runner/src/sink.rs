@@ -5,12 +5,13 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{RunInput, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
 
 use crate::execute::{Display, Options, Outcome};
 use crate::plan::{Origin, Plan, Sink};
 use crate::process::{Call, StageFailure};
+use crate::publish;
 
 /// The record of the nodes that a sink shows and all they were made of.
 fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<RunRecord> {
@@ -57,35 +58,36 @@ pub(crate) enum Shown {
     Missing,
 }
 
+/// What all sinks of a run have in common.
+pub(crate) struct Showing<'a> {
+    pub(crate) plan: &'a Plan,
+    pub(crate) store: &'a Store,
+    pub(crate) run: &'a RunFile,
+    /// Where pages go.
+    pub(crate) out: &'a Path,
+    pub(crate) options: &'a Options,
+    pub(crate) stop: &'a AtomicBool,
+}
+
 /// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(
-    plan: &Plan,
-    sink: &Sink,
-    outcome: &Outcome,
-    store: &Store,
-    out: &Path,
-    options: &Options,
-    stop: &AtomicBool,
-) -> Result<Shown, StageFailure> {
+pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Result<Shown, StageFailure> {
+    let Showing { plan, store, run, out, options, stop } = showing;
     let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
     let Some(record) = record(plan, sink, outcome, store) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
     let identity = hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}));
-    let mark = target.join(".shows");
-    if std::fs::read_to_string(&mark).is_ok_and(|shown| shown == identity) {
+    if publish::shows(&target, &identity) {
         return Ok(Shown::UpToDate(target));
     }
-    let scratch = store.root().join("sinks").join(&sink.stage);
-    // A sink's leftovers have no value.
-    std::fs::remove_dir_all(&scratch).ok();
-    let (run, params, output) = (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
-    std::fs::create_dir_all(&run)
-        .and_then(|()| write_json(&run.join("run.json"), &record))
+    let scratch = store.scratch(run.id()).join(&sink.stage);
+    let (folder, params, output) = (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
+    std::fs::create_dir_all(&folder)
+        .and_then(|()| write_json(&folder.join("run.json"), &record))
         .and_then(|()| write_json(&params, &sink.parameters))
         .map_err(|e| fail(&scratch, &e))?;
     let display = Display::new();
     let view = display.start(&sink.stage);
-    let inputs = [("run".to_owned(), run)];
+    let inputs = [("run".to_owned(), folder)];
     let call = Call {
         program: &sink.program,
         params: &params,
@@ -99,29 +101,15 @@ pub(crate) fn show(
     let result = call.run(&scratch.join("log"), &view, stop);
     view.end();
     result?;
-    std::fs::write(output.join(".shows"), identity).map_err(|e| fail(&output, &e))?;
-    std::fs::create_dir_all(out).map_err(|e| fail(out, &e))?;
-    if target.exists() {
-        std::fs::remove_dir_all(&target).map_err(|e| fail(&target, &e))?;
+    let kind = &sink.program.description.output.kind;
+    let manifest = output.join(MANIFEST_FILE);
+    if !manifest.exists() {
+        let found = Manifest::of_folder(kind, &output).map_err(|e| fail(&output, &e))?;
+        write_json(&manifest, &found).map_err(|e| fail(&manifest, &e))?;
     }
-    move_folder(&output, &target).map_err(|e| fail(&target, &e))?;
+    std::fs::write(output.join(publish::MARK), identity).map_err(|e| fail(&output, &e))?;
+    let target = publish::publish(&output, out, &sink.stage, kind, stop)?;
+    // A sink's leftovers have no value.
+    std::fs::remove_dir_all(&scratch).ok();
     Ok(Shown::Written(target))
-}
-
-/// Renames, or copies where the store lies on another file system.
-fn move_folder(from: &Path, to: &Path) -> std::io::Result<()> {
-    if std::fs::rename(from, to).is_ok() {
-        return Ok(());
-    }
-    std::fs::create_dir_all(to)?;
-    for entry in std::fs::read_dir(from)? {
-        let entry = entry?;
-        let target = to.join(entry.file_name());
-        if entry.file_type()?.is_dir() {
-            move_folder(&entry.path(), &target)?;
-        } else {
-            std::fs::copy(entry.path(), target)?;
-        }
-    }
-    Ok(())
 }

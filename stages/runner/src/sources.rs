@@ -1,13 +1,15 @@
+//! Content hashes of folders outside the store.
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use artifact::{Store, hash_folder, hash_json, write_atomically};
+use artifact::{Store, hash_files, hash_json, list_files, write_atomically};
 use serde::{Deserialize, Serialize};
 
-/// Content hashes of folders outside the store, kept by their files' paths, sizes and modification times.
+/// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times stay.
 #[derive(Default, Serialize, Deserialize)]
-struct Cache(BTreeMap<PathBuf, Entry>);
+struct Cache(BTreeMap<String, Entry>);
 
 #[derive(Serialize, Deserialize)]
 struct Entry {
@@ -17,23 +19,26 @@ struct Entry {
 
 /// The content hash of a folder outside the store.
 pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String> {
-    let fail = |e: std::io::Error| format!("{}: {e}; name a folder that is there", folder.display());
-    let absolute = folder.canonicalize().map_err(fail)?;
+    let fail = |e: std::io::Error| format!("{folder:?}: {e}");
+    let absolute = folder.canonicalize().map_err(|e| format!("{}; name a folder that is there", fail(e)))?;
     if !absolute.is_dir() {
-        return Err(format!("{}: not a folder", folder.display()));
+        return Err(format!("{folder:?}: not a folder"));
     }
-    let (listing, newest) = list(&absolute).map_err(fail)?;
+    let files = list_files(&absolute).map_err(fail)?;
+    let (listing, newest) = listing(&files).map_err(fail)?;
     let cache_file = store.root().join("cache/sources.json");
     let mut cache: Cache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
-    if let Some(entry) = cache.0.get(&absolute).filter(|e| e.listing == listing) {
+    let place = name_of(&absolute);
+    if let Some(entry) = cache.0.get(&place).filter(|e| e.listing == listing) {
         return Ok(entry.content.clone());
     }
-    let content = hash_json(&hash_folder(&absolute).map_err(fail)?);
+    let named = files.into_iter().map(|(relative, file)| (name_of(&relative), file)).collect();
+    let content = hash_json(&hash_files(named).map_err(fail)?);
     // A file changed within the clock's grain could change again unseen; such a listing isn't kept.
     let settled =
         SystemTime::now().duration_since(UNIX_EPOCH).is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
     if settled {
-        cache.0.insert(absolute, Entry { listing, content: content.clone() });
+        cache.0.insert(place, Entry { listing, content: content.clone() });
         if let Ok(bytes) = serde_json::to_vec(&cache) {
             write_atomically(&cache_file, &bytes).ok();
         }
@@ -42,23 +47,43 @@ pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String
 }
 
 /// A hash of every file's path, size and time, and the newest time.
-fn list(folder: &Path) -> std::io::Result<(String, u128)> {
-    let mut files = Vec::new();
+fn listing(files: &[(PathBuf, PathBuf)]) -> std::io::Result<(String, u128)> {
+    let mut entries = Vec::with_capacity(files.len());
     let mut newest = 0;
-    let mut waiting = vec![folder.to_path_buf()];
-    while let Some(folder) = waiting.pop() {
-        for entry in std::fs::read_dir(&folder)? {
-            let path = entry?.path();
-            let meta = std::fs::metadata(&path)?;
-            if meta.is_dir() {
-                waiting.push(path);
-            } else {
-                let time = meta.modified()?.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
-                newest = newest.max(time);
-                files.push((path, meta.len(), time.to_string()));
-            }
+    for (relative, file) in files {
+        let meta = std::fs::metadata(file)?;
+        let time = meta.modified()?.duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos());
+        newest = newest.max(time);
+        entries.push((name_of(relative), meta.len(), time.to_string()));
+    }
+    Ok((hash_json(&entries), newest))
+}
+
+/// A path as text, another for each path: names that aren't UTF-8 are written in hexadecimal after a NUL, which no name has.
+fn name_of(path: &Path) -> String {
+    path.to_str().map_or_else(
+        || path.as_os_str().as_encoded_bytes().iter().fold("\0".to_owned(), |text, byte| text + &format!("{byte:02x}")),
+        str::to_owned,
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt as _;
+
+    /// Any file name is taken, and each makes a hash of its own.
+    #[test]
+    fn any_name_has_a_hash() {
+        let dir = tempfile::tempdir().unwrap();
+        let (store, data) = (Store::open(&dir.path().join("store")).unwrap(), dir.path().join("data"));
+        let mut seen = std::collections::BTreeSet::new();
+        for name in [&b"plain"[..], b"\xff", b"\xfe", b"new\nline", b"\x1b]0;title\x07", "übung 🎈".as_bytes(), b"ff"] {
+            std::fs::create_dir_all(&data).unwrap();
+            std::fs::write(data.join(OsStr::from_bytes(name)), "x").unwrap();
+            assert!(seen.insert(hash_source(&store, &data).unwrap()), "{name:?}");
+            std::fs::remove_dir_all(&data).unwrap();
         }
     }
-    files.sort();
-    Ok((hash_json(&files), newest))
 }

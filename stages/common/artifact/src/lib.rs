@@ -3,7 +3,7 @@
 //! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked parameters, `describe`, progress,
 //!   exit codes, interruption and an atomic output for free.
 //! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and blake3); its hash is the artifact's identity.
-//! * [`Store`]: objects by content, actions by key, one OS lock a key.
+//! * [`Store`]: objects by content, actions by key, one OS lock a key; what runs and pins need.
 //! * [`RunRecord`]: what a sink (the report) is told of a run.
 //! * [`canonical`]: the one JSON form that is ever hashed.
 //!
@@ -38,11 +38,13 @@ mod canonical;
 mod describe;
 mod failure;
 mod fsio;
+mod lock;
 mod manifest;
 mod parameters;
 mod parts;
 mod progress;
 mod run_record;
+mod runs;
 mod stage;
 mod store;
 
@@ -50,9 +52,22 @@ pub use canonical::{canonical, hash_json};
 pub use describe::{Description, Input, Output};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
-pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_folder, relative_path};
+pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
+pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path};
 pub use parameters::{ParameterProblem, Schema};
 pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run_record::{RunInput, RunNode, RunRecord};
+pub use runs::{Run, RunFile, Waiting};
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{Attempt, KeyLock, Record, Store, StoreError};
+pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished};
+
+/// Seconds since 1970.
+pub fn unix_time() -> u64 {
+    std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs())
+}
+
+/// Tells names apart that one process gives.
+fn unique() -> u32 {
+    static COUNT: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+    COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed)
+}

@@ -82,8 +82,9 @@ pub enum Damage {
 impl Manifest {
     /// Hashes every file below `folder` (but its manifest).
     pub fn of_folder(kind: &str, folder: &Path) -> io::Result<Self> {
-        let mut files = hash_folder(folder)?;
-        files.retain(|f| f.path != MANIFEST_FILE);
+        let files = list_files(folder)?.into_iter().filter(|(relative, _)| relative != Path::new(MANIFEST_FILE));
+        let named = files.map(|(relative, file)| Ok((manifest_path(&relative)?, file))).collect::<io::Result<_>>()?;
+        let files = hash_files(named)?;
         Ok(Self { kind: kind.to_owned(), schema: SCHEMA, files })
     }
 
@@ -158,28 +159,37 @@ impl Manifest {
     }
 }
 
-/// Path, size and blake3 of every file below `folder`, sorted by path. Symbolic links are followed.
-pub fn hash_folder(folder: &Path) -> io::Result<Vec<FileEntry>> {
+/// Every file below a folder with its path inside it, in the order of names. Symbolic links are followed; one that leads back up is
+/// an error that names it.
+pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
     let mut found = Vec::new();
     for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
-        let entry = entry.map_err(io::Error::from)?;
+        let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
+            (Some(link), Some(up)) => io::Error::other(format!("{link:?} is a link that leads back to {up:?}; remove the link")),
+            _ => io::Error::from(error),
+        })?;
         if entry.file_type().is_file() {
-            let relative = entry.path().strip_prefix(folder).map_err(io::Error::other)?;
-            let path = relative
-                .components()
-                .map(|part| part.as_os_str().to_str())
-                .collect::<Option<Vec<_>>>()
-                .ok_or_else(|| io::Error::other(format!("{}: a file name that isn't UTF-8", entry.path().display())))?
-                .join("/");
-            found.push((path, entry.into_path()));
+            let relative = entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
+            found.push((relative, entry.into_path()));
         }
     }
-    let mut files: Vec<FileEntry> = found
-        .into_par_iter()
-        .map(|(path, file)| Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? }))
-        .collect::<io::Result<_>>()?;
-    files.sort();
-    Ok(files)
+    Ok(found)
+}
+
+/// Path, size and blake3 of files, sorted by path.
+pub fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
+    let entry = |(path, file): (String, PathBuf)| -> io::Result<FileEntry> {
+        Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? })
+    };
+    let mut entries: Vec<FileEntry> = files.into_par_iter().map(entry).collect::<io::Result<_>>()?;
+    entries.sort();
+    Ok(entries)
+}
+
+/// A path inside an artifact as its manifest has it: parts with `/` between them, all UTF-8.
+fn manifest_path(relative: &Path) -> io::Result<String> {
+    let parts: Option<Vec<&str>> = relative.components().map(|part| part.as_os_str().to_str()).collect();
+    parts.map(|parts| parts.join("/")).ok_or_else(|| io::Error::other(format!("{relative:?}: a file name that isn't UTF-8")))
 }
 
 fn hash_file(path: &Path) -> io::Result<String> {
@@ -237,6 +247,24 @@ mod tests {
         manifest.check_sizes(dir.path()).unwrap();
         let damage = manifest.check_contents(dir.path()).unwrap_err();
         assert!(matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")), "{damage}");
+    }
+
+    #[test]
+    fn names_that_no_manifest_can_have_are_refused() {
+        use std::os::unix::ffi::OsStrExt as _;
+        let (dir, _) = example();
+        let name = std::ffi::OsStr::from_bytes(b"r_\xff\x1b.png");
+        fs::write(dir.path().join(name), "").unwrap();
+        let message = Manifest::of_folder("scene", dir.path()).unwrap_err().to_string();
+        assert!(message.contains(r"r_\xFF\u{1b}.png") && message.contains("isn't UTF-8"), "{message}");
+    }
+
+    #[test]
+    fn a_link_that_leads_back_is_named() {
+        let (dir, _) = example();
+        std::os::unix::fs::symlink(dir.path(), dir.path().join("train/loop")).unwrap();
+        let message = list_files(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("train/loop") && message.contains("leads back"), "{message}");
     }
 
     #[test]

@@ -8,7 +8,9 @@ use serde_json::{Map, Value};
 
 use crate::canonical::hash_json;
 use crate::fsio::{sync_folder, write_atomically, write_json};
+use crate::lock::Entered;
 use crate::manifest::{Damage, MANIFEST_FILE, Manifest};
+use crate::{unique, unix_time};
 
 /// Artifacts by content and actions by key, in one folder.
 ///
@@ -16,8 +18,11 @@ use crate::manifest::{Damage, MANIFEST_FILE, Manifest};
 /// objects/HASH/         an artifact: artifact.json and its files
 /// actions/KEY.json      a finished action: its whole key, its output, when, where, in how long
 /// actions/KEY.log       what it said
-/// partial/KEY/work      checkpoints of an action that hasn't finished; never hashed
+/// partial/KEY/          an action that hasn't finished: action.json, what it said, and in work/ its checkpoints
 /// locks/KEY             one OS lock a key: the kernel drops it, whatever happens to the process
+/// runs/ID.jsonl         what a run needs, written while it goes on; pins/NAME.jsonl: what is kept for good
+/// gate                  entered by runs for moments, closed by garbage collection
+/// format                version of all this
 /// ```
 ///
 /// An object is made in `partial/`, checked, hashed, fsynced and renamed; the record goes last. So what is recorded is whole.
@@ -27,7 +32,7 @@ pub struct Store {
 }
 
 /// `actions/KEY.json`: the whole key and what came of it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Record {
     /// Name of the stage's block in pipeline.yaml.
@@ -55,6 +60,19 @@ impl Record {
     }
 }
 
+/// `partial/KEY/action.json`: an action that was begun.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Unfinished {
+    /// Name of the stage's block in pipeline.yaml.
+    pub stage: String,
+    /// The sweep's point.
+    pub point: String,
+    /// Every part of the key, by name.
+    pub key_parts: Map<String, Value>,
+    /// When it was begun, seconds since 1970.
+    pub started_unix: u64,
+}
+
 /// What can go wrong in a store.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
@@ -72,21 +90,20 @@ pub enum StoreError {
     /// A stage ended well but left no proper artifact.
     #[error("the stage ended without a proper artifact: {0}")]
     NoArtifact(String),
+    /// A newer program made the store.
+    #[error(
+        "{path}: the store has format {found}, this nerf-sr knows format {FORMAT}; use the newer nerf-sr, or another folder with --store"
+    )]
+    Newer {
+        /// The store.
+        path: PathBuf,
+        /// Its format.
+        found: String,
+    },
 }
 
-/// The lock on a key; held while it, or a process that was handed [`KeyLock::share`], lives.
-#[derive(Debug)]
-pub struct KeyLock {
-    file: File,
-}
-
-impl KeyLock {
-    /// The lock's file, to be handed to the stage (as its standard input, which reads as empty): so the lock outlives a runner
-    /// that is killed while its stage is still writing.
-    pub fn share(&self) -> io::Result<File> {
-        self.file.try_clone()
-    }
-}
+/// Version of a store's layout. It grows when an older runner could harm what a newer one wrote.
+const FORMAT: u32 = 1;
 
 /// An action being carried out: where it writes.
 #[derive(Debug)]
@@ -102,16 +119,31 @@ pub struct Attempt {
     folder: PathBuf,
 }
 
-fn at<T>(path: &Path, result: io::Result<T>) -> Result<T, StoreError> {
+/// What an attempt made, found whole.
+#[derive(Debug)]
+pub struct Checked {
+    attempt: Attempt,
+    identity: String,
+    /// Whether the store has such an object already.
+    is_there: bool,
+}
+
+pub(crate) fn at<T>(path: &Path, result: io::Result<T>) -> Result<T, StoreError> {
     result.map_err(|source| StoreError::Io { path: path.to_path_buf(), source })
 }
 
 impl Store {
     /// Opens the store in a folder, making it where it isn't there.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
-        for folder in ["objects", "actions", "partial", "locks", "cache"] {
+        at(root, fs::create_dir_all(root))?;
+        check_format(root)?;
+        for folder in ["objects", "actions", "partial", "locks", "cache", "runs", "pins", "sinks", "trash"] {
             let path = root.join(folder);
-            at(&path, fs::create_dir_all(&path))?;
+            match fs::create_dir_all(&path) {
+                // An old store that can't be written still shows what it has.
+                Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => {}
+                result => at(&path, result)?,
+            }
         }
         Ok(Self { root: root.to_path_buf() })
     }
@@ -121,20 +153,30 @@ impl Store {
         &self.root
     }
 
-    /// Waits for the key's lock. Take it, look for the record again, then act.
-    pub fn lock(&self, key: &str) -> Result<KeyLock, StoreError> {
-        let path = self.root.join("locks").join(key);
-        let file = at(&path, File::options().create(true).read(true).append(true).open(&path))?;
-        at(&path, file.lock())?;
-        Ok(KeyLock { file })
-    }
-
     /// The record of a key, if the action was done and its object is whole (sizes only; see [`Store::verify`]).
     pub fn hit(&self, key: &str) -> Option<Record> {
         let record = self.record(key)?;
-        let manifest = self.manifest(&record.output).ok()?;
+        let manifest = self.manifest(&record.output).ok().filter(|manifest| manifest.identity() == record.output)?;
         manifest.check_sizes(&self.object(&record.output)).ok()?;
         Some(record)
+    }
+
+    /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut short or another's, that is
+    /// written again. `kind` is what the stage makes.
+    pub fn hit_or_repair(&self, _: &Entered, key: &str, kind: &str) -> Option<Record> {
+        if let Some(record) = self.hit(key) {
+            return Some(record);
+        }
+        let record = self.record(key)?;
+        let object = self.object(&record.output);
+        let found = Manifest::of_folder(kind, &object).ok()?;
+        if found.identity() != record.output {
+            return None;
+        }
+        let mut text = serde_json::to_string_pretty(&found).ok()?;
+        text.push('\n');
+        write_atomically(&object.join(MANIFEST_FILE), text.as_bytes()).ok()?;
+        self.hit(key)
     }
 
     /// The record of a key. One that doesn't parse counts as absent: the action is run again.
@@ -149,19 +191,32 @@ impl Store {
         Ok(keys.iter().filter_map(|name| self.record(name.strip_suffix(".json")?)).collect())
     }
 
-    /// Identities of all objects, sorted.
-    pub fn objects(&self) -> Result<Vec<String>, StoreError> {
-        self.names("objects")
+    /// Keys that have any file among the actions, sorted: records that can't be read are among them.
+    pub fn action_files(&self) -> Result<Vec<String>, StoreError> {
+        let names = self.names("actions")?;
+        let mut keys: Vec<String> = names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned())).collect();
+        keys.dedup();
+        Ok(keys)
     }
 
-    /// Keys with checkpoints of an unfinished action, sorted.
+    /// Identities of all objects, sorted. Names that can't be an identity are somebody else's.
+    pub fn objects(&self) -> Result<Vec<String>, StoreError> {
+        let mut names = self.names("objects")?;
+        names.retain(|name| name.len() == 64 && name.bytes().all(|b| b.is_ascii_hexdigit()));
+        Ok(names)
+    }
+
+    /// Keys of actions that haven't finished, sorted.
     pub fn partials(&self) -> Result<Vec<String>, StoreError> {
         self.names("partial")
     }
 
-    fn names(&self, folder: &str) -> Result<Vec<String>, StoreError> {
+    pub(crate) fn names(&self, folder: &str) -> Result<Vec<String>, StoreError> {
         let folder = self.root.join(folder);
-        let entries = at(&folder, fs::read_dir(&folder))?;
+        let entries = match fs::read_dir(&folder) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => at(&folder, entries)?,
+        };
         let mut names: Vec<String> =
             entries.filter_map(|e| e.ok()?.file_name().into_string().ok()).filter(|n| !n.starts_with('.')).collect();
         names.sort_unstable();
@@ -188,9 +243,20 @@ impl Store {
         self.root.join("actions").join(format!("{key}.{extension}"))
     }
 
+    /// An action that was begun, where its file is whole.
+    pub fn unfinished(&self, key: &str) -> Option<Unfinished> {
+        serde_json::from_slice(&fs::read(self.partial(key).join("action.json")).ok()?).ok()
+    }
+
+    /// Whether an unfinished action left a checkpoint.
+    pub fn has_checkpoint(&self, key: &str) -> bool {
+        let files = walkdir::WalkDir::new(self.partial(key).join("work")).into_iter().flatten();
+        files.into_iter().any(|entry| entry.file_type().is_file())
+    }
+
     /// Begins an action, with its key locked. Leftovers of a killed attempt are cleared, its checkpoints kept.
-    pub fn begin(&self, key: &str, params: &Value) -> Result<Attempt, StoreError> {
-        let folder = self.partial(key);
+    pub fn begin(&self, _: &Entered, action: &Unfinished, params: &Value) -> Result<Attempt, StoreError> {
+        let folder = self.partial(&hash_json(&action.key_parts));
         let attempt = Attempt {
             output: folder.join("output"),
             work: folder.join("work"),
@@ -204,13 +270,15 @@ impl Store {
                 at(&leftover, fs::remove_dir_all(&leftover))?;
             }
         }
+        let file = folder.join("action.json");
+        at(&file, write_json(&file, action))?;
         at(&attempt.params, write_json(&attempt.params, params))?;
         Ok(attempt)
     }
 
-    /// Takes in what an attempt made: checks the manifest against the files, moves the object, writes the record last.
-    /// The record's `output` is set to the object's identity.
-    pub fn publish(&self, attempt: &Attempt, kind: &str, mut record: Record) -> Result<Record, StoreError> {
+    /// Looks at what an attempt made: checks the manifest against the files and makes both durable. This takes its time; taking
+    /// it in ([`Store::publish`]) doesn't.
+    pub fn check(&self, attempt: Attempt, kind: &str) -> Result<Checked, StoreError> {
         let output = &attempt.output;
         if !output.is_dir() {
             return Err(StoreError::NoArtifact("its --output was not made".to_owned()));
@@ -230,20 +298,28 @@ impl Store {
         if found.files.is_empty() {
             return Err(StoreError::NoArtifact("it has no files".to_owned()));
         }
-        for file in &found.files {
-            let path = output.join(&file.path);
+        for file in found.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
+            let path = output.join(file);
             at(&path, File::open(&path).and_then(|f| f.sync_all()))?;
         }
         at(output, sync_folder(output))?;
-        record.output = found.identity();
+        let identity = found.identity();
+        // What is there already under that name and isn't whole gives way.
+        let is_there = self.verify(&identity).is_ok();
+        Ok(Checked { attempt, identity, is_there })
+    }
+
+    /// Takes in what an attempt made: moves the object, writes the record last. The record's `output` is set to the object's
+    /// identity.
+    pub fn publish(&self, _: &Entered, checked: Checked, mut record: Record) -> Result<Record, StoreError> {
+        let Checked { attempt, identity, is_there } = checked;
+        record.output = identity;
         let object = self.object(&record.output);
-        if object.exists() && found.check_contents(&object).is_ok() {
-            at(output, fs::remove_dir_all(output))?;
-        } else {
-            if object.exists() {
-                at(&object, fs::remove_dir_all(&object))?;
+        if !is_there || !object.exists() {
+            if object.symlink_metadata().is_ok() {
+                self.discard(&object)?;
             }
-            at(&object, fs::rename(output, &object))?;
+            at(&object, fs::rename(&attempt.output, &object))?;
             at(&object, sync_folder(&self.root.join("objects")))?;
         }
         let key = record.key();
@@ -271,49 +347,100 @@ impl Store {
 
     /// Removes an object; records that name it count as absent from then on.
     pub fn remove_object(&self, identity: &str) -> Result<(), StoreError> {
-        let path = self.object(identity);
-        at(&path, fs::remove_dir_all(&path))
+        self.discard(&self.object(identity))
     }
 
     /// Removes an action's record and log.
     pub fn remove_record(&self, key: &str) -> Result<(), StoreError> {
-        let path = self.action(key, "json");
-        at(&path, fs::remove_file(&path))?;
-        fs::remove_file(self.action(key, "log")).ok();
+        // The record goes first: a log without a record is only a log.
+        for path in [self.action(key, "json"), self.action(key, "log")] {
+            match fs::remove_file(&path) {
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                result => at(&path, result)?,
+            }
+        }
         Ok(())
     }
 
-    /// Removes an unfinished action's checkpoints.
+    /// Removes an unfinished action with its checkpoints.
     pub fn remove_partial(&self, key: &str) -> Result<(), StoreError> {
-        let path = self.partial(key);
-        at(&path, fs::remove_dir_all(&path))
+        self.discard(&self.partial(key))
+    }
+
+    /// Takes a file or folder out of sight at once; [`Store::empty_trash`] deletes it.
+    fn discard(&self, path: &Path) -> Result<(), StoreError> {
+        let place = format!("{}-{}-{}", unix_time(), std::process::id(), unique());
+        at(path, fs::rename(path, self.root.join("trash").join(place)))
+    }
+
+    /// Deletes what was removed. It may take its time, and may be cut short at any point.
+    pub fn empty_trash(&self) -> Result<(), StoreError> {
+        for name in self.names("trash")? {
+            let path = self.root.join("trash").join(name);
+            let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            match removed {
+                // Somebody else empties it, too.
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                result => at(&path, result)?,
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Refuses a store of a newer form; marks one that isn't marked yet.
+fn check_format(root: &Path) -> Result<(), StoreError> {
+    let path = root.join("format");
+    match fs::read_to_string(&path) {
+        Ok(text) => match text.trim().parse::<u32>() {
+            Ok(found) if found <= FORMAT => Ok(()),
+            _ => Err(StoreError::Newer { path: root.to_path_buf(), found: text.trim().chars().take(20).collect() }),
+        },
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            match write_atomically(&path, format!("{FORMAT}\n").as_bytes()) {
+                Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => Ok(()),
+                result => at(&path, result),
+            }
+        }
+        Err(source) => Err(StoreError::Io { path, source }),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lock::Locked;
     use serde_json::json;
 
-    fn record(name: &str) -> Record {
-        Record {
-            stage: name.to_owned(),
-            point: String::new(),
-            key_parts: json!({ "stage": name }).as_object().unwrap().clone(),
-            output: String::new(),
-            started_unix: 0,
-            seconds: 0.0,
-            threads: 1,
-            host: String::new(),
+    fn entered(store: &Store) -> Entered {
+        match store.try_enter().unwrap() {
+            Locked::Held(entered) => entered,
+            Locked::By(_) => panic!("closed"),
         }
     }
 
+    fn unfinished(name: &str) -> Unfinished {
+        Unfinished {
+            stage: name.to_owned(),
+            key_parts: json!({ "stage": name }).as_object().unwrap().clone(),
+            ..Default::default()
+        }
+    }
+
+    /// Begins an action and, unless told otherwise, makes its output.
+    fn begin(store: &Store, name: &str, content: Option<&str>) -> Attempt {
+        let attempt = store.begin(&entered(store), &unfinished(name), &json!({})).unwrap();
+        if let Some(content) = content {
+            fs::create_dir(&attempt.output).unwrap();
+            fs::write(attempt.output.join("x"), content).unwrap();
+        }
+        attempt
+    }
+
     fn make(store: &Store, name: &str, content: &str) -> Record {
-        let record = record(name);
-        let attempt = store.begin(&record.key(), &json!({})).unwrap();
-        fs::create_dir(&attempt.output).unwrap();
-        fs::write(attempt.output.join("x"), content).unwrap();
-        store.publish(&attempt, "text", record).unwrap()
+        let checked = store.check(begin(store, name, Some(content)), "text").unwrap();
+        let Unfinished { stage, key_parts, .. } = unfinished(name);
+        store.publish(&entered(store), checked, Record { stage, key_parts, threads: 1, ..Record::default() }).unwrap()
     }
 
     #[test]
@@ -337,32 +464,61 @@ mod tests {
         assert!(matches!(store.verify(&done.output), Err(Damage::Content { .. })));
         fs::remove_file(store.object(&done.output).join("x")).unwrap();
         assert_eq!(store.hit(&done.key()), None);
+        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text"), None);
         // Made again, the damaged object is replaced.
         make(&store, "a", "1234");
         store.verify(&done.output).unwrap();
+    }
+
+    /// Whatever became of a manifest, it is written again; whatever stands in an object's place, it gives way to the object.
+    #[test]
+    fn manifests_are_repaired_and_objects_replaced() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let (done, other) = (make(&store, "a", "1234"), make(&store, "b", "other"));
+        let (object, manifest) = (store.object(&done.output), store.object(&done.output).join(MANIFEST_FILE));
+        let foreign = fs::read(store.object(&other.output).join(MANIFEST_FILE)).unwrap();
+        for damage in [None, Some(&b""[..]), Some(&b"{}"[..]), Some(&foreign[..])] {
+            fs::remove_file(&manifest).unwrap();
+            if let Some(bytes) = damage {
+                fs::write(&manifest, bytes).unwrap();
+            }
+            assert_eq!(store.hit(&done.key()), None);
+            assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").as_ref(), Some(&done));
+            store.verify(&done.output).unwrap();
+        }
+        fs::remove_dir_all(&object).unwrap();
+        fs::write(&object, "a file").unwrap();
+        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text"), None);
+        assert_eq!(make(&store, "a", "1234"), done);
+        fs::remove_file(&manifest).unwrap();
+        assert_eq!(make(&store, "a", "1234"), done);
+        store.verify(&done.output).unwrap();
+        store.empty_trash().unwrap();
+        assert_eq!(fs::read_dir(dir.path().join("trash")).unwrap().count(), 0);
     }
 
     #[test]
     fn success_without_an_artifact_is_a_failure() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let attempt = store.begin("k", &json!({})).unwrap();
-        assert!(matches!(store.publish(&attempt, "text", record("a")), Err(StoreError::NoArtifact(_))));
-        fs::create_dir(&attempt.output).unwrap();
-        fs::write(attempt.output.join("x"), "1").unwrap();
+        assert!(matches!(store.check(begin(&store, "k", None), "text"), Err(StoreError::NoArtifact(_))));
+        let attempt = begin(&store, "k", Some("1"));
         fs::write(attempt.output.join(MANIFEST_FILE), r#"{"kind":"text","schema":1,"files":[]}"#).unwrap();
-        assert!(matches!(store.publish(&attempt, "text", record("a")), Err(StoreError::NoArtifact(_))));
+        assert!(matches!(store.check(attempt, "text"), Err(StoreError::NoArtifact(_))));
         assert!(store.objects().unwrap().is_empty());
     }
 
     #[test]
-    fn a_lock_is_exclusive_and_dropped_with_its_owner() {
+    fn a_newer_store_is_refused_in_one_line() {
         let dir = tempfile::tempdir().unwrap();
-        let store = Store::open(dir.path()).unwrap();
-        let held = store.lock("k").unwrap();
-        let other = File::open(dir.path().join("locks/k")).unwrap();
-        assert!(other.try_lock().is_err());
-        drop(held);
-        other.try_lock().unwrap();
+        Store::open(dir.path()).unwrap();
+        assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "1\n");
+        Store::open(dir.path()).unwrap();
+        for text in ["2\n", "99", "", "new"] {
+            fs::write(dir.path().join("format"), text).unwrap();
+            let message = Store::open(dir.path()).unwrap_err().to_string();
+            assert!(message.contains("use the newer nerf-sr") && !message.contains('\n'), "{message}");
+        }
     }
 }

@@ -1,28 +1,58 @@
-use std::collections::BTreeSet;
 use std::process::ExitCode;
 
-use artifact::hash_json;
+use artifact::{Failure, hash_json};
 
+use crate::execute::seconds;
+use crate::gc::{Choice, Root, judge};
 use crate::plan::{Request, State};
 use crate::session::Session;
+use crate::signals::stop_at_signals;
+use crate::waiting::until_held;
 
 /// Removes what nothing needs any more.
-pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, keep_days: u64) -> anyhow::Result<ExitCode> {
-    let plan = session.plan(what)?;
-    let states = session.states(&plan)?;
-    let keys: BTreeSet<String> = states
-        .iter()
-        .filter_map(|state| match state {
-            State::Cached(record) => Some(record.key()),
-            State::WillRun { key_parts } => Some(hash_json(key_parts)),
-            State::Waits { .. } => None,
-        })
-        .collect();
-    let garbage = crate::gc::find(&session.store, &keys, keep_days)?;
-    garbage.lines.iter().for_each(|line| println!("{line}"));
-    if !dry_run {
-        garbage.remove(&session.store)?;
+pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, choice: Choice) -> anyhow::Result<ExitCode> {
+    let store = &session.store;
+    let needed = needed(session, what)?;
+    if dry_run {
+        let verdict = judge(store, needed, choice)?;
+        verdict.lines().iter().for_each(|line| println!("{line}"));
+        let (goes, stays) = verdict.bytes();
+        println!("{:.1} MB would go, {:.1} MB would stay", goes as f64 / 1e6, stays as f64 / 1e6);
+        return Ok(ExitCode::SUCCESS);
     }
-    println!("{:.1} MB {}", garbage.bytes as f64 / 1e6, if dry_run { "would go" } else { "freed" });
+    let stop = stop_at_signals()?;
+    let say = |_: Option<&_>, waited: std::time::Duration| {
+        eprintln!("nerf-sr: waits until no run looks for artifacts, for {} now", seconds(waited.as_secs_f64()));
+    };
+    let closed = match until_held(&stop, &say, || store.try_close()) {
+        Ok(closed) => closed,
+        Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
+        Err(failure) => return Err(failure.into()),
+    };
+    let verdict = judge(store, needed, choice)?;
+    verdict.carry_out(store, &closed)?;
+    drop(closed);
+    verdict.lines().iter().for_each(|line| println!("{line}"));
+    store.empty_trash()?;
+    let (goes, stays) = verdict.bytes();
+    println!("{:.1} MB freed, {:.1} MB stay", goes as f64 / 1e6, stays as f64 / 1e6);
     Ok(ExitCode::SUCCESS)
+}
+
+/// What the pipeline needs with these arguments.
+fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
+    let plan = session.plan(what)?;
+    let mut root = Root { why: "the pipeline needs it".to_owned(), ..Root::default() };
+    for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
+        match state {
+            State::Cached(record) => {
+                root.keys.insert(record.key());
+            }
+            State::WillRun { key_parts } => {
+                root.keys.insert(hash_json(&key_parts));
+            }
+            State::Waits { .. } => root.waiting.push(node.waiting()),
+        }
+    }
+    Ok(root)
 }

@@ -2,6 +2,7 @@
 
 mod gc;
 mod log;
+mod pin;
 mod plan;
 mod run;
 mod status;
@@ -10,6 +11,7 @@ mod why;
 
 pub(crate) use gc::gc;
 pub(crate) use log::log;
+pub(crate) use pin::{pin, unpin};
 pub(crate) use plan::plan;
 pub(crate) use run::run;
 pub(crate) use status::status;

@@ -1,37 +1,72 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, SUMMARY_FILE};
+use artifact::{Failure, RunFile, SUMMARY_FILE, hash_json};
 
-use crate::execute::{self, Options};
-use crate::plan::Request;
+use crate::execute::{self, Options, Outcome};
+use crate::plan::{Plan, Request, State};
+use crate::process::StageFailure;
 use crate::session::Session;
-use crate::sink::{Shown, show};
+use crate::signals::stop_at_signals;
+use crate::sink::{Showing, Shown, show};
+use crate::waiting::enter;
 
 /// Makes what the targets need and shows it.
 pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path) -> anyhow::Result<ExitCode> {
-    let stop = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        signal_hook::flag::register(signal, Arc::clone(&stop))?;
-    }
+    let stop = stop_at_signals()?;
     let plan = session.plan(what)?;
-    let outcome = execute::run(&plan, &session.store, options, &stop);
-    if stop.load(Ordering::Relaxed) {
-        return Err(Failure::Interrupted.into());
+    let file = match register(session, &plan, &stop) {
+        Ok(file) => file,
+        Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
+        Err(error) => return Err(error.into()),
+    };
+    let outcome = execute::run(&plan, &session.store, &file, options, &stop);
+    let code = if stop.load(Ordering::Relaxed) {
+        Err(Failure::Interrupted.into())
+    } else if let Some((index, failure)) = outcome.failures.first() {
+        say_failure(&plan, *index, &outcome);
+        Ok(ExitCode::from(failure.code))
+    } else {
+        let showing = Showing { plan: &plan, store: &session.store, run: &file, out, options, stop: &stop };
+        say_results(session, &plan, &outcome).and_then(|()| show_all(&showing, &outcome)).map(|()| ExitCode::SUCCESS)
+    };
+    // A run whose end isn't written down, on a full disk, counts from its beginning.
+    file.end().ok();
+    code
+}
+
+/// Writes down what the run needs, as far as is known before it starts.
+fn register(session: &Session, plan: &Plan, stop: &AtomicBool) -> Result<RunFile, StageFailure> {
+    let fail = |e: artifact::StoreError| StageFailure { code: 1, message: e.to_string() };
+    let entered = enter(&session.store, stop, &|text| eprintln!("nerf-sr: {text}"))?;
+    let file = session.store.begin_run(&entered, std::env::args().collect()).map_err(fail)?;
+    // A source that can't be read is said when the stage's turn comes; other stages may not need it.
+    let states = session.states(plan).unwrap_or_default();
+    for (index, node) in plan.nodes.iter().enumerate() {
+        match states.get(index) {
+            Some(State::Cached(record)) => file.needs(&entered, &node.stage, &record.key()),
+            Some(State::WillRun { key_parts }) => file.needs(&entered, &node.stage, &hash_json(key_parts)),
+            Some(State::Waits { .. }) | None => file.waits(&entered, node.waiting()),
+        }
+        .map_err(fail)?;
     }
-    if let Some((index, failure)) = outcome.failures.first() {
-        let skipped = outcome.skipped.len();
-        eprintln!(
-            "nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said",
-            plan.nodes[*index].label(),
-            plan.nodes[*index].stage
-        );
-        return Ok(ExitCode::from(failure.code));
-    }
+    Ok(file)
+}
+
+fn say_failure(plan: &Plan, index: usize, outcome: &Outcome) {
+    let skipped = outcome.skipped.len();
+    eprintln!(
+        "nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said",
+        plan.nodes[index].label(),
+        plan.nodes[index].stage
+    );
+}
+
+/// Prints a few words on each result that nothing else is made of.
+fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Result<()> {
     let ends: BTreeSet<usize> =
         (0..plan.nodes.len()).filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i))).collect();
     for index in ends {
@@ -41,9 +76,19 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
             println!("{}: {}", plan.nodes[index].label(), summary.trim_end());
         }
     }
+    Ok(())
+}
+
+/// Calls the sinks and says what the run came to.
+fn show_all(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+    let plan = showing.plan;
     let mut wrote = false;
     for sink in &plan.sinks {
-        match show(&plan, sink, &outcome, &session.store, out, options, &stop).map_err(|e| anyhow!("{}: {e}", sink.stage))? {
+        let shown = show(showing, sink, outcome);
+        if showing.stop.load(Ordering::Relaxed) {
+            return Err(Failure::Interrupted.into());
+        }
+        match shown.map_err(|e| anyhow!("{}: {e}", sink.stage))? {
             Shown::Written(folder) => {
                 wrote = true;
                 println!("{}: {}", sink.stage, page(&folder).display());
@@ -52,17 +97,13 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
             Shown::Missing => println!("{}: nothing to show", sink.stage),
         }
     }
-    if outcome.ran.is_empty() && !wrote {
-        println!("nothing to run: all {} stages are cached", plan.nodes.len());
+    let (ran, all) = (outcome.ran.len(), plan.nodes.len());
+    if ran == 0 && !wrote {
+        println!("nothing to run: all {all} stages are cached");
     } else {
-        println!(
-            "{} of {} stages ran, {} were cached",
-            outcome.ran.len(),
-            plan.nodes.len(),
-            plan.nodes.len() - outcome.ran.len()
-        );
+        println!("{ran} of {all} stages ran, {} were cached", all - ran);
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(())
 }
 
 /// The page in a sink's folder, or the folder.

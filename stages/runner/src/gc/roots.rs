@@ -1,0 +1,65 @@
+use std::collections::BTreeSet;
+
+use artifact::{Run, Store, StoreError, Waiting, unix_time};
+
+use super::contents::Contents;
+
+/// Something that is needed, and why.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Root {
+    /// As people read it after "stays:".
+    pub(crate) why: String,
+    /// Keys of actions.
+    pub(crate) keys: BTreeSet<String>,
+    /// Nodes that any fitting record may belong to.
+    pub(crate) waiting: Vec<Waiting>,
+}
+
+/// What the person who collects garbage chooses.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Choice {
+    /// What was used within so many days stays.
+    pub(crate) keep_days: u64,
+    /// Whether checkpoints of actions that nobody works on go.
+    pub(crate) drop_unfinished: bool,
+}
+
+impl Choice {
+    /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be kept for its age.
+    pub(super) fn is_recent(self, unix: u64) -> bool {
+        unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
+    }
+}
+
+/// All roots of a store; where several hold a thing, the first says why.
+pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choice) -> Result<Vec<Root>, StoreError> {
+    let mut roots = vec![plan];
+    roots.extend(store.pins()?.into_iter().map(|pin| of_run(format!("pinned as {}", pin.id), pin)));
+    for run in store.runs()? {
+        if run.in_progress {
+            let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
+            roots.push(of_run(format!("process {process} is running it"), run));
+        } else if choice.is_recent(run.used_unix()) {
+            roots.push(of_run(format!("a run {} used it", ago(run.used_unix())), run));
+        }
+    }
+    let one = |why: String, key: &String| Root { why, keys: BTreeSet::from([key.clone()]), waiting: Vec::new() };
+    roots.extend(store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)));
+    for (key, record) in contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix)) {
+        roots.push(one(format!("made {}", ago(record.started_unix)), key));
+    }
+    if !choice.drop_unfinished {
+        let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));
+        roots.extend(with_checkpoint.map(|key| one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)));
+    }
+    Ok(roots)
+}
+
+fn of_run(why: String, run: Run) -> Root {
+    Root { why, keys: run.keys, waiting: run.waiting }
+}
+
+fn ago(unix: u64) -> String {
+    let hours = unix_time().saturating_sub(unix) / 3600;
+    if hours < 48 { format!("{hours} h ago") } else { format!("{} days ago", hours / 24) }
+}

@@ -1,0 +1,297 @@
+//! Garbage collection against its definition, on random stores.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+
+use artifact::{KeyLock, Locked, Manifest, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time};
+use proptest::prelude::*;
+use serde_json::{Map, Value, json};
+
+use super::{Choice, Root, judge};
+
+/// An action of a random store. Numbers name earlier actions, modulo how many there are.
+#[derive(Debug, Clone)]
+struct Action {
+    stage: u8,
+    parameter: u8,
+    /// Earlier actions whose objects it is made of, and whether a folder of them is meant.
+    inputs: Vec<(u8, bool)>,
+    /// What comes out; equal contents are one object.
+    content: u8,
+    days_old: u64,
+    state: Finished,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Finished {
+    Yes,
+    WithCheckpoint,
+    WithoutCheckpoint,
+}
+
+/// What holds actions.
+#[derive(Debug, Clone)]
+enum Holder {
+    Pin(Vec<u8>),
+    Lock(u8),
+    Run { keys: Vec<u8>, waiting: Vec<(u8, u8)>, days_ago: u64, in_progress: bool },
+}
+
+#[derive(Debug, Clone)]
+struct Case {
+    actions: Vec<Action>,
+    holders: Vec<Holder>,
+    plan: (Vec<u8>, Vec<(u8, u8)>),
+    keep_days: u64,
+    drop_unfinished: bool,
+}
+
+fn cases() -> impl Strategy<Value = Case> {
+    let state = prop_oneof![
+        6 => Just(Finished::Yes),
+        1 => Just(Finished::WithCheckpoint),
+        1 => Just(Finished::WithoutCheckpoint)
+    ];
+    let inputs = prop::collection::vec((any::<u8>(), any::<bool>()), 0..3);
+    let action =
+        (0..3u8, 0..2u8, inputs, 0..6u8, 0..20u64, state).prop_map(|(stage, parameter, inputs, content, days_old, state)| {
+            Action { stage, parameter, inputs, content, days_old, state }
+        });
+    let some = || prop::collection::vec(any::<u8>(), 0..3);
+    let waiting = || prop::collection::vec((0..3u8, 0..2u8), 0..2);
+    let holder = prop_oneof![
+        some().prop_map(Holder::Pin),
+        any::<u8>().prop_map(Holder::Lock),
+        (some(), waiting(), 0..20u64, any::<bool>()).prop_map(|(keys, waiting, days_ago, in_progress)| Holder::Run {
+            keys,
+            waiting,
+            days_ago,
+            in_progress
+        }),
+    ];
+    (
+        prop::collection::vec(action, 1..12),
+        prop::collection::vec(holder, 0..4),
+        (some(), waiting()),
+        prop_oneof![Just(0u64), Just(7)],
+        any::<bool>(),
+    )
+        .prop_map(|(actions, holders, plan, keep_days, drop_unfinished)| Case {
+            actions,
+            holders,
+            plan,
+            keep_days,
+            drop_unfinished,
+        })
+}
+
+/// A store made by a case, with what holds it open.
+struct Made {
+    _dir: tempfile::TempDir,
+    store: Store,
+    /// Each action's key.
+    keys: Vec<String>,
+    /// Every finished action and every unfinished one, by key: its key's parts.
+    parts: BTreeMap<String, Map<String, Value>>,
+    _locks: Vec<KeyLock>,
+    _runs: Vec<RunFile>,
+}
+
+fn held<T>(locked: Locked<T>) -> T {
+    match locked {
+        Locked::Held(held) => held,
+        Locked::By(holder) => panic!("held by {holder:?}"),
+    }
+}
+
+fn days_ago(days: u64) -> u64 {
+    unix_time() - days * 86_400
+}
+
+fn waiting((stage, parameter): (u8, u8)) -> Waiting {
+    let parameters = json!({ "p": parameter }).as_object().unwrap().clone();
+    Waiting { program: format!("s{stage}"), parameters }
+}
+
+fn make(case: &Case) -> Made {
+    // In memory where there is such a place: objects are synced to disk.
+    let memory = std::path::Path::new("/dev/shm");
+    let dir = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
+    let store = Store::open(dir.path()).unwrap();
+    let (mut keys, mut outputs, mut parts) = (Vec::new(), Vec::<Option<String>>::new(), BTreeMap::new());
+    for action in &case.actions {
+        let mut key_parts = Map::new();
+        key_parts.insert("stage".into(), json!(format!("s{}", action.stage)));
+        key_parts.insert("parameter p".into(), json!(action.parameter));
+        for (i, (earlier, is_folder)) in action.inputs.iter().enumerate() {
+            if let Some(output) = outputs.get(*earlier as usize % outputs.len().max(1)).cloned().flatten() {
+                let manifest = store.manifest(&output).unwrap();
+                let hash = if *is_folder { manifest.subtree("sub").identity() } else { output };
+                key_parts.insert(format!("input {i}"), json!(hash));
+            }
+        }
+        let (key, output) = make_action(&store, action, &key_parts);
+        parts.insert(key.clone(), key_parts);
+        keys.push(key);
+        outputs.push(output);
+    }
+    let (mut locks, mut runs) = (Vec::new(), Vec::new());
+    let key = |number: &u8| keys[*number as usize % keys.len()].clone();
+    for (i, holder) in case.holders.iter().enumerate() {
+        let entered = held(store.try_enter().unwrap());
+        match holder {
+            Holder::Pin(numbers) => {
+                let actions: Vec<(String, String)> = numbers.iter().map(|n| ("s".to_owned(), key(n))).collect();
+                store.pin(&entered, &format!("pin-{i}"), Vec::new(), &actions).unwrap();
+            }
+            Holder::Lock(number) => {
+                if let Locked::Held(lock) = store.try_lock(&key(number)).unwrap() {
+                    locks.push(lock);
+                }
+            }
+            Holder::Run { keys, waiting: nodes, days_ago: days, in_progress } => {
+                let run = store.begin_run(&entered, Vec::new()).unwrap();
+                keys.iter().for_each(|number| run.needs(&entered, "s", &key(number)).unwrap());
+                nodes.iter().for_each(|node| run.waits(&entered, waiting(*node)).unwrap());
+                if *in_progress {
+                    runs.push(run);
+                } else {
+                    let path = store.root().join(format!("runs/{}.jsonl", run.id()));
+                    drop(run);
+                    let text = fs::read_to_string(&path).unwrap() + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
+                    fs::write(&path, text).unwrap();
+                }
+            }
+        }
+    }
+    Made { _dir: dir, store, keys, parts, _locks: locks, _runs: runs }
+}
+
+/// Makes one action; gives its key and, if it finished, its object.
+fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>) -> (String, Option<String>) {
+    let key = hash_json(key_parts);
+    if let Some(record) = store.record(&key) {
+        return (key, Some(record.output));
+    }
+    let entered = held(store.try_enter().unwrap());
+    let stage = format!("s{}", action.stage);
+    let unfinished = Unfinished { stage: stage.clone(), key_parts: key_parts.clone(), ..Default::default() };
+    let attempt = store.begin(&entered, &unfinished, &json!({})).unwrap();
+    if action.state != Finished::Yes {
+        fs::create_dir_all(&attempt.work).unwrap();
+        if action.state == Finished::WithCheckpoint {
+            fs::write(attempt.work.join("checkpoint"), "x").unwrap();
+        }
+        return (key, None);
+    }
+    fs::create_dir_all(attempt.output.join("sub")).unwrap();
+    fs::write(attempt.output.join("own"), format!("{}", action.content)).unwrap();
+    // Different objects may share a folder, too.
+    fs::write(attempt.output.join("sub/shared"), format!("{}", action.content / 2)).unwrap();
+    let checked = store.check(attempt, "kind").unwrap();
+    let record = Record { stage, key_parts: key_parts.clone(), started_unix: days_ago(action.days_old), ..Record::default() };
+    let record = store.publish(&entered, checked, record).unwrap();
+    (key, Some(record.output))
+}
+
+/// What has to stay, by the definition: pass after pass until nothing joins.
+fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
+    let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
+    let recent = |days: u64| days < case.keep_days;
+    let mut stays: BTreeSet<String> = case.plan.0.iter().map(key).collect();
+    let mut nodes: Vec<(u8, u8)> = case.plan.1.clone();
+    for holder in &case.holders {
+        match holder {
+            Holder::Pin(numbers) => stays.extend(numbers.iter().map(key)),
+            Holder::Lock(number) => stays.extend([key(number)]),
+            Holder::Run { keys, waiting, days_ago, in_progress } if *in_progress || recent(*days_ago) => {
+                stays.extend(keys.iter().map(key));
+                nodes.extend(waiting);
+            }
+            Holder::Run { .. } => {}
+        }
+    }
+    for (number, parts) in &made.parts {
+        let record = made.store.record(number);
+        let fits = nodes
+            .iter()
+            .any(|(stage, parameter)| parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter));
+        let is_recent = record.as_ref().is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
+        let has_checkpoint = made.store.partial(number).join("work/checkpoint").exists() && !case.drop_unfinished;
+        if (record.is_some() && (fits || is_recent)) || has_checkpoint {
+            stays.insert(number.clone());
+        }
+    }
+    loop {
+        let mut more = stays.clone();
+        for key in &stays {
+            for (_, hash) in made.parts[key].iter().filter(|(name, _)| name.starts_with("input ")) {
+                for other in made.parts.keys() {
+                    let Some(record) = made.store.record(other) else { continue };
+                    let manifest: Manifest = made.store.manifest(&record.output).unwrap();
+                    if hash == &json!(record.output) || hash == &json!(manifest.subtree("sub").identity()) {
+                        more.insert(other.clone());
+                    }
+                }
+            }
+        }
+        if more == stays {
+            return stays;
+        }
+        stays = more;
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    /// Both ways: what a root reaches is never deleted, and everything else is.
+    #[test]
+    fn what_roots_reach_stays_and_all_else_goes(case in cases()) {
+        let made = make(&case);
+        let store = &made.store;
+        let stays = expected(&case, &made);
+        let records: BTreeSet<String> = stays.iter().filter(|key| store.record(key).is_some()).cloned().collect();
+        let unfinished: BTreeSet<String> = stays.iter().filter(|key| store.partial(key).exists()).cloned().collect();
+        let objects: BTreeSet<String> = records.iter().map(|key| store.record(key).unwrap().output).collect();
+        let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
+        let plan = Root {
+            why: "the plan".into(),
+            keys: case.plan.0.iter().map(key).collect(),
+            waiting: case.plan.1.iter().map(|node| waiting(*node)).collect(),
+        };
+        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished };
+
+        let verdict = judge(store, plan, choice).unwrap();
+        prop_assert_eq!(verdict.lines().len(), store.objects().unwrap().len() + store.partials().unwrap().len());
+        verdict.carry_out(store, &held(store.try_close().unwrap())).unwrap();
+        store.empty_trash().unwrap();
+
+        let left = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
+        prop_assert_eq!(left(store.action_files().unwrap()), records);
+        prop_assert_eq!(left(store.objects().unwrap()), objects);
+        prop_assert_eq!(left(store.partials().unwrap()), unfinished);
+        for object in store.objects().unwrap() {
+            store.verify(&object).unwrap();
+        }
+        prop_assert_eq!(fs::read_dir(store.root().join("trash")).unwrap().count(), 0);
+        for run in store.runs().unwrap() {
+            prop_assert!(run.in_progress || unix_time() - run.used_unix() < case.keep_days * 86_400);
+        }
+    }
+}
+
+/// An object that no record names goes, and so does a record that can't be read; the reason is said.
+#[test]
+fn orphans_go() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(dir.path()).unwrap();
+    let action = Action { stage: 0, parameter: 0, inputs: vec![], content: 1, days_old: 0, state: Finished::Yes };
+    let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
+    let (key, _) = make_action(&store, &action, &parts);
+    fs::write(store.action(&key, "json"), "{").unwrap();
+    let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false }).unwrap();
+    assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
+    verdict.carry_out(&store, &held(store.try_close().unwrap())).unwrap();
+    assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
+}
