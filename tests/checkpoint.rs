@@ -9,7 +9,7 @@ use std::process::Command;
 use common::{Finished, Project, demo_train, stage};
 
 fn here(file: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join(file)
+    common::root().join(file)
 }
 
 fn convert(coarse: &Path, fine: &Path, out: &Path) -> Finished {

@@ -152,7 +152,7 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
         eprintln!("skipped: no pycolmap (python3 -m pip install pycolmap)");
         return;
     }
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/write-colmap.py");
+    let script = common::root().join("scripts/write-colmap.py");
     let colmap = project.path("pycolmap");
     photographs(&project, "pycolmap");
     let model = colmap.join("sparse/0");

@@ -155,7 +155,7 @@ fn the_page_is_written_and_then_up_to_date() {
 #[test]
 fn a_stage_in_python_takes_evals_place() {
     let project = Project::tiny();
-    let script = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
+    let script = common::root().join("scripts/example-eval.py");
     std::fs::copy(script, project.path("my-eval.py")).unwrap();
     project.replace("  eval:\n", "  eval:\n    run: ./my-eval.py\n");
     let run = project.ok(&["run"]);

@@ -10,7 +10,7 @@ use common::Project;
 const DOCUMENTS: [&str; 2] = ["README.md", "docs/results.md"];
 
 fn read(path: impl AsRef<Path>) -> String {
-    std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+    std::fs::read_to_string(common::root().join(path)).unwrap()
 }
 
 fn documents() -> String {
@@ -82,7 +82,7 @@ fn pipeline_blocks_are_valid() {
     for block in blocks {
         let project = Project::tiny();
         std::fs::create_dir(project.path("scripts")).unwrap();
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts/example-eval.py");
+        let script = common::root().join("scripts/example-eval.py");
         std::fs::copy(script, project.path("scripts/example-eval.py")).unwrap();
         // Each block replaces the stage of its name.
         let name = block.lines().next().unwrap().trim().trim_end_matches(':').to_owned();
@@ -99,7 +99,7 @@ fn pipeline_blocks_are_valid() {
 #[test]
 fn links_lead_somewhere() {
     for document in DOCUMENTS {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(document).parent().unwrap().to_owned();
+        let folder = common::root().join(document).parent().unwrap().to_owned();
         for target in read(document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
             assert!(folder.join(target).exists(), "{document}: {target} is not there");
         }

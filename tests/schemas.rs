@@ -48,7 +48,7 @@ fn schemas_are_current() {
     ] {
         all.insert(format!("{name}.json"), schema);
     }
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("schemas");
+    let folder = common::root().join("schemas");
     let update = std::env::var_os("UPDATE").is_some();
     for (name, schema) in &all {
         let path = folder.join(name);
@@ -70,7 +70,7 @@ fn schemas_are_current() {
 fn artifacts_fit_their_schemas() {
     let project = common::Project::tiny();
     project.ok(&["run"]);
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("schemas");
+    let folder = common::root().join("schemas");
     let check = |schema: &str, file: &Path| {
         let read = |path: &Path| -> serde_json::Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() };
         let validator = jsonschema::validator_for(&read(&folder.join(schema))).unwrap();

@@ -28,7 +28,7 @@ fn project() -> Project {
 }
 
 fn goldens() -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("stages/upsample/tests/data")
+    common::root().join("stages/upsample/tests/data")
 }
 
 #[test]

@@ -4,12 +4,19 @@
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 use std::time::{Duration, SystemTime};
 
-/// The binaries' folder: that of the runner, where `make build` put the stages, too.
+/// The repository.
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().to_path_buf()
+}
+
+/// A program that `make build` made.
 pub fn bin(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_BIN_EXE_nerf-sr")).with_file_name(name);
+    // Test binaries lie one folder deeper.
+    let test = std::env::current_exe().unwrap();
+    let path = test.ancestors().nth(2).unwrap().join(name);
     assert!(path.exists(), "{} is not built; run `make build` first", path.display());
     path
 }
@@ -32,6 +39,27 @@ stages:
     inputs: {views: render-depth, truth: prep/truth}
 ";
 
+/// A pipeline of stages that take a tenth of a second each, with its page.
+pub const FAST: &str = "
+default: [report]
+stages:
+  demo-scene:
+    parameters: {size: 32, train: 6, test: 2, samples: 1}
+  prep:
+    inputs: {dataset: demo-scene}
+    parameters: {lr: 16, scale: 2}
+  train-ss:
+    inputs: {scene: prep/train}
+    parameters: {rays: 4000, levels: 2, finest: 32, log2_entries: 10, hidden: 16, steps: 64, batch: 512, samples: 4096}
+  render-depth:
+    inputs: {field: train-ss, cameras: prep/cameras}
+    parameters: {sub_rays: 1}
+  eval:
+    inputs: {views: render-depth, truth: prep/truth}
+  report:
+    inputs: {run: eval}
+";
+
 /// A folder with a pipeline.
 pub struct Project {
     dir: tempfile::TempDir,
@@ -46,6 +74,10 @@ impl Project {
 
     pub fn tiny() -> Self {
         Self::new(TINY)
+    }
+
+    pub fn fast() -> Self {
+        Self::new(FAST)
     }
 
     pub fn path(&self, file: &str) -> PathBuf {
@@ -67,9 +99,14 @@ impl Project {
     }
 
     pub fn command(&self, arguments: &[&str]) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_nerf-sr"));
+        let mut command = Command::new(bin("nerf-sr"));
         command.args(arguments).current_dir(self.dir.path()).env_remove("NERF_SR_STORE");
         command
+    }
+
+    /// Starts the runner, its output kept.
+    pub fn spawn(&self, arguments: &[&str]) -> Child {
+        self.command(arguments).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     }
 
     pub fn run(&self, arguments: &[&str]) -> Finished {
@@ -126,7 +163,7 @@ impl Project {
     /// Calls one of the measuring scripts on `data`.
     pub fn script(&self, script: &str, arguments: &[&str]) -> Finished {
         let mut command = Command::new("python3");
-        command.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("scripts").join(script)).args(arguments);
+        command.arg(root().join("scripts").join(script)).args(arguments);
         command.args(["--data", "data", "--nerf-sr", bin("nerf-sr").to_str().unwrap()]).current_dir(self.path("."));
         Finished::of(command.output().unwrap())
     }
@@ -203,7 +240,7 @@ pub fn manifest(folder: &Path) -> String {
 }
 
 /// Sends a running stage a signal: "-TERM", "-KILL".
-pub fn signal(child: &std::process::Child, name: &str) {
+pub fn signal(child: &Child, name: &str) {
     Command::new("kill").args([name, &child.id().to_string()]).status().unwrap();
 }
 
@@ -255,8 +292,7 @@ pub fn kill_again_and_again(
 
 /// The data folder with real scenes and weights; without it a test says so and ends.
 pub fn data() -> Option<PathBuf> {
-    let path = std::env::var("NERF_SR_DATA")
-        .map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let path = std::env::var("NERF_SR_DATA").map_or_else(|_| root().join("../shared/data"), PathBuf::from);
     if path.is_dir() {
         return Some(path);
     }

@@ -1,6 +1,6 @@
 //! Runs a plan: nodes whose parents are done, some at once, each under its key's lock.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::IsTerminal as _;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -71,7 +71,8 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
             for &index in starting {
                 progress[index] = Progress::Running;
                 running += 1;
-                let parents: Vec<Option<String>> = outcome.records.iter().map(|r| r.as_ref().map(|r| r.output.clone())).collect();
+                let parents: BTreeMap<usize, Record> =
+                    plan.nodes[index].parents().filter_map(|p| Some((p, outcome.records[p].clone()?))).collect();
                 let (sender, display) = (sender.clone(), &display);
                 let threads = (options.threads / together).max(1);
                 scope.spawn(move || {
@@ -128,9 +129,9 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
-    /// Finds the record or makes it. `parents` are the outputs of the plan's nodes.
-    fn run(&self, parents: &[Option<String>]) -> Result<(Record, bool), StageFailure> {
-        let output_of = |index: usize| parents[index].clone().expect("a node runs after its parents");
+    /// Finds the record or makes it. `parents` are the records of the nodes that it needs.
+    fn run(&self, parents: &BTreeMap<usize, Record>) -> Result<(Record, bool), StageFailure> {
+        let output_of = |index: usize| parents[&index].output.clone();
         let hashes = input_hashes(self.node, self.store, output_of).map_err(|e| match e {
             PlanError::Source(message) => StageFailure { code: 3, message },
             other => fail(other),
@@ -141,8 +142,13 @@ impl Job<'_> {
             return Ok((record, false));
         }
         let lock = until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || self.store.try_lock(&key))?;
-        let action =
-            Unfinished { stage: self.node.stage.clone(), point: self.node.point.clone(), key_parts, started_unix: unix_time() };
+        let action = Unfinished {
+            stage: self.node.stage.clone(),
+            point: self.node.point.clone(),
+            key_parts,
+            made_of: parents.values().map(Record::key).collect(),
+            started_unix: unix_time(),
+        };
         let attempt = {
             let entered = self.enter()?;
             // Another runner may have made it while this one waited.
@@ -201,6 +207,7 @@ impl Job<'_> {
             stage: action.stage,
             point: action.point,
             key_parts: action.key_parts,
+            made_of: action.made_of,
             output: String::new(),
             started_unix: action.started_unix,
             seconds: (started.elapsed().as_secs_f64() * 1e3).round() / 1e3,

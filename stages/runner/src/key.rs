@@ -59,16 +59,7 @@ mod tests {
     use super::*;
 
     fn record(stage: &str, started_unix: u64, parts: &Value) -> Record {
-        Record {
-            stage: stage.to_owned(),
-            point: String::new(),
-            key_parts: parts.as_object().unwrap().clone(),
-            output: String::new(),
-            started_unix,
-            seconds: 0.0,
-            threads: 1,
-            host: String::new(),
-        }
+        Record { stage: stage.to_owned(), key_parts: parts.as_object().unwrap().clone(), started_unix, ..Record::default() }
     }
 
     #[test]

@@ -41,6 +41,9 @@ pub struct Record {
     pub point: String,
     /// Every part of the key, by name. The key is the blake3 of this map's canonical JSON.
     pub key_parts: Map<String, Value>,
+    /// Keys of the actions that made its inputs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub made_of: Vec<String>,
     /// Identity of the artifact that came out.
     pub output: String,
     /// When it started, seconds since 1970.
@@ -69,6 +72,9 @@ pub struct Unfinished {
     pub point: String,
     /// Every part of the key, by name.
     pub key_parts: Map<String, Value>,
+    /// Keys of the actions that made its inputs.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub made_of: Vec<String>,
     /// When it was begun, seconds since 1970.
     pub started_unix: u64,
 }

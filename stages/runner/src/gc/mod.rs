@@ -1,8 +1,8 @@
 //! Garbage collection by reachability: what roots reach stays, everything else goes.
 //!
 //! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress and recent runs.
-//! * `contents`: what lies in the store, and which record made which input.
-//! * `reach`: from the roots to the inputs of what they name, and so on.
+//! * `contents`: what lies in the store.
+//! * `reach`: from the roots to what they name, and to what that was made of.
 
 mod contents;
 mod reach;
@@ -46,9 +46,9 @@ impl Verdict {
             makers.entry(&record.output).or_insert_with(|| format!("{}{point}, {age} h old", record.stage));
         }
         let fate = |why: Option<&String>| why.map_or("goes".to_owned(), |why| format!("stays: {why}"));
-        let objects = self.contents.objects.iter().map(|(identity, object)| {
+        let objects = self.contents.objects.iter().map(|(identity, bytes)| {
             let maker = makers.get(identity.as_str()).map_or("no record names it", String::as_str);
-            let size = object.bytes as f64 / 1e6;
+            let size = *bytes as f64 / 1e6;
             format!("{}  {size:>9.1} MB  {maker}: {}", short(identity), fate(self.kept.objects.get(identity)))
         });
         let unfinished = self.contents.unfinished.iter().map(|(key, action)| {
@@ -62,7 +62,7 @@ impl Verdict {
     pub(crate) fn bytes(&self) -> (u64, u64) {
         let sum = |stays: bool| {
             let objects = self.contents.objects.iter().filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
-            objects.map(|(_, object)| object.bytes).sum()
+            objects.map(|(_, bytes)| bytes).sum()
         };
         (sum(false), sum(true))
     }

@@ -1,7 +1,5 @@
 use std::collections::BTreeMap;
 
-use serde_json::{Map, Value};
-
 use super::contents::Contents;
 use super::roots::Root;
 
@@ -16,43 +14,38 @@ pub(super) struct Kept {
     pub(super) unfinished: BTreeMap<String, String>,
 }
 
-/// From the roots to the records and unfinished actions they name, to those actions' inputs, and to the records that made them.
+/// From the roots to the records and unfinished actions that they name and, where a root asks for it, on to the actions that those
+/// were made of.
 pub(super) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
     let mut kept = Kept::default();
-    let mut open: Vec<(String, String)> = Vec::new();
-    for root in roots.iter().rev() {
+    for root in roots {
         let fitting = contents.records.iter().filter(|(_, record)| root.waiting.iter().any(|node| node.may_be(record)));
-        let keys = root.keys.iter().chain(fitting.map(|(key, _)| key));
-        open.extend(keys.map(|key| (key.clone(), root.why.clone())));
-    }
-    while let Some((key, why)) = open.pop() {
-        if let Some(action) = contents.unfinished.get(&key)
-            && kept.unfinished.insert(key.clone(), why.clone()).is_none()
-            && let Some(action) = action
-        {
-            keep_inputs(contents, (&action.stage, &action.key_parts), &mut kept, &mut open);
-        }
-        if let Some(record) = contents.records.get(&key)
-            && !kept.records.contains_key(&key)
-        {
-            kept.objects.entry(record.output.clone()).or_insert_with(|| why.clone());
-            kept.records.insert(key, why);
-            keep_inputs(contents, (&record.stage, &record.key_parts), &mut kept, &mut open);
+        let mut open: Vec<(String, String)> =
+            root.keys.iter().chain(fitting.map(|(key, _)| key)).map(|key| (key.clone(), root.why.clone())).collect();
+        let mut seen = std::collections::BTreeSet::new();
+        while let Some((key, why)) = open.pop() {
+            if !seen.insert(key.clone()) {
+                continue;
+            }
+            if root.with_inputs {
+                open.extend(made_of(contents, &key));
+            }
+            if contents.unfinished.contains_key(&key) {
+                kept.unfinished.entry(key.clone()).or_insert_with(|| why.clone());
+            }
+            if let Some(record) = contents.records.get(&key) {
+                kept.objects.entry(record.output.clone()).or_insert_with(|| why.clone());
+                kept.records.entry(key).or_insert(why);
+            }
         }
     }
     kept
 }
 
-/// Keeps the inputs of an action, and goes on with what made them.
-fn keep_inputs(
-    contents: &Contents,
-    (stage, key_parts): (&str, &Map<String, Value>),
-    kept: &mut Kept,
-    open: &mut Vec<(String, String)>,
-) {
-    for object in contents.inputs(key_parts) {
-        let why = format!("{stage} was made of it");
-        kept.objects.entry(object.clone()).or_insert_with(|| why.clone());
-        open.extend(contents.makers(object).map(|key| (key.clone(), why.clone())));
-    }
+/// The actions that an action was made of, and why they stay.
+fn made_of(contents: &Contents, key: &str) -> Vec<(String, String)> {
+    let finished = contents.records.get(key).map(|record| (&record.stage, &record.made_of));
+    let unfinished = contents.unfinished.get(key).and_then(Option::as_ref).map(|action| (&action.stage, &action.made_of));
+    let parents = [finished, unfinished].into_iter().flatten();
+    parents.flat_map(|(stage, keys)| keys.iter().map(move |key| (key.clone(), format!("{stage} was made of it")))).collect()
 }

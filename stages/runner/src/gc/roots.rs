@@ -13,6 +13,8 @@ pub(crate) struct Root {
     pub(crate) keys: BTreeSet<String>,
     /// Nodes that any fitting record may belong to.
     pub(crate) waiting: Vec<Waiting>,
+    /// Whether it needs the actions that those were made of, too. A plan or a run names them itself.
+    pub(crate) with_inputs: bool,
 }
 
 /// What the person who collects garbage chooses.
@@ -43,7 +45,8 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
             roots.push(of_run(format!("a run {} used it", ago(run.used_unix())), run));
         }
     }
-    let one = |why: String, key: &String| Root { why, keys: BTreeSet::from([key.clone()]), waiting: Vec::new() };
+    let one =
+        |why: String, key: &String| Root { why, keys: BTreeSet::from([key.clone()]), waiting: Vec::new(), with_inputs: true };
     roots.extend(store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)));
     for (key, record) in contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix)) {
         roots.push(one(format!("made {}", ago(record.started_unix)), key));
@@ -56,7 +59,7 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
 }
 
 fn of_run(why: String, run: Run) -> Root {
-    Root { why, keys: run.keys, waiting: run.waiting }
+    Root { why, keys: run.keys, waiting: run.waiting, with_inputs: false }
 }
 
 fn ago(unix: u64) -> String {

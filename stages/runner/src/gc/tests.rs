@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
-use artifact::{KeyLock, Locked, Manifest, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time};
+use artifact::{KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time};
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
 
@@ -14,8 +14,8 @@ use super::{Choice, Root, judge};
 struct Action {
     stage: u8,
     parameter: u8,
-    /// Earlier actions whose objects it is made of, and whether a folder of them is meant.
-    inputs: Vec<(u8, bool)>,
+    /// Earlier actions that it is made of.
+    inputs: Vec<u8>,
     /// What comes out; equal contents are one object.
     content: u8,
     days_old: u64,
@@ -52,7 +52,7 @@ fn cases() -> impl Strategy<Value = Case> {
         1 => Just(Finished::WithCheckpoint),
         1 => Just(Finished::WithoutCheckpoint)
     ];
-    let inputs = prop::collection::vec((any::<u8>(), any::<bool>()), 0..3);
+    let inputs = prop::collection::vec(any::<u8>(), 0..3);
     let action =
         (0..3u8, 0..2u8, inputs, 0..6u8, 0..20u64, state).prop_map(|(stage, parameter, inputs, content, days_old, state)| {
             Action { stage, parameter, inputs, content, days_old, state }
@@ -91,8 +91,8 @@ struct Made {
     store: Store,
     /// Each action's key.
     keys: Vec<String>,
-    /// Every finished action and every unfinished one, by key: its key's parts.
-    parts: BTreeMap<String, Map<String, Value>>,
+    /// Every finished action and every unfinished one, by key: its key's parts and what it is made of.
+    parts: BTreeMap<String, (Map<String, Value>, Vec<String>)>,
     _locks: Vec<KeyLock>,
     _runs: Vec<RunFile>,
 }
@@ -118,22 +118,20 @@ fn make(case: &Case) -> Made {
     let memory = std::path::Path::new("/dev/shm");
     let dir = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
     let store = Store::open(dir.path()).unwrap();
-    let (mut keys, mut outputs, mut parts) = (Vec::new(), Vec::<Option<String>>::new(), BTreeMap::new());
+    let (mut keys, mut parts): (Vec<String>, _) = (Vec::new(), BTreeMap::new());
     for action in &case.actions {
         let mut key_parts = Map::new();
         key_parts.insert("stage".into(), json!(format!("s{}", action.stage)));
         key_parts.insert("parameter p".into(), json!(action.parameter));
-        for (i, (earlier, is_folder)) in action.inputs.iter().enumerate() {
-            if let Some(output) = outputs.get(*earlier as usize % outputs.len().max(1)).cloned().flatten() {
-                let manifest = store.manifest(&output).unwrap();
-                let hash = if *is_folder { manifest.subtree("sub").identity() } else { output };
-                key_parts.insert(format!("input {i}"), json!(hash));
-            }
+        let mut made_of = Vec::new();
+        if !keys.is_empty() {
+            made_of.extend(action.inputs.iter().map(|earlier| keys[*earlier as usize % keys.len()].clone()));
         }
-        let (key, output) = make_action(&store, action, &key_parts);
-        parts.insert(key.clone(), key_parts);
+        // Actions with equal inputs and parameters are one.
+        key_parts.insert("input".into(), json!(made_of));
+        let key = make_action(&store, action, &key_parts, &made_of);
+        parts.insert(key.clone(), (key_parts, made_of));
         keys.push(key);
-        outputs.push(output);
     }
     let (mut locks, mut runs) = (Vec::new(), Vec::new());
     let key = |number: &u8| keys[*number as usize % keys.len()].clone();
@@ -167,78 +165,71 @@ fn make(case: &Case) -> Made {
     Made { _dir: dir, store, keys, parts, _locks: locks, _runs: runs }
 }
 
-/// Makes one action; gives its key and, if it finished, its object.
-fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>) -> (String, Option<String>) {
-    let key = hash_json(key_parts);
-    if let Some(record) = store.record(&key) {
-        return (key, Some(record.output));
+/// Makes one action; gives its key.
+fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>, made_of: &[String]) -> String {
+    let (key, stage, made_of) = (hash_json(key_parts), format!("s{}", action.stage), made_of.to_vec());
+    if store.record(&key).is_some() {
+        return key;
     }
     let entered = held(store.try_enter().unwrap());
-    let stage = format!("s{}", action.stage);
-    let unfinished = Unfinished { stage: stage.clone(), key_parts: key_parts.clone(), ..Default::default() };
+    let unfinished =
+        Unfinished { stage: stage.clone(), key_parts: key_parts.clone(), made_of: made_of.clone(), ..Default::default() };
     let attempt = store.begin(&entered, &unfinished, &json!({})).unwrap();
     if action.state != Finished::Yes {
         fs::create_dir_all(&attempt.work).unwrap();
         if action.state == Finished::WithCheckpoint {
             fs::write(attempt.work.join("checkpoint"), "x").unwrap();
         }
-        return (key, None);
+        return key;
     }
-    fs::create_dir_all(attempt.output.join("sub")).unwrap();
-    fs::write(attempt.output.join("own"), format!("{}", action.content)).unwrap();
-    // Different objects may share a folder, too.
-    fs::write(attempt.output.join("sub/shared"), format!("{}", action.content / 2)).unwrap();
+    fs::create_dir_all(&attempt.output).unwrap();
+    fs::write(attempt.output.join("file"), format!("{}", action.content)).unwrap();
     let checked = store.check(attempt, "kind").unwrap();
-    let record = Record { stage, key_parts: key_parts.clone(), started_unix: days_ago(action.days_old), ..Record::default() };
-    let record = store.publish(&entered, checked, record).unwrap();
-    (key, Some(record.output))
+    let started_unix = days_ago(action.days_old);
+    let record = Record { stage, key_parts: key_parts.clone(), made_of, started_unix, ..Record::default() };
+    store.publish(&entered, checked, record).unwrap();
+    key
 }
 
 /// What has to stay, by the definition: pass after pass until nothing joins.
 fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
     let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
     let recent = |days: u64| days < case.keep_days;
-    let mut stays: BTreeSet<String> = case.plan.0.iter().map(key).collect();
+    // What is named itself, and what is needed with all that it is made of.
+    let mut named: BTreeSet<String> = case.plan.0.iter().map(key).collect();
+    let mut whole: BTreeSet<String> = BTreeSet::new();
     let mut nodes: Vec<(u8, u8)> = case.plan.1.clone();
     for holder in &case.holders {
         match holder {
-            Holder::Pin(numbers) => stays.extend(numbers.iter().map(key)),
-            Holder::Lock(number) => stays.extend([key(number)]),
+            Holder::Pin(numbers) => named.extend(numbers.iter().map(key)),
+            Holder::Lock(number) => whole.extend([key(number)]),
             Holder::Run { keys, waiting, days_ago, in_progress } if *in_progress || recent(*days_ago) => {
-                stays.extend(keys.iter().map(key));
+                named.extend(keys.iter().map(key));
                 nodes.extend(waiting);
             }
             Holder::Run { .. } => {}
         }
     }
-    for (number, parts) in &made.parts {
+    for (number, (parts, _)) in &made.parts {
         let record = made.store.record(number);
         let fits = nodes
             .iter()
             .any(|(stage, parameter)| parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter));
-        let is_recent = record.as_ref().is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
+        if record.is_some() && fits {
+            named.insert(number.clone());
+        }
+        let is_recent = record.is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
         let has_checkpoint = made.store.partial(number).join("work/checkpoint").exists() && !case.drop_unfinished;
-        if (record.is_some() && (fits || is_recent)) || has_checkpoint {
-            stays.insert(number.clone());
+        if is_recent || has_checkpoint {
+            whole.insert(number.clone());
         }
     }
     loop {
-        let mut more = stays.clone();
-        for key in &stays {
-            for (_, hash) in made.parts[key].iter().filter(|(name, _)| name.starts_with("input ")) {
-                for other in made.parts.keys() {
-                    let Some(record) = made.store.record(other) else { continue };
-                    let manifest: Manifest = made.store.manifest(&record.output).unwrap();
-                    if hash == &json!(record.output) || hash == &json!(manifest.subtree("sub").identity()) {
-                        more.insert(other.clone());
-                    }
-                }
-            }
+        let more: BTreeSet<String> = whole.iter().flat_map(|key| made.parts[key].1.clone()).collect();
+        if more.is_subset(&whole) {
+            return named.union(&whole).cloned().collect();
         }
-        if more == stays {
-            return stays;
-        }
-        stays = more;
+        whole.extend(more);
     }
 }
 
@@ -259,6 +250,7 @@ proptest! {
             why: "the plan".into(),
             keys: case.plan.0.iter().map(key).collect(),
             waiting: case.plan.1.iter().map(|node| waiting(*node)).collect(),
+            with_inputs: false,
         };
         let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished };
 
@@ -288,7 +280,7 @@ fn orphans_go() {
     let store = Store::open(dir.path()).unwrap();
     let action = Action { stage: 0, parameter: 0, inputs: vec![], content: 1, days_old: 0, state: Finished::Yes };
     let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
-    let (key, _) = make_action(&store, &action, &parts);
+    let key = make_action(&store, &action, &parts, &[]);
     fs::write(store.action(&key, "json"), "{").unwrap();
     let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false }).unwrap();
     assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());

@@ -1,0 +1,102 @@
+#!/usr/bin/env python3
+"""Runs all tests, a binary for each core at a time, and says which were skipped and which took longest.
+
+run-tests.py [FILTER]: only tests whose names contain FILTER. Build the stages first: end-to-end tests run them.
+"""
+
+import concurrent.futures
+import json
+import os
+import subprocess
+import sys
+import time
+
+SLOWEST = 3
+
+
+def build() -> list[tuple[str, str, str]]:
+    """Builds all test binaries; (package and target, path, folder to run in) of each, fast ones first."""
+    command = ["cargo", "test", "--release", "--workspace", "--lib", "--bins", "--tests", "--no-run", "--message-format=json-render-diagnostics"]
+    built = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if built.returncode:
+        sys.exit(built.returncode)
+    found = []
+    for line in built.stdout.splitlines():
+        message = json.loads(line)
+        if message["reason"] == "compiler-artifact" and message["profile"]["test"] and message["executable"]:
+            kind = message["target"]["kind"][0]
+            folder = os.path.dirname(message["manifest_path"])
+            package = os.path.basename(folder) if kind != "test" else "tests"
+            found.append((kind == "test", f"{package}::{message['target']['name']}", message["executable"], folder))
+    return [entry[1:] for entry in sorted(found)]
+
+
+class Outcome:
+    """What the tests of one binary came to."""
+
+    def __init__(self) -> None:
+        self.passed, self.failed, self.skipped, self.times = 0, [], [], []
+        self.output = ""
+
+
+def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
+    """Runs a binary's tests one after the other, so that each has its time."""
+    outcome = Outcome()
+    environment = dict(os.environ, CARGO_MANIFEST_DIR=folder)
+    command = [path, "--test-threads=1", "--show-output", *test_filter]
+    process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    line, begun, test = b"", time.monotonic(), None
+    while byte := process.stdout.read1(1):
+        line += byte
+        if line.startswith(b"test ") and line.endswith(b" ... "):
+            begun, test = time.monotonic(), line[5:-5].decode()
+        if byte == b"\n":
+            text, line = line.decode(errors="replace"), b""
+            outcome.output += text
+            if test and text.startswith("test "):
+                outcome.times.append((time.monotonic() - begun, f"{name}::{test}"))
+                outcome.passed += text.endswith("ok\n")
+                if text.endswith("FAILED\n"):
+                    outcome.failed.append(f"{name}::{test}")
+                test = None
+            elif text.startswith("---- ") and text.endswith(" stdout ----\n"):
+                said_by = text[5:-13]
+            elif text.startswith("skipped: ") and "said_by" in locals():
+                outcome.skipped.append(f"{name}::{said_by}: {text.strip()}")
+    if process.wait() and not outcome.failed:
+        outcome.failed.append(f"{name} ended with {process.returncode}" + (f" in {test}" if test else ""))
+    return outcome
+
+
+def main() -> int:
+    test_filter = sys.argv[1:]
+    outcomes = []
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        runs = {pool.submit(run, name, path, folder, test_filter): name for name, path, folder in build()}
+        for done in concurrent.futures.as_completed(runs):
+            outcome = done.result()
+            outcomes.append(outcome)
+            seconds = sum(spent for spent, _ in outcome.times)
+            if outcome.times or outcome.failed:
+                failed = f", {len(outcome.failed)} FAILED" if outcome.failed else ""
+                print(f"{runs[done]}: {outcome.passed} passed{failed}, {seconds:.1f} s", flush=True)
+            if outcome.failed:
+                print(outcome.output, flush=True)
+    times = sorted((time for outcome in outcomes for time in outcome.times), reverse=True)
+    skipped = sorted(set(skip for outcome in outcomes for skip in outcome.skipped))
+    failed = sorted(name for outcome in outcomes for name in outcome.failed)
+    print("\nslowest:")
+    for seconds, name in times[:SLOWEST]:
+        print(f"  {seconds:6.1f} s  {name}")
+    print("skipped:" if skipped else "skipped: none")
+    for skip in skipped:
+        print(f"  {skip}")
+    for name in failed:
+        print(f"FAILED: {name}")
+    passed = sum(outcome.passed for outcome in outcomes) - len(skipped)
+    print(f"{passed} passed, {len(failed)} failed, {len(skipped)} skipped")
+    return 1 if failed or not passed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

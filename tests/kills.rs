@@ -1,0 +1,164 @@
+//! Kills at random moments, with garbage collection at random moments beside: what was finished is whole, what a run needs stays,
+//! and the artifacts come out equal.
+//!
+//! NERF_SR_KILLS says how many kills (`make faults`: 200), NERF_SR_SEED which moments.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::collections::BTreeMap;
+use std::os::unix::process::CommandExt as _;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use common::{Finished, Project, wait_until};
+
+const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
+const STAGES: [&str; 5] = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
+/// So many pipelines are run by turns; each trains from another seed.
+const POINTS: u64 = 3;
+
+/// Random numbers that a seed repeats (xorshift).
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, bound: u64) -> u64 {
+        for (left, shift) in [(true, 13), (false, 7), (true, 17)] {
+            self.0 ^= if left { self.0 << shift } else { self.0 >> shift };
+        }
+        self.0 % bound
+    }
+}
+
+fn number(variable: &str) -> Option<u64> {
+    std::env::var(variable).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}: not a number")))
+}
+
+fn point(number: u64) -> [String; 2] {
+    ["-p".to_owned(), format!("train-ss.seed={number}")]
+}
+
+fn arguments<'a>(verb: &'a str, point: &'a [String; 2]) -> Vec<&'a str> {
+    vec![verb, &point[0], &point[1]]
+}
+
+/// The finished stages of a point with their artifacts.
+fn finished(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> {
+    let status = project.ok(&arguments("status", point));
+    let line = |line: &str| {
+        let mut words = line.split_whitespace();
+        let (stage, state, hash) = (words.next()?, words.next()?, words.next()?);
+        (state == "cached").then(|| (stage.to_owned(), hash.to_owned()))
+    };
+    status.lines().filter_map(line).collect()
+}
+
+/// The processes that a process has started.
+fn children(pid: u32) -> Vec<String> {
+    let text = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+    // Threads start stages, too.
+    let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
+    let of_threads = tasks.filter_map(|task| std::fs::read_to_string(task.path().join("children")).ok());
+    let all = of_threads.collect::<String>() + " " + &text;
+    all.split_whitespace().map(str::to_owned).collect()
+}
+
+fn send(signal: &str, process: &str) {
+    // It may have ended by itself.
+    Command::new("kill").args([signal, "--", process]).stderr(Stdio::null()).status().unwrap();
+}
+
+/// Sends a signal to the runner, its stages, both, or the process group; says to whom.
+fn strike(random: &mut Random, runner: &Child) -> String {
+    let signal = SIGNALS[random.below(4) as usize];
+    let (pid, stages) = (runner.id(), children(runner.id()));
+    let whom = ["runner", "stage", "both", "group"][random.below(4) as usize];
+    if whom == "stage" || whom == "both" {
+        stages.iter().for_each(|stage| send(signal, stage));
+    }
+    match whom {
+        "runner" | "both" => send(signal, &pid.to_string()),
+        "group" => send(signal, &format!("-{pid}")),
+        _ => {}
+    }
+    format!("{signal} to {whom}")
+}
+
+/// The command's result; one that hangs fails the test.
+fn ended(child: Child, what: &str) -> Finished {
+    let (sender, receiver) = std::sync::mpsc::channel();
+    let pid = child.id();
+    std::thread::spawn(move || sender.send(child.wait_with_output()));
+    match receiver.recv_timeout(Duration::from_secs(120)) {
+        Ok(output) => Finished::of(output.unwrap()),
+        Err(_) => panic!("{what}: process {pid} hangs"),
+    }
+}
+
+#[test]
+fn kills_at_random_moments_lose_nothing() {
+    let kills = number("NERF_SR_KILLS").unwrap_or(20);
+    let seed = number("NERF_SR_SEED").unwrap_or_else(|| std::process::id().into());
+    println!("NERF_SR_KILLS={kills} NERF_SR_SEED={seed}");
+    let mut random = Random(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
+    let undisturbed = Project::fast();
+    let begun = Instant::now();
+    undisturbed.ok(&["run", "-p", "train-ss.seed=0"]);
+    let whole_run = begun.elapsed().as_millis() as u64;
+    let expected: Vec<BTreeMap<String, String>> = (0..POINTS)
+        .map(|seed| {
+            undisturbed.ok(&arguments("run", &point(seed)));
+            finished(&undisturbed, &point(seed))
+        })
+        .collect();
+    assert!(expected.iter().all(|stages| stages.len() == STAGES.len()));
+
+    let mut project = Project::fast();
+    for round in 0..kills {
+        let seed = random.below(POINTS);
+        let before = finished(&project, &point(seed));
+        if before.len() == STAGES.len() {
+            // All is made: begin anew, so that kills find something to do.
+            project = Project::fast();
+        }
+        let mut command = project.command(&arguments("run", &point(seed)));
+        let runner = command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let moment = Duration::from_millis(random.below(whole_run + 1));
+        let collect_first = random.below(2) == 0;
+        let collect = |project: &Project| project.spawn(&["gc", "--keep-days", "0"]);
+        let mut collector = collect_first.then(|| collect(&project));
+        std::thread::sleep(moment);
+        collector = collector.or_else(|| Some(collect(&project)));
+        let what = strike(&mut random, &runner);
+        let place = format!("round {round}: seed {seed}, {what} after {moment:?}");
+        println!("{place}");
+        // Stages may live on for a moment, to write their checkpoints.
+        let pids = children(runner.id());
+        let run = ended(runner, &place);
+        let gc = ended(collector.unwrap(), &place);
+        assert_eq!(gc.code, 0, "{place}: {}{}", gc.stdout, gc.stderr);
+        assert!(!run.stderr.contains("panicked") && !run.stderr.contains("damaged"), "{place}: {}", run.stderr);
+        wait_until(|| pids.iter().all(|pid| !std::path::Path::new(&format!("/proc/{pid}")).exists()));
+        assert!(project.ok(&["verify"]).contains(", 0 damaged"), "{place}");
+        for (stage, hash) in finished(&project, &point(seed)) {
+            assert_eq!(hash, expected[seed as usize][&stage], "{place}: {stage}");
+        }
+        // What everything is made of is needed by the pipeline as it stands, whatever the point.
+        for stage in ["demo-scene", "prep"] {
+            let now = finished(&project, &point(seed));
+            assert!(
+                !before.contains_key(stage) || before.len() == STAGES.len() || now.contains_key(stage),
+                "{place}: {stage} is gone"
+            );
+        }
+    }
+    for seed in 0..POINTS {
+        // With garbage collection beside, and no kill, a run ends well.
+        let runner = project.spawn(&arguments("run", &point(seed)));
+        let collector = project.spawn(&["gc", "--keep-days", "0"]);
+        let run = ended(runner, "the last run");
+        assert_eq!(run.code, 0, "{}", run.stderr);
+        assert_eq!(ended(collector, "the last collection").code, 0);
+        assert_eq!(finished(&project, &point(seed)), expected[seed as usize]);
+    }
+}
