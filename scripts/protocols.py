@@ -9,7 +9,7 @@ OTHER_BUDGET = (60_000_000, 1)
 # `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
 AVERAGE_RAYS = 13 / 12
 # The field that a refiner rehearses with gets as many rays for an LR pixel, and no fewer than these. Of photographs it gets half as many: shrunk once
-# more they are easier to fit, and what fits them better lacks less, so that too little is learnt (ARCHITECTURE.md, "Refinement").
+# more they are easier to fit, and what fits them better lacks less, so that too little is learnt (docs/design/016-data-consistency.md).
 REHEARSAL_RAYS = 2_000_000
 
 

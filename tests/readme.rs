@@ -1,4 +1,4 @@
-//! The README and what it leads to tell the truth: commands parse and plan, pipeline blocks are valid, the files they name are there.
+//! The documents tell the truth: commands parse and plan, pipeline blocks are valid, the files they name are there.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -7,14 +7,33 @@ use std::path::Path;
 
 use common::Project;
 
-const DOCUMENTS: [&str; 2] = ["README.md", "docs/results.md"];
+/// Documents whose commands and blocks are checked, and folders that hold more of them.
+const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
+const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
+/// The same for those whose links alone are checked.
+const LINKED: [&str; 3] = ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md"];
+const LINKED_FOLDERS: [&str; 1] = ["docs/design"];
 
 fn read(path: impl AsRef<Path>) -> String {
     std::fs::read_to_string(common::root().join(path)).unwrap()
 }
 
+/// Paths of documents, from the root: those named, and every Markdown file of the folders.
+fn paths(files: &[&str], folders: &[&str]) -> Vec<String> {
+    let mut paths: Vec<String> = files.iter().map(|file| (*file).to_owned()).collect();
+    for folder in folders {
+        let entries = std::fs::read_dir(common::root().join(folder)).unwrap();
+        let mut names: Vec<String> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        names.retain(|name| name.ends_with(".md"));
+        names.sort();
+        assert!(!names.is_empty(), "no documents in {folder}");
+        paths.extend(names.iter().map(|name| format!("{folder}/{name}")));
+    }
+    paths
+}
+
 fn documents() -> String {
-    DOCUMENTS.map(read).concat()
+    paths(&DOCUMENTS, &FOLDERS).iter().map(|path| read(path) + "\n").collect()
 }
 
 /// Contents of the fenced blocks of a language.
@@ -98,9 +117,11 @@ fn pipeline_blocks_are_valid() {
 
 #[test]
 fn links_lead_somewhere() {
-    for document in DOCUMENTS {
-        let folder = common::root().join(document).parent().unwrap().to_owned();
-        for target in read(document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
+    let files = [&DOCUMENTS[..], &LINKED[..]].concat();
+    let folders = [&FOLDERS[..], &LINKED_FOLDERS[..]].concat();
+    for document in paths(&files, &folders) {
+        let folder = common::root().join(&document).parent().unwrap().to_owned();
+        for target in read(&document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
             assert!(folder.join(target).exists(), "{document}: {target} is not there");
         }
     }
