@@ -1,5 +1,5 @@
 # make demo    set-up, build, the demo scene at ×2, and its page
-# make test    every test · make lint · make bench · make sweep · make clean
+# make test    every test · make faults · make lint · make bench · make sweep · make clean
 # make help    all targets
 
 SHELL := /bin/bash
@@ -14,9 +14,8 @@ export LD_LIBRARY_PATH := $(LIBTORCH_DIR)/lib$(if $(LD_LIBRARY_PATH),:$(LD_LIBRA
 NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
-NEXTEST := $(shell command -v cargo-nextest 2>/dev/null)
 
-.PHONY: help demo build setup test lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build setup test faults lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -30,13 +29,15 @@ build: setup ## Build everything in the release profile
 demo: build ## Set-up, build, demo scene ×2, and the page
 	@$(NERF_SR) run
 
-test: build ## Every test; with nextest where it is installed
-ifneq ($(NEXTEST),)
-	cargo nextest run --release --workspace --no-fail-fast
-else
-	cargo test --release --workspace --lib --bins --tests
-endif
-	cargo test --release --workspace --doc
+test: build ## Every test, the skipped and the slowest named; FILTER=WORDS for some of them
+	@python3 scripts/run-tests.py $(FILTER)
+	cargo test --release --workspace --doc --quiet
+
+KILLS ?= 200
+RUNNERS ?= 10
+faults: build ## Many kills at random moments, and runners at once: make faults KILLS=200 SEED=1
+	NERF_SR_KILLS=$(KILLS) NERF_SR_REPEAT=$(RUNNERS) $(if $(SEED),NERF_SR_SEED=$(SEED)) \
+	  cargo test --release -p end-to-end --test kills --test sharing -- --nocapture random_moments eight_runners
 
 lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets; cargo-deny and typos where installed
 	cargo fmt --all --check

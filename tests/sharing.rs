@@ -20,7 +20,8 @@ fn is_whole(page: &Path) -> bool {
 
 #[test]
 fn eight_runners_make_each_stage_once() {
-    for _ in 0..2 {
+    let rounds = std::env::var("NERF_SR_REPEAT").map_or(2, |text| text.parse().unwrap());
+    for _ in 0..rounds {
         let project = Project::fast();
         let outs = ["a", "b", "c", "d", "shared", "shared", "shared", "shared"];
         let runners: Vec<Child> = outs.iter().map(|out| project.spawn(&["run", "--out", out])).collect();
