@@ -272,7 +272,8 @@ impl Store {
     /// Removes an object; records that name it count as absent from then on.
     pub fn remove_object(&self, identity: &str) -> Result<(), StoreError> {
         let path = self.object(identity);
-        at(&path, fs::remove_dir_all(&path))
+        // One that is damaged may be a plain file.
+        at(&path, if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) })
     }
 
     /// Removes an action's record and log.
