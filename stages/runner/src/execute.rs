@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, mpsc};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use artifact::{Event, Pace, Record, Store, hash_json};
+use artifact::{Event, Pace, Record, Store, hash_json, printable, report_text};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use crate::key;
@@ -146,17 +146,19 @@ impl Job<'_> {
                 (input.name.clone(), folder)
             })
             .collect();
+        let label = self.node.label();
         let call = Call {
+            label: &label,
             program: &self.node.program,
             params: &attempt.params,
             inputs: &inputs,
+            hashes: &hashes,
             output: &attempt.output,
             work: Some(&attempt.work),
             device: &self.options.device,
             threads: self.threads,
             lock: Some(&lock),
         };
-        let label = self.node.label();
         let view = self.display.start(&label);
         let started = Instant::now();
         let started_unix = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
@@ -198,8 +200,8 @@ impl Display {
     fn line(&self, text: &str) {
         match &self.bars {
             // The terminal may have gone; the run goes on.
-            Some(bars) => bars.println(text).unwrap_or_default(),
-            None => eprintln!("{text}"),
+            Some(bars) => bars.println(printable(text)).unwrap_or_default(),
+            None => report_text(text),
         }
     }
 
@@ -207,7 +209,7 @@ impl Display {
         let bar = self.bars.as_ref().map(|bars| {
             let style =
                 ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
-            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned()))
+            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(printable(label).into_owned()))
         });
         if bar.is_none() {
             self.line(&format!("{label}: running"));
@@ -246,7 +248,7 @@ impl StageView<'_> {
 
 impl Watcher for StageView<'_> {
     fn progress(&self, event: &Event) {
-        let Event::Progress { label, done, total, note } = event;
+        let Event::Progress { label, done, total, note } = event else { return };
         let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         if shown.label != *label {
             (shown.label, shown.pace) = (label.clone(), Pace::default());

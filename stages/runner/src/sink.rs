@@ -87,9 +87,11 @@ pub(crate) fn show(
     let view = display.start(&sink.stage);
     let inputs = [("run".to_owned(), run)];
     let call = Call {
+        label: &sink.stage,
         program: &sink.program,
         params: &params,
         inputs: &inputs,
+        hashes: &[],
         output: &output,
         work: None,
         device: &options.device,

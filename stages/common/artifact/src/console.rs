@@ -1,25 +1,37 @@
 //! Words for people. Whoever reads them may go away (`| head -1`, a closed terminal): that stops nothing and changes no exit
 //! code, so a write that fails is passed over. Control characters are spelled out.
 
-use std::fmt::Display;
 use std::io::Write;
 
 use crate::printable::printable;
 
-/// Prints one line to stdout.
-pub fn print_line(text: impl Display) {
-    write_line(&mut std::io::stdout(), &text.to_string());
+/// Prints one line to stdout, as `println!` does, but with control characters spelled out, and without a panic when stdout is
+/// closed.
+#[macro_export]
+macro_rules! print_line {
+    ($($arguments:tt)*) => { $crate::print_text(&format!($($arguments)*)) };
+}
+
+/// Prints one line to stderr, likewise.
+#[macro_export]
+macro_rules! report_line {
+    ($($arguments:tt)*) => { $crate::report_text(&format!($($arguments)*)) };
+}
+
+/// What [`print_line!`] does.
+pub fn print_text(line: &str) {
+    write_line(&mut std::io::stdout(), line);
+}
+
+/// What [`report_line!`] does.
+pub fn report_text(line: &str) {
+    write_line(&mut std::io::stderr(), line);
 }
 
 /// Prints a text of several lines to stdout.
 pub fn print_lines(text: &str) {
     let mut stdout = std::io::stdout().lock();
     text.lines().for_each(|line| write_line(&mut stdout, line));
-}
-
-/// Prints one line to stderr.
-pub fn report_line(text: impl Display) {
-    write_line(&mut std::io::stderr(), &text.to_string());
 }
 
 fn write_line(to: &mut impl Write, text: &str) {

@@ -54,7 +54,7 @@ mod stage;
 mod store;
 
 pub use canonical::{canonical, hash_json};
-pub use console::{counted, print_line, print_lines, report_line, sized};
+pub use console::{counted, print_lines, print_text, report_text, sized};
 pub use describe::{Description, Input, Output};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};

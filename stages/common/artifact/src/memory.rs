@@ -1,7 +1,7 @@
 use crate::console::sized;
 
-/// How allocators name what they didn't get: that of Rust, of libtorch, and of CUDA.
-const MARKS: [&str; 3] = ["memory allocation of ", "tried to allocate ", "Tried to allocate "];
+/// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
+const MARKS: [&str; 4] = ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
 
 /// What an allocator's last words mean, with the amount that was asked for and what to do; nothing for other words.
 ///
@@ -40,6 +40,7 @@ mod tests {
             ("memory allocation of 99532800 bytes failed", Some("99.5 MB")),
             ("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4000000000 bytes. Error code 12", Some("4.0 GB")),
             ("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity", Some("2.00 GiB")),
+            ("numpy._core._exceptions._ArrayMemoryError: Unable to allocate 74.5 GiB for an array", Some("74.5 GiB")),
             ("memory allocation of many bytes failed", None),
             ("memory allocation of ", None),
             ("r_0.png: No such file", None),

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::console::report_line;
+use crate::report_line;
 
 /// How a stage shows that it is getting on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -152,7 +152,7 @@ impl Progress {
         } else if self.mode == ProgressMode::Json {
             Event::Progress { label: self.label.clone(), done, total: self.total, note: state.note.clone() }.emit();
         } else {
-            report_line(format_args!("{}: {done} of {} {} · {left} left", self.label, self.total, state.note));
+            report_line!("{}: {done} of {} {} · {left} left", self.label, self.total, state.note);
         }
     }
 }

@@ -15,7 +15,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::canonical::hash_json;
-use crate::console::{print_lines, report_line};
+use crate::console::{print_lines, report_text};
 use crate::describe::{Description, Input, Output};
 use crate::failure::{Failure, FailureExt, exit_code, one_line};
 use crate::fsio::write_json;
@@ -23,6 +23,7 @@ use crate::manifest::{MANIFEST_FILE, Manifest};
 use crate::panics::install_panic_hook;
 use crate::parameters::Schema;
 use crate::progress::{Progress, ProgressMode, StopAfter, emit_events, failed_event};
+use crate::report_line;
 use crate::signals::stop_on_signals;
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
@@ -225,7 +226,7 @@ impl Context {
     /// Says something to the person watching, on one line; it also lands in the action's log.
     pub fn say(&self, text: impl std::fmt::Display) {
         if self.progress != ProgressMode::None {
-            report_line(text);
+            report_text(&text.to_string());
         }
     }
 
@@ -256,7 +257,7 @@ pub(crate) fn run_stage_with<S: Stage>(
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             let message = one_line(&error);
-            report_line(format_args!("{}: {message}", S::NAME));
+            report_line!("{}: {message}", S::NAME);
             if let Some(event) = failed_event(&message) {
                 std::io::stdout().write_all(event.as_bytes()).ok();
             }

@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 use std::process::ExitCode;
 
-use artifact::hash_json;
+use artifact::{hash_json, print_line};
 
 use crate::plan::{Request, State};
 use crate::session::Session;
@@ -19,10 +19,10 @@ pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, keep_days: u6
         })
         .collect();
     let garbage = crate::gc::find(&session.store, &keys, keep_days)?;
-    garbage.lines.iter().for_each(|line| println!("{line}"));
+    garbage.lines.iter().for_each(|line| print_line!("{line}"));
     if !dry_run {
         garbage.remove(&session.store)?;
     }
-    println!("{:.1} MB {}", garbage.bytes as f64 / 1e6, if dry_run { "would go" } else { "freed" });
+    print_line!("{:.1} MB {}", garbage.bytes as f64 / 1e6, if dry_run { "would go" } else { "freed" });
     Ok(ExitCode::SUCCESS)
 }

@@ -5,15 +5,17 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, SUMMARY_FILE};
+use artifact::{Failure, SUMMARY_FILE, print_line, print_lines, report_text};
 
+use crate::counts;
 use crate::execute::{self, Options};
 use crate::plan::Request;
+use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::sink::{Shown, show};
 
 /// Makes what the targets need and shows it.
-pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path, remedy: &Remedy) -> anyhow::Result<ExitCode> {
     let stop = Arc::new(AtomicBool::new(false));
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
@@ -24,12 +26,8 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
         return Err(Failure::Interrupted.into());
     }
     if let Some((index, failure)) = outcome.failures.first() {
-        let skipped = outcome.skipped.len();
-        eprintln!(
-            "nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said",
-            plan.nodes[*index].label(),
-            plan.nodes[*index].stage
-        );
+        let node = &plan.nodes[*index];
+        report_text(&remedy.after_failure(&node.label(), &node.stage, outcome.skipped.len()));
         return Ok(ExitCode::from(failure.code));
     }
     let ends: BTreeSet<usize> =
@@ -38,7 +36,7 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
         let record = outcome.records[index].as_ref().context("every node is done")?;
         let summary = std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).unwrap_or_default();
         if !summary.is_empty() {
-            println!("{}: {}", plan.nodes[index].label(), summary.trim_end());
+            print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
         }
     }
     let mut wrote = false;
@@ -46,21 +44,16 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
         match show(&plan, sink, &outcome, &session.store, out, options, &stop).map_err(|e| anyhow!("{}: {e}", sink.stage))? {
             Shown::Written(folder) => {
                 wrote = true;
-                println!("{}: {}", sink.stage, page(&folder).display());
+                print_line!("{}: {}", sink.stage, page(&folder).display());
             }
-            Shown::UpToDate(folder) => println!("{}: {} (up to date)", sink.stage, page(&folder).display()),
-            Shown::Missing => println!("{}: nothing to show", sink.stage),
+            Shown::UpToDate(folder) => print_line!("{}: {} (up to date)", sink.stage, page(&folder).display()),
+            Shown::Missing => print_line!("{}: nothing to show", sink.stage),
         }
     }
     if outcome.ran.is_empty() && !wrote {
-        println!("nothing to run: all {} stages are cached", plan.nodes.len());
+        print_line!("{}", counts::all_cached(plan.nodes.len()));
     } else {
-        println!(
-            "{} of {} stages ran, {} were cached",
-            outcome.ran.len(),
-            plan.nodes.len(),
-            plan.nodes.len() - outcome.ran.len()
-        );
+        print_line!("{}", counts::ran(outcome.ran.len(), plan.nodes.len()));
     }
     Ok(ExitCode::SUCCESS)
 }
