@@ -129,7 +129,7 @@ impl Call<'_> {
         // Not twice: as what it said, and as the reason.
         let is_reason = |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
         if let Some(last) = last.filter(|line| !is_reason(line)) {
-            ear.pass_on(&last);
+            watcher.said(&last);
         }
         result
     }
@@ -187,8 +187,11 @@ impl Ear<'_> {
         let mut tail: VecDeque<String> = VecDeque::new();
         for line in lines(stderr) {
             self.log.line(&line);
+            if is_noise(&line) {
+                continue;
+            }
             if let Some(last) = tail.back() {
-                self.pass_on(last);
+                self.watcher.said(last);
             }
             if tail.len() == TAIL {
                 tail.pop_front();
@@ -196,12 +199,6 @@ impl Ear<'_> {
             tail.push_back(line);
         }
         tail.into()
-    }
-
-    fn pass_on(&self, line: &str) {
-        if !is_noise(line) {
-            self.watcher.said(line);
-        }
     }
 }
 

@@ -13,7 +13,7 @@ pub(crate) struct End {
     pub(crate) status: ExitStatus,
     /// The reason it gave by the protocol.
     pub(crate) stated: Option<String>,
-    /// Its last lines on stderr.
+    /// Its last lines on stderr, less [noise](is_noise).
     pub(crate) tail: Vec<String>,
     /// Whether it was asked to end.
     pub(crate) asked: bool,
@@ -45,19 +45,17 @@ impl End {
     }
 }
 
-/// A line without the name it begins with; nothing of one that only says how to see more.
+/// A line without the name it begins with.
 fn own_words<'a>(line: &'a str, name: &str) -> &'a str {
-    if is_noise(line) {
-        return "";
-    }
     line.strip_prefix(name).and_then(|rest| rest.strip_prefix(": ")).unwrap_or(line).trim()
 }
 
-/// Lines that Rust's runtime adds to a message.
+/// What Rust's runtime adds to a message: how to see more, or the frames of a backtrace. It is for the log alone.
 pub(crate) fn is_noise(line: &str) -> bool {
-    ["note: run with `RUST_BACKTRACE", "note: Some details are omitted", "stack backtrace:"]
-        .iter()
-        .any(|start| line.trim_start().starts_with(start))
+    let text = line.trim_start();
+    let is_frame = text.starts_with("at ") || text.trim_start_matches(|c: char| c.is_ascii_digit()).starts_with(": ");
+    let is_added = ["note: run with `RUST_BACKTRACE", "note: Some details are omitted", "stack backtrace:"];
+    (text.len() < line.len() && is_frame) || is_added.iter().any(|start| text.starts_with(start))
 }
 
 fn by_signal(signal: i32, words: Option<&str>) -> String {
@@ -84,20 +82,12 @@ mod tests {
 
     #[test]
     fn the_reason_is_not_the_last_line_by_position() {
-        let note = "note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace";
         for (status, tail, code, starts, ends) in [
             (3 << 8, &["eval: r_0.png: cut short"][..], 3, "r_0.png: cut short", "short"),
             (1 << 8, &["Traceback", "ValueError: bad"], 1, "ValueError: bad", "bad"),
-            (101 << 8, &["thread 'main' panicked at x.rs:1:2:", "a name", note], 101, "a name", "name"),
+            (101 << 8, &["thread 'main' panicked at x.rs:1:2:", "a name"], 101, "a name", "name"),
             (7 << 8, &[], 7, "ended with exit code 7 and said nothing", "nothing"),
-            (7 << 8, &[note], 7, "ended with exit code 7 and said nothing", "nothing"),
-            (
-                6,
-                &["memory allocation of 99532800 bytes failed", note],
-                1,
-                "out of memory: 99.5 MB more were asked for;",
-                "pictures",
-            ),
+            (6, &["memory allocation of 99532800 bytes failed"], 1, "out of memory: 99.5 MB more were asked for;", "pictures"),
             (6, &["free(): invalid pointer"], 1, "crashed with SIGABRT after it said: free(): invalid", "please report it"),
             (9, &["LR pictures: 8"], 1, "ended by SIGKILL after it said: LR pictures: 8; maybe the kernel", "pictures"),
             (11, &[], 1, "crashed with SIGSEGV; please report it", "it"),
@@ -106,6 +96,22 @@ mod tests {
             let failure = end(status, tail).failure("eval");
             assert_eq!(failure.code, code, "{tail:?}");
             assert!(failure.message.starts_with(starts) && failure.message.ends_with(ends), "{tail:?}: {}", failure.message);
+        }
+    }
+
+    #[test]
+    fn what_rusts_runtime_adds_is_no_reason() {
+        for line in [
+            "note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace",
+            "stack backtrace:",
+            "   0: std::alloc::rust_oom",
+            "             at /rustc/59807616/library/std/src/alloc.rs:424:5",
+            "  10: {closure#0}",
+        ] {
+            assert!(is_noise(line), "{line}");
+        }
+        for line in ["memory allocation of 5 bytes failed", "at last", "10: ten", "  indented: words", ": odd", ""] {
+            assert!(!is_noise(line), "{line}");
         }
     }
 

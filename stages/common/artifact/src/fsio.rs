@@ -34,3 +34,21 @@ pub fn write_json(path: &Path, value: &impl Serialize) -> io::Result<()> {
 pub(crate) fn sync_folder(folder: &Path) -> io::Result<()> {
     File::open(folder)?.sync_all()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn permissions_are_left_to_the_umask() {
+        let dir = tempfile::tempdir().unwrap();
+        let place = |name: &str| dir.path().join(name);
+        let mode = |path: &Path| fs::metadata(path).unwrap().permissions().mode();
+        fs::write(place("plain"), "").unwrap();
+        write_atomically(&place("atomic"), b"").unwrap();
+        assert_eq!(mode(&place("atomic")), mode(&place("plain")));
+        fs::create_dir(place("folder")).unwrap();
+        let temporary = temporary(0o777).tempdir_in(dir.path()).unwrap();
+        assert_eq!(mode(temporary.path()), mode(&place("folder")));
+    }
+}

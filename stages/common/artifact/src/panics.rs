@@ -96,7 +96,7 @@ mod tests {
             "main" => panic!("two\n   lines"),
             "thread" => {
                 let (_sender, receiver) = std::sync::mpsc::channel::<()>();
-                std::thread::spawn(|| None::<u8>.expect("a name"));
+                std::thread::spawn(|| panic!("a name"));
                 // For ever, unless the panic ends the process.
                 receiver.recv().ok();
             }
