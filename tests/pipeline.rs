@@ -41,7 +41,7 @@ fn why_names_the_changed_parameter_and_equal_output_cuts_off() {
     assert!(run.contains("1 of 5 stages ran, 4 were cached"), "{run}");
     // And with the other kernel everything after demo-scene runs.
     let run = project.ok(&["run", "-p", "kernel=box"]);
-    assert!(run.contains("4 of 5 stages ran, 1 were cached"), "{run}");
+    assert!(run.contains("4 of 5 stages ran, 1 was cached"), "{run}");
 }
 
 #[test]

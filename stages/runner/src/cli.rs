@@ -1,14 +1,24 @@
-use std::path::PathBuf;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 
 use crate::execute::Options;
 use crate::gc::Choice;
 use crate::graph::{ascii, dot, svg};
+use crate::limits::capped;
+use crate::pipeline::Pipeline;
 use crate::plan::{PlanError, Request};
+use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::verbs;
+
+/// Where the pipeline is looked for.
+const PIPELINE: &str = "pipeline.yaml";
+/// Where stages compute.
+const DEVICE: &str = "cpu";
 
 /// Runs pipeline.yaml: makes what isn't there, skips what is, and says why.
 #[derive(Parser)]
@@ -17,13 +27,13 @@ struct Cli {
     #[command(subcommand)]
     verb: Verb,
     /// The pipeline
-    #[arg(long, global = true, default_value = "pipeline.yaml", value_name = "FILE")]
+    #[arg(long, global = true, default_value = PIPELINE, value_name = "FILE")]
     pipeline: PathBuf,
     /// Where artifacts are kept [default: .nerf-sr beside the pipeline]
     #[arg(long, global = true, value_name = "DIR", env = "NERF_SR_STORE")]
     store: Option<PathBuf>,
     /// Where to compute: cpu or cuda:N
-    #[arg(long, global = true, default_value = "cpu")]
+    #[arg(long, global = true, default_value = DEVICE)]
     device: String,
 }
 
@@ -122,6 +132,11 @@ enum Verb {
         #[arg(long)]
         drop_unfinished: bool,
     },
+    /// Print the help of a stage's program: what it makes, its inputs and its parameters
+    Describe {
+        /// The stage
+        stage: String,
+    },
     /// Print shell completions
     Completions {
         /// For which shell
@@ -136,12 +151,14 @@ enum GraphFormat {
     Svg,
 }
 
-/// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or command line.
+/// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or command line, 70 for a panic.
+/// None of them changes where stdout is closed.
 pub fn main() -> ExitCode {
+    artifact::install_panic_hook("nerf-sr");
     match run(Cli::parse()) {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("nerf-sr: {}", artifact::one_line(&error));
+            report_line!("nerf-sr: {}", artifact::one_line(&error));
             let plan_code = error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
                 PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
                 PlanError::Source(_) => 3,
@@ -158,21 +175,19 @@ impl From<What> for Request {
 }
 
 fn run(cli: Cli) -> anyhow::Result<ExitCode> {
-    if let Verb::Completions { shell } = cli.verb {
-        clap_complete::generate(shell, &mut Cli::command(), "nerf-sr", &mut std::io::stdout());
-        return Ok(ExitCode::SUCCESS);
+    match &cli.verb {
+        Verb::Completions { shell } => return Ok(completions(*shell)),
+        Verb::Describe { stage } => return verbs::describe(&Pipeline::read(&cli.pipeline).map_err(PlanError::from)?, stage),
+        _ => {}
     }
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), &cli.device)?;
     match cli.verb {
         Verb::Run { what, jobs, threads, keep_going, out } => {
-            let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-            if jobs == Some(0) || threads == Some(0) {
-                return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()).into());
-            }
-            let threads = threads.unwrap_or(cores);
-            let options = Options { jobs: jobs.unwrap_or(cores.min(4)), threads, device: session.device.clone(), keep_going };
+            let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
+            let (jobs, threads) = at_once(jobs, threads)?;
+            let options = Options { jobs, threads, device: session.device.clone(), keep_going };
             let out = out.unwrap_or_else(|| session.pipeline.folder().join("out"));
-            verbs::run(&session, &what.into(), &options, &out)
+            verbs::run(&session, &what.into(), &options, &out, &remedy)
         }
         Verb::Plan { what } => verbs::plan(&session, &what.into()),
         Verb::Why { stage, what } => verbs::why(&session, &stage, &what.into()),
@@ -180,14 +195,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Graph { what, format } => {
             let plan = session.plan(&what.into())?;
             let states = session.states(&plan)?;
-            print!(
-                "{}",
-                match format {
-                    GraphFormat::Ascii => ascii(&plan, &states),
-                    GraphFormat::Dot => dot(&plan),
-                    GraphFormat::Svg => svg(&plan, &states),
-                }
-            );
+            print_lines(&match format {
+                GraphFormat::Ascii => ascii(&plan, &states),
+                GraphFormat::Dot => dot(&plan),
+                GraphFormat::Svg => svg(&plan, &states),
+            });
             Ok(ExitCode::SUCCESS)
         }
         Verb::Log { stage, what } => verbs::log(&session, &stage, &what.into()),
@@ -197,8 +209,43 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Gc { what, dry_run, keep_days, drop_unfinished } => {
             verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished })
         }
-        Verb::Completions { .. } => unreachable!("handled before the session"),
+        Verb::Completions { .. } | Verb::Describe { .. } => unreachable!("handled before the session"),
     }
+}
+
+fn completions(shell: clap_complete::Shell) -> ExitCode {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Cli::command(), "nerf-sr", &mut script);
+    // Whoever asked for it may have gone.
+    std::io::stdout().write_all(&script).ok();
+    ExitCode::SUCCESS
+}
+
+/// Stages at once and threads of all of them, as far as the machine can use them.
+fn at_once(jobs: Option<usize>, threads: Option<usize>) -> Result<(usize, usize), PlanError> {
+    if jobs == Some(0) || threads == Some(0) {
+        return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
+    }
+    let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let (jobs, less_jobs) = capped("--jobs", jobs.unwrap_or(cores.min(4)), cores);
+    let (threads, less_threads) = capped("--threads", threads.unwrap_or(cores), cores);
+    less_jobs.into_iter().chain(less_threads).for_each(|said| report_line!("{said}"));
+    Ok((jobs, threads))
+}
+
+/// The words with which another verb is asked for the same.
+fn given(what: &What, pipeline: &Path, store: Option<&Path>, device: &str) -> Vec<String> {
+    let mut words = what.targets.clone();
+    words.extend(what.parameters.iter().flat_map(|value| ["-p".to_owned(), value.clone()]));
+    words.extend(what.inputs.iter().flat_map(|value| ["-i".to_owned(), value.clone()]));
+    let file = |path: &Path| path.to_string_lossy().into_owned();
+    let options = [
+        ("--pipeline", (pipeline != Path::new(PIPELINE)).then(|| file(pipeline))),
+        ("--store", store.map(file)),
+        ("--device", (device != DEVICE).then(|| device.to_owned())),
+    ];
+    words.extend(options.into_iter().flat_map(|(name, value)| value.into_iter().flat_map(|v| [name.to_owned(), v])));
+    words
 }
 
 #[cfg(test)]

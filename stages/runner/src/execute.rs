@@ -8,7 +8,8 @@ use std::sync::{Mutex, mpsc};
 use std::time::{Duration, Instant};
 
 use artifact::{
-    Attempt, Entered, Event, Holder, KeyLock, Pace, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time,
+    Attempt, Entered, Event, Holder, KeyLock, Pace, Record, RunFile, Store, Unfinished, hash_json, host_name, printable,
+    report_text, unix_time,
 };
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
@@ -158,7 +159,7 @@ impl Job<'_> {
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
         };
-        self.make(&lock, attempt, action, &output_of).map(|record| (record, true))
+        self.make(&lock, attempt, action, (&hashes, &output_of)).map(|record| (record, true))
     }
 
     /// The record, if the action was done. Either way it is written down that this run needs it, so that it can't go meanwhile.
@@ -183,21 +184,23 @@ impl Job<'_> {
         lock: &KeyLock,
         attempt: Attempt,
         action: Unfinished,
-        output_of: &dyn Fn(usize) -> String,
+        (hashes, output_of): (&[(String, String)], &dyn Fn(usize) -> String),
     ) -> Result<Record, StageFailure> {
         let inputs: Vec<(String, PathBuf)> =
             self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, output_of))).collect();
+        let label = self.node.label();
         let call = Call {
+            label: &label,
             program: &self.node.program,
             params: &attempt.params,
             inputs: &inputs,
+            hashes,
             output: &attempt.output,
             work: Some(&attempt.work),
             device: &self.options.device,
             threads: self.threads,
             lock: Some(lock),
         };
-        let label = self.node.label();
         let view = self.display.start(&label);
         let started = Instant::now();
         let result = call.run(&attempt.log, &view, self.stop);
@@ -254,8 +257,8 @@ impl Display {
     fn line(&self, text: &str) {
         match &self.bars {
             // The terminal may have gone; the run goes on.
-            Some(bars) => bars.println(text).unwrap_or_default(),
-            None => eprintln!("{text}"),
+            Some(bars) => bars.println(printable(text)).unwrap_or_default(),
+            None => report_text(text),
         }
     }
 
@@ -263,7 +266,7 @@ impl Display {
         let bar = self.bars.as_ref().map(|bars| {
             let style =
                 ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
-            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned()))
+            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(printable(label).into_owned()))
         });
         if bar.is_none() {
             self.line(&format!("{label}: running"));
@@ -302,7 +305,7 @@ impl StageView<'_> {
 
 impl Watcher for StageView<'_> {
     fn progress(&self, event: &Event) {
-        let Event::Progress { label, done, total, note } = event;
+        let Event::Progress { label, done, total, note } = event else { return };
         let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         if shown.label != *label {
             (shown.label, shown.pace) = (label.clone(), Pace::default());

@@ -6,21 +6,28 @@
 //! * `execute`: runs nodes, some at once, each under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
 mod cli;
+mod clock;
+mod counts;
 mod execute;
 mod gc;
 mod graph;
 mod key;
+mod limits;
 mod pipeline;
 mod plan;
 mod process;
 mod publish;
+mod remedy;
 mod session;
-mod signals;
 mod sink;
 mod sources;
+mod stage_log;
 mod stages;
 mod verbs;
+mod verdict;
 mod waiting;
 mod words;
 

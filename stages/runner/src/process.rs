@@ -1,24 +1,45 @@
-use std::fs::File;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::collections::VecDeque;
+use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use artifact::{Event, KeyLock};
+use artifact::{Event, KeyLock, SUMMARY_FILE, counted, printable};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
+use crate::execute::seconds;
+use crate::stage_log::{StageLog, Tenths};
 use crate::stages::StageProgram;
+use crate::verdict::{End, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
-const ENVIRONMENT: [&str; 9] =
-    ["PATH", "HOME", "LANG", "LC_ALL", "TMPDIR", "LD_LIBRARY_PATH", "CUDA_VISIBLE_DEVICES", "NO_COLOR", "RUST_BACKTRACE"];
+const ENVIRONMENT: [&str; 10] = [
+    "PATH",
+    "HOME",
+    "LANG",
+    "LC_ALL",
+    "TMPDIR",
+    "LD_LIBRARY_PATH",
+    "CUDA_VISIBLE_DEVICES",
+    "NO_COLOR",
+    "RUST_BACKTRACE",
+    artifact::STOP_VARIABLE,
+];
+
+/// Last lines of a stage's stderr in which the reason of a failure is looked for.
+const TAIL: usize = 8;
 
 /// One call of a stage by the contract.
 pub(crate) struct Call<'a> {
+    /// Block and point, for the log.
+    pub(crate) label: &'a str,
     pub(crate) program: &'a StageProgram,
     pub(crate) params: &'a Path,
     pub(crate) inputs: &'a [(String, PathBuf)],
+    /// What the inputs' contents are, where that is known; for the log.
+    pub(crate) hashes: &'a [(String, String)],
     pub(crate) output: &'a Path,
     pub(crate) work: Option<&'a Path>,
     pub(crate) device: &'a str,
@@ -33,62 +54,84 @@ pub(crate) struct Call<'a> {
 pub(crate) struct StageFailure {
     /// Its exit code; 1 where a signal ended it.
     pub(crate) code: u8,
-    /// Its last words.
+    /// Why, on one line.
     pub(crate) message: String,
 }
 
-/// What to do with a stage's output while it runs.
+impl StageFailure {
+    fn at(path: &Path, error: &std::io::Error) -> Self {
+        Self { code: 1, message: format!("{}: {error}", path.display()) }
+    }
+}
+
+/// What to do with a stage's output while it runs. Control characters in it are spelled out.
 pub(crate) trait Watcher: Sync {
     fn progress(&self, event: &Event);
     fn said(&self, line: &str);
 }
 
 impl Call<'_> {
-    /// Runs the stage; appends what it says to `log`. When `stop` is set the stage is asked to end, so that it leaves a checkpoint.
+    /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When `stop` is set the stage is asked to
+    /// end, so that it leaves a checkpoint.
     pub(crate) fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
-        let fail = |message: String| StageFailure { code: 1, message };
-        let mut log = File::options().create(true).append(true).open(log).map_err(|e| fail(format!("{}: {e}", log.display())))?;
-        let path = self.program.path.display();
+        let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
+        self.log_start(&log);
+        let started = Instant::now();
+        let result = self.carry_out(&log, watcher, stop);
+        let time = seconds(started.elapsed().as_secs_f64());
+        match &result {
+            Ok(()) => {
+                log.line(format_args!("done in {time}"));
+                let summary = std::fs::read_to_string(self.output.join(SUMMARY_FILE)).unwrap_or_default();
+                summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
+            }
+            Err(StageFailure { code, message }) => log.line(format_args!("failed after {time} with {code}: {message}")),
+        }
+        result
+    }
+
+    fn log_start(&self, log: &StageLog) {
+        log.start(self.label);
+        let StageProgram { path, description } = self.program;
+        log.line(format_args!("program: {} {}, {}", path.display(), description.version, counted(self.threads, "thread")));
+        log.line(format_args!("device: {}", self.device));
+        let parameters = std::fs::read(self.params).ok().and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
+        log.line(format_args!("parameters: {}", parameters.unwrap_or_default()));
+        for (name, folder) in self.inputs {
+            let hash = self.hashes.iter().find(|(of, _)| of == name).map(|(_, hash)| format!(" ({hash})")).unwrap_or_default();
+            log.line(format_args!("input {name}: {}{hash}", folder.display()));
+        }
+    }
+
+    fn carry_out(&self, log: &StageLog, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
+        let fail = |e: std::io::Error| StageFailure::at(&self.program.path, &e);
         let stdin = match self.lock {
-            Some(lock) => Stdio::from(lock.share().map_err(|e| fail(format!("{path}: {e}")))?),
+            Some(lock) => Stdio::from(lock.share().map_err(fail)?),
             None => Stdio::null(),
         };
-        let mut child = self.command().stdin(stdin).spawn().map_err(|e| fail(format!("{path}: {e}")))?;
+        let mut child = self.command().stdin(stdin).spawn().map_err(fail)?;
+        let ear = Ear { log, watcher };
         let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
-        let mut last_words = String::new();
-        let status = std::thread::scope(|scope| {
-            scope.spawn(|| {
-                for line in lines(stdout) {
-                    if let Ok(event) = serde_json::from_str::<Event>(&line) {
-                        watcher.progress(&event);
-                    }
-                }
-            });
-            let reader = scope.spawn(|| {
-                for line in lines(stderr) {
-                    // The log is for people; a full disk shows itself in the output.
-                    writeln!(log, "{line}").ok();
-                    if !last_words.is_empty() {
-                        watcher.said(&last_words);
-                    }
-                    last_words = line;
-                }
-            });
+        let (status, stated, tail) = std::thread::scope(|scope| {
+            let events = scope.spawn(|| ear.hear_events(stdout));
+            let words = scope.spawn(|| ear.hear_words(stderr));
             let status = wait(&mut child, stop);
-            reader.join().ok();
-            status
+            (status, events.join().ok().flatten(), words.join().unwrap_or_default())
         });
-        let status = status.map_err(|e| fail(format!("{path}: {e}")))?;
-        if status.success() {
-            if !last_words.is_empty() {
-                watcher.said(&last_words);
-            }
-            return Ok(());
+        let status = status.map_err(fail)?;
+        let last = tail.last().cloned();
+        let result = if status.success() {
+            Ok(())
+        } else {
+            let end = End { status, stated, tail, asked: stop.load(Ordering::Relaxed) };
+            Err(end.failure(&self.program.description.name))
+        };
+        // Not twice: as what it said, and as the reason.
+        let is_reason = |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
+        if let Some(last) = last.filter(|line| !is_reason(line)) {
+            watcher.said(&last);
         }
-        let code = status.code().and_then(|c| u8::try_from(c).ok()).unwrap_or(1);
-        let message =
-            if last_words.is_empty() { format!("{} ended with {status}", self.program.description.name) } else { last_words };
-        Err(StageFailure { code, message })
+        result
     }
 
     fn command(&self) -> Command {
@@ -112,28 +155,79 @@ impl Call<'_> {
     }
 }
 
+/// Listens to a stage.
+struct Ear<'a> {
+    log: &'a StageLog,
+    watcher: &'a dyn Watcher,
+}
+
+impl Ear<'_> {
+    /// Hears stdout: events, and what a plain script prints, which is for the log alone. Returns the reason of a failure, where
+    /// one is stated.
+    fn hear_events(&self, stdout: Option<impl Read>) -> Option<String> {
+        let (mut stated, mut tenths) = (None, Tenths::default());
+        for line in lines(stdout) {
+            match serde_json::from_str(&line) {
+                Ok(Event::Failed { message }) => stated = Some(printable(&message).into_owned()),
+                Ok(Event::Progress { label, done, total, note }) => {
+                    let (label, note) = (printable(&label).into_owned(), printable(&note).into_owned());
+                    if let Some(told) = tenths.told(&label, done, total, &note) {
+                        self.log.line(told);
+                    }
+                    self.watcher.progress(&Event::Progress { label, done, total, note });
+                }
+                Err(_) => self.log.line(line),
+            }
+        }
+        stated
+    }
+
+    /// Hears stderr, and passes on all but the last line, which may be the reason of a failure. Returns the last lines.
+    fn hear_words(&self, stderr: Option<impl Read>) -> Vec<String> {
+        let mut tail: VecDeque<String> = VecDeque::new();
+        for line in lines(stderr) {
+            self.log.line(&line);
+            if is_noise(&line) {
+                continue;
+            }
+            if let Some(last) = tail.back() {
+                self.watcher.said(last);
+            }
+            if tail.len() == TAIL {
+                tail.pop_front();
+            }
+            tail.push_back(line);
+        }
+        tail.into()
+    }
+}
+
+/// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open and write unseen.
 fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ExitStatus> {
+    let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
     let mut asked = false;
     loop {
         if let Some(status) = child.try_wait()? {
+            // Mostly there is nothing left of its group.
+            pid.map(|group| kill_process_group(group, Signal::KILL).ok());
             return Ok(status);
         }
         if stop.load(Ordering::Relaxed) && !asked {
-            if let Some(pid) = rustix::process::Pid::from_raw(child.id() as i32) {
-                // It may just have ended by itself.
-                rustix::process::kill_process(pid, rustix::process::Signal::TERM).ok();
-            }
+            // It may just have ended by itself.
+            pid.map(|pid| kill_process(pid, Signal::TERM).ok());
             asked = true;
         }
         std::thread::sleep(Duration::from_millis(10));
     }
 }
 
-/// Lines of a pipe; bytes that aren't UTF-8 are replaced, not refused.
+/// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control characters spelled out. Of what was
+/// written over in place (a foreign progress bar) the last state counts.
 fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
     let reader = pipe.map(BufReader::new);
-    reader
-        .into_iter()
-        .flat_map(|r| r.split(b'\n').map_while(Result::ok))
-        .map(|l| String::from_utf8_lossy(&l).trim_end().to_owned())
+    reader.into_iter().flat_map(|r| r.split(b'\n').map_while(Result::ok)).filter_map(|bytes| {
+        let text = String::from_utf8_lossy(&bytes);
+        let line = text.trim_end().rsplit('\r').find(|state| !state.trim().is_empty())?;
+        Some(printable(line).into_owned())
+    })
 }

@@ -89,9 +89,11 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Res
     let view = display.start(&sink.stage);
     let inputs = [("run".to_owned(), folder)];
     let call = Call {
+        label: &sink.stage,
         program: &sink.program,
         params: &params,
         inputs: &inputs,
+        hashes: &[],
         output: &output,
         work: None,
         device: &options.device,

@@ -54,7 +54,7 @@ pub(crate) fn describe_all(pipeline: &Pipeline, store: &Store) -> Result<BTreeMa
     Ok(programs)
 }
 
-fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
+pub(crate) fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     let origin = pipeline.stages[stage].like.as_deref().unwrap_or(stage);
     let run = pipeline.stages[origin].run.as_deref().unwrap_or(origin);
     if run.contains('/') {

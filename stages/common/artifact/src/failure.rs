@@ -1,5 +1,7 @@
 use std::fmt::Display;
 
+use crate::printable::printable;
+
 /// What went wrong, by what the user does next. Each kind has its exit code.
 #[derive(Debug, thiserror::Error)]
 pub enum Failure {
@@ -18,7 +20,7 @@ pub enum Failure {
 }
 
 impl Failure {
-    fn exit_code(&self) -> u8 {
+    pub(crate) fn exit_code(&self) -> u8 {
         match self {
             Self::Usage(_) => 2,
             Self::BadInput(_) => 3,
@@ -33,7 +35,7 @@ pub fn exit_code(error: &anyhow::Error) -> u8 {
     error.chain().find_map(|cause| cause.downcast_ref::<Failure>()).map_or(1, Failure::exit_code)
 }
 
-/// An error and its causes on one line.
+/// An error and its causes on one line, control characters spelled out.
 pub fn one_line(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -43,7 +45,7 @@ pub fn one_line(error: &anyhow::Error) -> String {
             text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
         }
     }
-    text.replace('\n', " ")
+    printable(&text.replace('\n', " ")).into_owned()
 }
 
 /// Turns any error into a [`Failure`] of a kind.
@@ -61,5 +63,18 @@ impl<T, E: Into<anyhow::Error>> FailureExt<T> for Result<T, E> {
 
     fn usage(self, context: impl Display) -> anyhow::Result<T> {
         self.map_err(|e| Failure::Usage(format!("{context}: {}", one_line(&e.into()))).into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_from_files_move_no_terminal() {
+        let error = anyhow::anyhow!("r_\u{1b}]0;PWN\u{7}.png: No such file").context("frame 3\nof many");
+        assert_eq!(one_line(&error), r"frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
+        let bad = Err::<(), _>(error).bad_input("input scene").unwrap_err();
+        assert_eq!(one_line(&bad), r"input scene: frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
     }
 }

@@ -34,30 +34,42 @@
 //! }
 //! ```
 
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
 mod canonical;
+mod console;
 mod describe;
 mod failure;
 mod fsio;
 mod lock;
 mod manifest;
+mod memory;
+mod panics;
 mod parameters;
 mod parts;
+mod printable;
 mod progress;
 mod run_record;
 mod runs;
+mod signals;
 mod stage;
 mod store;
 
 pub use canonical::{canonical, hash_json};
+pub use console::{counted, print_lines, print_text, report_text, sized};
 pub use describe::{Description, Input, Output};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path};
+pub use memory::{MEMORY_REMEDY, out_of_memory};
+pub use panics::install_panic_hook;
 pub use parameters::{ParameterProblem, Schema};
-pub use progress::{Event, Pace, Progress, ProgressMode};
+pub use printable::printable;
+pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
 pub use run_record::{RunInput, RunNode, RunRecord};
 pub use runs::{Run, RunFile, Waiting};
+pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished};
 

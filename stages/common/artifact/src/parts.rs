@@ -6,7 +6,7 @@ use anyhow::Context as _;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::fsio::{sync_folder, write_json};
+use crate::fsio::{sync_folder, temporary, write_json};
 use crate::manifest::{MANIFEST_FILE, Manifest};
 use crate::stage::Context;
 
@@ -61,7 +61,7 @@ impl Context {
     fn keep(&self, folder: &Path, files: &[&str], value: &impl Serialize) -> anyhow::Result<()> {
         let parts = folder.parent().expect("it lies in --work");
         fs::create_dir_all(parts)?;
-        let partial = tempfile::Builder::new().prefix(".").tempdir_in(parts)?;
+        let partial = temporary(0o777).tempdir_in(parts)?;
         for file in files {
             copy(&self.output_path(file)?, &partial.path().join(file))?;
         }

@@ -1,8 +1,11 @@
 use std::io::{IsTerminal, Write};
-use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
+
+use crate::report_line;
 
 /// How a stage shows that it is getting on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -30,7 +33,40 @@ pub enum Event {
         /// A figure that matters (loss, PSNR), in a few words.
         note: String,
     },
+    /// The stage is about to end without a result. The exit code says what kind of failure it is.
+    Failed {
+        /// What is wrong and what to do, on one line, without the stage's name.
+        message: String,
+    },
 }
+
+impl Event {
+    fn line(&self) -> String {
+        serde_json::to_string(self).expect("an event is plain JSON") + "\n"
+    }
+
+    /// A runner that went away is no reason to stop: the stage's work still counts.
+    fn emit(&self) {
+        std::io::stdout().write_all(self.line().as_bytes()).ok();
+    }
+}
+
+/// Whether the process has been asked for events: what ends it may come from anywhere.
+static EMITS_EVENTS: AtomicBool = AtomicBool::new(false);
+
+/// From now on the process says as an event why it fails.
+pub(crate) fn emit_events() {
+    EMITS_EVENTS.store(true, Ordering::SeqCst);
+}
+
+/// The line that tells a runner why the process fails, where it is to be told.
+pub(crate) fn failed_event(message: &str) -> Option<String> {
+    let event = || Event::Failed { message: message.to_owned() }.line();
+    EMITS_EVENTS.load(Ordering::SeqCst).then(event)
+}
+
+/// Environment variable of the tests: a stage whose progress comes to this count is stopped then, as if by a signal.
+pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
 
 /// Progress of one piece of long work. Cheap to call often: at most ten updates a second leave it.
 pub struct Progress {
@@ -39,6 +75,22 @@ pub struct Progress {
     mode: ProgressMode,
     bar: Option<indicatif::ProgressBar>,
     state: Mutex<State>,
+    stop: Option<StopAfter>,
+}
+
+/// Stops a stage at a count.
+#[derive(Debug, Clone)]
+pub(crate) struct StopAfter {
+    count: u64,
+    interrupted: Arc<AtomicBool>,
+}
+
+impl StopAfter {
+    /// What [`STOP_VARIABLE`] asks for.
+    pub(crate) fn from_environment(interrupted: &Arc<AtomicBool>) -> Option<Self> {
+        let count = std::env::var(STOP_VARIABLE).ok()?.parse().ok()?;
+        Some(Self { count, interrupted: Arc::clone(interrupted) })
+    }
 }
 
 struct State {
@@ -58,7 +110,12 @@ impl Progress {
             indicatif::ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned())
         });
         let state = State { done: 0, note: String::new(), pace: Pace::default(), shown: Instant::now(), is_shown: false };
-        Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state) }
+        Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state), stop: None }
+    }
+
+    pub(crate) fn stopping(mut self, stop: Option<StopAfter>) -> Self {
+        self.stop = stop;
+        self
     }
 
     /// Sets the count.
@@ -78,6 +135,9 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         change(&mut state);
         let done = state.done;
+        if let Some(stop) = self.stop.as_ref().filter(|stop| done >= stop.count) {
+            stop.interrupted.store(true, Ordering::Relaxed);
+        }
         state.pace.begin(done);
         let interval = if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
         let due = state.shown.elapsed() >= Duration::from_millis(interval);
@@ -90,13 +150,9 @@ impl Progress {
             bar.set_position(state.done);
             bar.set_message(format!("{} · {left}", state.note));
         } else if self.mode == ProgressMode::Json {
-            let event =
-                Event::Progress { label: self.label.clone(), done: state.done, total: self.total, note: state.note.clone() };
-            let line = serde_json::to_string(&event).expect("an event is plain JSON");
-            // A runner that went away is no reason to stop: the stage's work still counts.
-            writeln!(std::io::stdout(), "{line}").ok();
+            Event::Progress { label: self.label.clone(), done, total: self.total, note: state.note.clone() }.emit();
         } else {
-            eprintln!("{}: {} of {} {} · {left} left", self.label, state.done, self.total, state.note);
+            report_line!("{}: {done} of {} {} · {left} left", self.label, self.total, state.note);
         }
     }
 }

@@ -1,5 +1,7 @@
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fs;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -13,12 +15,16 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use crate::canonical::hash_json;
+use crate::console::{print_lines, report_text};
 use crate::describe::{Description, Input, Output};
 use crate::failure::{Failure, FailureExt, exit_code, one_line};
 use crate::fsio::write_json;
 use crate::manifest::{MANIFEST_FILE, Manifest};
+use crate::panics::install_panic_hook;
 use crate::parameters::Schema;
-use crate::progress::{Progress, ProgressMode};
+use crate::progress::{Progress, ProgressMode, StopAfter, emit_events, failed_event};
+use crate::report_line;
+use crate::signals::stop_on_signals;
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
 pub const SUMMARY_FILE: &str = "summary.txt";
@@ -214,13 +220,13 @@ impl Context {
 
     /// Starts a progress display.
     pub fn progress(&self, label: &str, total: u64) -> Progress {
-        Progress::new(label, total, self.progress)
+        Progress::new(label, total, self.progress).stopping(StopAfter::from_environment(&self.interrupted))
     }
 
-    /// Says something to the person watching; it also lands in the action's log.
+    /// Says something to the person watching, on one line; it also lands in the action's log.
     pub fn say(&self, text: impl std::fmt::Display) {
         if self.progress != ProgressMode::None {
-            eprintln!("{text}");
+            report_text(&text.to_string());
         }
     }
 
@@ -235,35 +241,56 @@ impl Context {
     }
 }
 
-/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors to an exit code.
+/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors and panics to an exit code. The reason of a
+/// failure is one line on stderr, and with `--progress json` an event on stdout.
 pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
-    match parse_and_run::<S>(version, code) {
+    run_stage_with::<S>(version, code, std::env::args_os())
+}
+
+pub(crate) fn run_stage_with<S: Stage>(
+    version: &'static str,
+    code: &str,
+    arguments: impl IntoIterator<Item = OsString>,
+) -> ExitCode {
+    install_panic_hook(S::NAME);
+    match parse_and_run::<S>(version, code, arguments) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{}: {}", S::NAME, one_line(&error));
+            let message = one_line(&error);
+            report_line!("{}: {message}", S::NAME);
+            if let Some(event) = failed_event(&message) {
+                std::io::stdout().write_all(event.as_bytes()).ok();
+            }
             ExitCode::from(exit_code(&error))
         }
     }
 }
 
-fn parse_and_run<S: Stage>(version: &'static str, code: &str) -> anyhow::Result<()> {
+fn parse_and_run<S: Stage>(
+    version: &'static str,
+    code: &str,
+    arguments: impl IntoIterator<Item = OsString>,
+) -> anyhow::Result<()> {
     let description = S::describe(version, code);
     let mut command = Arguments::command().name(S::NAME).about(S::SUMMARY).after_help(help_of(&description));
     if !version.is_empty() {
         command = command.version(version);
     }
-    let arguments = match command.clone().try_get_matches() {
+    let arguments = match command.clone().try_get_matches_from(arguments) {
         Ok(matches) => <Arguments as clap::FromArgMatches>::from_arg_matches(&matches)?,
         // Help and version, too, come this way; clap knows where to print and how to exit.
         Err(error) => error.exit(),
     };
     match arguments.command {
         Some(Command::Describe) => {
-            println!("{}", serde_json::to_string_pretty(&description)?);
+            print_lines(&serde_json::to_string_pretty(&description)?);
             Ok(())
         }
         Some(Command::Completions { shell }) => {
-            clap_complete::generate(shell, &mut command, S::NAME, &mut std::io::stdout());
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut command, S::NAME, &mut script);
+            // Whoever asked for it may have gone.
+            std::io::stdout().write_all(&script).ok();
             Ok(())
         }
         None => execute::<S>(arguments, &description),
@@ -292,50 +319,26 @@ fn help_of(description: &Description) -> String {
 }
 
 fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
+    let for_runner = arguments.progress == ProgressMode::Json;
+    if for_runner {
+        emit_events();
+    }
     let params: S::Params = read_params(arguments.params.as_deref(), &description.parameters)?;
-    let mut inputs = BTreeMap::new();
-    let mut folders = Vec::new();
-    for text in &arguments.inputs {
-        let (name, folder) = text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
-        if !description.inputs.contains_key(name) {
-            let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
-            return Err(Failure::Usage(format!("--input {name}: no such input; known: {known}")).into());
-        }
-        folders.push((name, Path::new(folder)));
-    }
-    for (name, input) in &description.inputs {
-        if !input.optional && !folders.iter().any(|(given, _)| given == name) {
-            return Err(Failure::Usage(format!("input {name} is missing; give --input {name}=DIR ({})", input.summary)).into());
-        }
-    }
+    let folders = input_folders(&arguments.inputs, description)?;
     let threads = match arguments.threads {
         Some(0) => return Err(Failure::Usage("--threads 0: give at least 1".to_owned()).into()),
         Some(n) => n,
         None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
     };
     rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
+    let mut inputs = BTreeMap::new();
     for (name, folder) in folders {
         inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
     }
-
-    let interrupted = Arc::new(AtomicBool::new(false));
-    for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
-        // The second signal ends the process at once.
-        signal_hook::flag::register_conditional_shutdown(signal, 130, Arc::clone(&interrupted))?;
-        signal_hook::flag::register(signal, Arc::clone(&interrupted))?;
+    let interrupted = stop_on_signals()?;
+    if for_runner {
+        end_with_runner(&interrupted)?;
     }
-
-    if arguments.progress == ProgressMode::Json {
-        // The parent is a runner: when it is killed, end as if interrupted, with a checkpoint, rather than work on unseen.
-        rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
-        // It may have been killed before that, while this process was being loaded.
-        let runner = std::env::var(RUNNER_VARIABLE).ok().and_then(|pid| pid.parse::<i32>().ok());
-        let parent = rustix::process::getppid().map_or(0, rustix::process::Pid::as_raw_pid);
-        if runner.is_some_and(|pid| pid != parent) {
-            interrupted.store(true, std::sync::atomic::Ordering::SeqCst);
-        }
-    }
-
     let output = arguments.output.expect("clap requires --output");
     let staging = Staging::new(&output)?;
     if let Some(work) = &arguments.work {
@@ -358,6 +361,37 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     S::run(&context, &params)?;
     context.check_interrupt()?;
     staging.publish(&description.output.kind, &output)
+}
+
+/// The inputs' names and folders: each one known, none missing.
+fn input_folders<'a>(given: &'a [String], description: &Description) -> anyhow::Result<Vec<(&'a str, &'a Path)>> {
+    let mut folders = Vec::new();
+    for text in given {
+        let (name, folder) = text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
+        if !description.inputs.contains_key(name) {
+            let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
+            return Err(Failure::Usage(format!("--input {name}: no such input; known: {known}")).into());
+        }
+        folders.push((name, Path::new(folder)));
+    }
+    for (name, input) in &description.inputs {
+        if !input.optional && !folders.iter().any(|(given, _)| given == name) {
+            return Err(Failure::Usage(format!("input {name} is missing; give --input {name}=DIR ({})", input.summary)).into());
+        }
+    }
+    Ok(folders)
+}
+
+/// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than work on unseen.
+fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
+    // It may have been killed before that, while this process was being loaded.
+    let runner = std::env::var(RUNNER_VARIABLE).ok().and_then(|pid| pid.parse::<i32>().ok());
+    let parent = rustix::process::getppid().map_or(0, rustix::process::Pid::as_raw_pid);
+    if runner.is_some_and(|pid| pid != parent) {
+        interrupted.store(true, Ordering::SeqCst);
+    }
+    Ok(())
 }
 
 /// The parameters from the file, checked against the schema, or the defaults.

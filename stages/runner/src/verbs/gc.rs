@@ -1,12 +1,11 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, hash_json};
+use artifact::{Failure, hash_json, print_line, report_line, stop_on_signals};
 
 use crate::execute::seconds;
 use crate::gc::{Choice, Root, judge};
 use crate::plan::{Request, State};
 use crate::session::Session;
-use crate::signals::stop_at_signals;
 use crate::waiting::until_held;
 
 /// Removes what nothing needs any more.
@@ -15,14 +14,14 @@ pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, choice: Choic
     let needed = needed(session, what)?;
     if dry_run {
         let verdict = judge(store, needed, choice)?;
-        verdict.lines().iter().for_each(|line| println!("{line}"));
+        verdict.lines().iter().for_each(|line| print_line!("{line}"));
         let (goes, stays) = verdict.bytes();
-        println!("{:.1} MB would go, {:.1} MB would stay", goes as f64 / 1e6, stays as f64 / 1e6);
+        print_line!("{:.1} MB would go, {:.1} MB would stay", goes as f64 / 1e6, stays as f64 / 1e6);
         return Ok(ExitCode::SUCCESS);
     }
-    let stop = stop_at_signals()?;
+    let stop = stop_on_signals()?;
     let say = |_: Option<&_>, waited: std::time::Duration| {
-        eprintln!("nerf-sr: waits until no run looks for artifacts, for {} now", seconds(waited.as_secs_f64()));
+        report_line!("nerf-sr: waits until no run looks for artifacts, for {} now", seconds(waited.as_secs_f64()));
     };
     let closed = match until_held(&stop, &say, || store.try_close()) {
         Ok(closed) => closed,
@@ -32,10 +31,10 @@ pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, choice: Choic
     let verdict = judge(store, needed, choice)?;
     verdict.carry_out(store, &closed)?;
     drop(closed);
-    verdict.lines().iter().for_each(|line| println!("{line}"));
+    verdict.lines().iter().for_each(|line| print_line!("{line}"));
     store.empty_trash()?;
     let (goes, stays) = verdict.bytes();
-    println!("{:.1} MB freed, {:.1} MB stay", goes as f64 / 1e6, stays as f64 / 1e6);
+    print_line!("{:.1} MB freed, {:.1} MB stay", goes as f64 / 1e6, stays as f64 / 1e6);
     Ok(ExitCode::SUCCESS)
 }
 

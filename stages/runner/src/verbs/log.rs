@@ -1,22 +1,90 @@
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::UNIX_EPOCH;
 
-use artifact::hash_json;
+use artifact::{Store, StoreError, hash_json, print_line, print_lines};
 
-use crate::plan::{Request, State};
+use crate::clock::utc;
+use crate::plan::{Plan, Request, State};
 use crate::session::{Session, of_stage};
+use crate::stage_log::label_in;
 
-/// Prints what a stage said.
+/// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
 pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
-    let states = session.states(&plan)?;
-    for i in of_stage(&plan, stage)? {
-        let path = match &states[i] {
+    let nodes = of_stage(&plan, stage);
+    let logs = nodes.as_ref().map_or_else(|_| Vec::new(), |nodes| logs_of(session, &plan, nodes));
+    for (label, path, text) in &logs {
+        print_line!("{label} ({}):", path.display());
+        print_lines(text);
+    }
+    if !logs.is_empty() {
+        return Ok(ExitCode::SUCCESS);
+    }
+    let Some(last) = last_of(&session.store, stage)? else {
+        // Where the plan has the stage, that it has said nothing is no fault.
+        nodes?;
+        print_line!("{stage}: it has not run yet");
+        return Ok(ExitCode::SUCCESS);
+    };
+    print_line!("{stage}: not run with these arguments; this is of its last run, {}", utc(last.unix));
+    print_line!("{} ({}):", last.label, last.path.display());
+    print_lines(&text_of(&last.path));
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Label, file and text of the logs that there are of some nodes.
+fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, PathBuf, String)> {
+    // What can't be known, say of a folder that is gone, may still have a log from before.
+    let Ok(states) = session.states(plan) else { return Vec::new() };
+    let mut logs = Vec::new();
+    for &node in nodes {
+        let path = match &states[node] {
             State::Cached(record) => session.store.action(&record.key(), "log"),
-            State::WillRun { key_parts } => session.store.partial(&hash_json(key_parts)).join("log"),
+            State::WillRun { key_parts } => attempt_log(&session.store, &hash_json(key_parts)),
             State::Waits { .. } => continue,
         };
-        println!("{}:", plan.nodes[i].label());
-        print!("{}", std::fs::read_to_string(&path).unwrap_or_else(|_| "  it has said nothing yet\n".to_owned()));
+        if path.is_file() {
+            let text = text_of(&path);
+            logs.push((plan.nodes[node].label(), path, text));
+        }
     }
-    Ok(ExitCode::SUCCESS)
+    logs
+}
+
+fn attempt_log(store: &Store, key: &str) -> PathBuf {
+    store.partial(key).join("log")
+}
+
+/// A stage's run.
+struct Run {
+    /// When it ended, or last said something.
+    unix: u64,
+    label: String,
+    path: PathBuf,
+}
+
+/// The last run of a stage, finished or not, whatever it was run with.
+fn last_of(store: &Store, stage: &str) -> Result<Option<Run>, StoreError> {
+    let finished = store.records()?.into_iter().filter(|record| record.stage == stage).map(|record| {
+        let label = if record.point.is_empty() { record.stage.clone() } else { format!("{} [{}]", record.stage, record.point) };
+        Run { unix: record.started_unix + record.seconds as u64, label, path: store.action(&record.key(), "log") }
+    });
+    let unfinished = store.partials()?.into_iter().filter_map(|key| unfinished(attempt_log(store, &key), stage));
+    Ok(finished.chain(unfinished).filter(|run| run.path.is_file()).max_by_key(|run| run.unix))
+}
+
+/// An attempt that hasn't ended well, where its log says that it is the stage's.
+fn unfinished(path: PathBuf, stage: &str) -> Option<Run> {
+    let text = text_of(&path);
+    let label = label_in(&text)?;
+    if label.split(" [").next() != Some(stage) {
+        return None;
+    }
+    let unix = std::fs::metadata(&path).ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()?.as_secs();
+    Some(Run { unix, label: label.to_owned(), path })
+}
+
+fn text_of(path: &Path) -> String {
+    String::from_utf8_lossy(&std::fs::read(path).unwrap_or_default()).into_owned()
 }

@@ -1,5 +1,6 @@
 //! What the command line can ask for, a file each.
 
+mod describe;
 mod gc;
 mod log;
 mod pin;
@@ -9,6 +10,7 @@ mod status;
 mod verify;
 mod why;
 
+pub(crate) use describe::describe;
 pub(crate) use gc::gc;
 pub(crate) use log::log;
 pub(crate) use pin::{pin, unpin};

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::Locked;
+use artifact::{Locked, print_line};
 
 use crate::plan::{PlanError, Request, State};
 use crate::session::Session;
@@ -23,7 +23,7 @@ pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Resu
         }
     }
     session.store.pin(&entered, name, std::env::args().collect(), &actions)?;
-    println!("pinned {} artifacts as {name}", actions.len());
+    print_line!("pinned {} artifacts as {name}", actions.len());
     Ok(ExitCode::SUCCESS)
 }
 
@@ -31,7 +31,7 @@ pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Resu
 pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
     check(name)?;
     if session.store.unpin(name)? {
-        println!("{name} is no longer pinned");
+        print_line!("{name} is no longer pinned");
         return Ok(ExitCode::SUCCESS);
     }
     let known: Vec<String> = session.store.pins()?.into_iter().map(|pin| pin.id).collect();

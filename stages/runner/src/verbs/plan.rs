@@ -1,5 +1,7 @@
 use std::process::ExitCode;
 
+use artifact::print_line;
+
 use crate::plan::Request;
 use crate::session::Session;
 use crate::words::words;
@@ -9,7 +11,7 @@ pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     for (i, state) in states.iter().enumerate() {
-        println!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+        print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -4,19 +4,20 @@ use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, RunFile, SUMMARY_FILE, hash_json};
+use artifact::{Failure, RunFile, SUMMARY_FILE, hash_json, print_line, print_lines, report_line, report_text, stop_on_signals};
 
+use crate::counts;
 use crate::execute::{self, Options, Outcome};
 use crate::plan::{Plan, Request, State};
 use crate::process::StageFailure;
+use crate::remedy::Remedy;
 use crate::session::Session;
-use crate::signals::stop_at_signals;
 use crate::sink::{Showing, Shown, show};
 use crate::waiting::enter;
 
 /// Makes what the targets need and shows it.
-pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path) -> anyhow::Result<ExitCode> {
-    let stop = stop_at_signals()?;
+pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path, remedy: &Remedy) -> anyhow::Result<ExitCode> {
+    let stop = stop_on_signals()?;
     let plan = session.plan(what)?;
     let file = match register(session, &plan, &stop) {
         Ok(file) => file,
@@ -27,7 +28,8 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
     let code = if stop.load(Ordering::Relaxed) {
         Err(Failure::Interrupted.into())
     } else if let Some((index, failure)) = outcome.failures.first() {
-        say_failure(&plan, *index, &outcome);
+        let node = &plan.nodes[*index];
+        report_text(&remedy.after_failure(&node.label(), &node.stage, outcome.skipped.len()));
         Ok(ExitCode::from(failure.code))
     } else {
         let showing = Showing { plan: &plan, store: &session.store, run: &file, out, options, stop: &stop };
@@ -41,7 +43,7 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
 /// Writes down what the run needs, as far as is known before it starts.
 fn register(session: &Session, plan: &Plan, stop: &AtomicBool) -> Result<RunFile, StageFailure> {
     let fail = |e: artifact::StoreError| StageFailure { code: 1, message: e.to_string() };
-    let entered = enter(&session.store, stop, &|text| eprintln!("nerf-sr: {text}"))?;
+    let entered = enter(&session.store, stop, &|text| report_line!("nerf-sr: {text}"))?;
     let file = session.store.begin_run(&entered, std::env::args().collect()).map_err(fail)?;
     // A source that can't be read is said when the stage's turn comes; other stages may not need it.
     let states = session.states(plan).unwrap_or_default();
@@ -56,15 +58,6 @@ fn register(session: &Session, plan: &Plan, stop: &AtomicBool) -> Result<RunFile
     Ok(file)
 }
 
-fn say_failure(plan: &Plan, index: usize, outcome: &Outcome) {
-    let skipped = outcome.skipped.len();
-    eprintln!(
-        "nerf-sr: {} failed; {skipped} stages were not run; `nerf-sr log {}` has all it said",
-        plan.nodes[index].label(),
-        plan.nodes[index].stage
-    );
-}
-
 /// Prints a few words on each result that nothing else is made of.
 fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Result<()> {
     let ends: BTreeSet<usize> =
@@ -73,7 +66,7 @@ fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Res
         let record = outcome.records[index].as_ref().context("every node is done")?;
         let summary = std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).unwrap_or_default();
         if !summary.is_empty() {
-            println!("{}: {}", plan.nodes[index].label(), summary.trim_end());
+            print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
         }
     }
     Ok(())
@@ -91,18 +84,14 @@ fn show_all(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
         match shown.map_err(|e| anyhow!("{}: {e}", sink.stage))? {
             Shown::Written(folder) => {
                 wrote = true;
-                println!("{}: {}", sink.stage, page(&folder).display());
+                print_line!("{}: {}", sink.stage, page(&folder).display());
             }
-            Shown::UpToDate(folder) => println!("{}: {} (up to date)", sink.stage, page(&folder).display()),
-            Shown::Missing => println!("{}: nothing to show", sink.stage),
+            Shown::UpToDate(folder) => print_line!("{}: {} (up to date)", sink.stage, page(&folder).display()),
+            Shown::Missing => print_line!("{}: nothing to show", sink.stage),
         }
     }
     let (ran, all) = (outcome.ran.len(), plan.nodes.len());
-    if ran == 0 && !wrote {
-        println!("nothing to run: all {all} stages are cached");
-    } else {
-        println!("{ran} of {all} stages ran, {} were cached", all - ran);
-    }
+    print_line!("{}", if ran == 0 && !wrote { counts::all_cached(all) } else { counts::ran(ran, all) });
     Ok(())
 }
 

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::hash_json;
+use artifact::{hash_json, print_line, sized};
 
 use crate::execute::seconds;
 use crate::graph::state_word;
@@ -15,20 +15,14 @@ pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCo
         let detail = match &state {
             State::Cached(record) => {
                 let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
-                format!(
-                    "{}  {:>9.1} MB  {:>9}  {}",
-                    &record.output[..10],
-                    size as f64 / 1e6,
-                    seconds(record.seconds),
-                    age(record)
-                )
+                format!("{}  {:>9}  {:>9}  {}", &record.output[..10], sized(size), seconds(record.seconds), age(record))
             }
             State::WillRun { key_parts } if session.store.partial(&hash_json(key_parts)).join("work").exists() => {
                 "has a checkpoint to go on from".to_owned()
             }
             _ => String::new(),
         };
-        println!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
+        print_line!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -1,5 +1,7 @@
 use std::process::ExitCode;
 
+use artifact::print_line;
+
 use crate::plan::Request;
 use crate::session::{Session, of_stage};
 use crate::words::{causes, words};
@@ -10,9 +12,9 @@ pub(crate) fn why(session: &Session, stage: &str, what: &Request) -> anyhow::Res
     let states = session.states(&plan)?;
     let records = session.store.records()?;
     for i in of_stage(&plan, stage)? {
-        println!("{}: {}", plan.nodes[i].label(), words(session, &plan, i, &states[i], &records));
+        print_line!("{}: {}", plan.nodes[i].label(), words(session, &plan, i, &states[i], &records));
         for cause in causes(&states, i) {
-            println!("  {}: {}", plan.nodes[cause].label(), words(session, &plan, cause, &states[cause], &records));
+            print_line!("  {}: {}", plan.nodes[cause].label(), words(session, &plan, cause, &states[cause], &records));
         }
     }
     Ok(ExitCode::SUCCESS)
