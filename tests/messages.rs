@@ -310,7 +310,7 @@ fn a_group_can_share_a_store() {
     let project = Project::tiny();
     let run = |more: &[(&str, &str)]| {
         let mut command = Command::new("sh");
-        command.args(["-c", "umask 002; exec \"$0\" run", env!("CARGO_BIN_EXE_nerf-sr")]).current_dir(project.path("."));
+        command.args(["-c", "umask 002; exec \"$0\" run"]).arg(bin("nerf-sr")).current_dir(project.path("."));
         let finished = Finished::of(command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap());
         for entry in walkdir::WalkDir::new(project.path(".nerf-sr")) {
             let entry = entry.unwrap();
