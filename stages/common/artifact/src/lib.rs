@@ -36,23 +36,30 @@
 
 mod canonical;
 mod describe;
+mod device;
 mod failure;
 mod fsio;
 mod manifest;
+mod nearest;
 mod parameters;
 mod parts;
 mod progress;
+mod rules;
 mod run_record;
 mod stage;
 mod store;
+mod values;
 
 pub use canonical::{canonical, hash_json};
 pub use describe::{Description, Input, Output};
+pub use device::check_device;
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_folder, relative_path};
+pub use nearest::{known_names, nearest};
 pub use parameters::{ParameterProblem, Schema};
 pub use progress::{Event, Pace, Progress, ProgressMode};
+pub use rules::{GivenInputs, Rule};
 pub use run_record::{RunInput, RunNode, RunRecord};
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, KeyLock, Record, Store, StoreError};

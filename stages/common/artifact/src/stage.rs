@@ -19,6 +19,7 @@ use crate::fsio::write_json;
 use crate::manifest::{MANIFEST_FILE, Manifest};
 use crate::parameters::Schema;
 use crate::progress::{Progress, ProgressMode};
+use crate::rules::Rule;
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
 pub const SUMMARY_FILE: &str = "summary.txt";
@@ -44,6 +45,11 @@ pub trait Stage {
     /// What comes out.
     fn output() -> Output;
 
+    /// What parameters and inputs must be together.
+    fn rules() -> Vec<Rule> {
+        Vec::new()
+    }
+
     /// Does the work: reads inputs and writes outputs through `context`.
     fn run(context: &Context, params: &Self::Params) -> anyhow::Result<()>;
 
@@ -59,6 +65,7 @@ pub trait Stage {
             output: Self::output(),
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
+            rules: Self::rules(),
         }
     }
 }
@@ -292,7 +299,7 @@ fn help_of(description: &Description) -> String {
 }
 
 fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
-    let params: S::Params = read_params(arguments.params.as_deref(), &description.parameters)?;
+    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), &description.parameters)?;
     let mut inputs = BTreeMap::new();
     let mut folders = Vec::new();
     for text in &arguments.inputs {
@@ -307,6 +314,11 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         if !input.optional && !folders.iter().any(|(given, _)| given == name) {
             return Err(Failure::Usage(format!("input {name} is missing; give --input {name}=DIR ({})", input.summary)).into());
         }
+    }
+    // What made an input isn't known here; rules about that are the runner's to check.
+    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
+    if let Some(problem) = description.broken_rule(&resolved, &given) {
+        return Err(Failure::Usage(problem).into());
     }
     let threads = match arguments.threads {
         Some(0) => return Err(Failure::Usage("--threads 0: give at least 1".to_owned()).into()),
@@ -360,8 +372,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     staging.publish(&description.output.kind, &output)
 }
 
-/// The parameters from the file, checked against the schema, or the defaults.
-fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<P> {
+/// The parameters from the file, checked against the schema, or the defaults: as JSON and as the stage's own type.
+fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<(Value, P)> {
     let place = file.map(|f| f.display().to_string()).unwrap_or_default();
     let given = match file {
         None => serde_json::Map::new(),
@@ -375,7 +387,8 @@ fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyh
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
     })?;
-    serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))
+    let params = serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))?;
+    Ok((resolved, params))
 }
 
 /// The output while it is being made: beside its final place, removed unless published.
