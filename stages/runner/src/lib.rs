@@ -1,13 +1,20 @@
 //! `nerf-sr`, the runner: pipeline.yaml → plan → run. It knows stages by their `describe` alone and artifacts by their hashes.
 //!
 //! * [`Pipeline`]: the file as written, checked whole before anything runs.
-//! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits.
+//! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
+//!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
+//! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
 //! * `execute`: runs nodes, some at once, each under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
+mod arguments;
+mod axes;
+mod check;
 mod cli;
+mod describing;
 mod execute;
+mod expand;
 mod gc;
 mod graph;
 mod key;
@@ -20,7 +27,9 @@ mod sources;
 mod stages;
 mod verbs;
 mod words;
+mod yaml;
 
 pub use cli::main;
-pub use pipeline::{Pipeline, PipelineError, StageBlock};
-pub use plan::{Node, Plan, PlanError};
+pub use key::explain;
+pub use pipeline::{Part, Pipeline, PipelineError, StageBlock};
+pub use plan::{Node, Plan, PlanError, Request};

@@ -128,7 +128,9 @@ impl Stage for TrainSs {
         let closed = [("supervision", json!("kernel")), ("pose_refinement", json!(true)), ("exposure", json!(true))];
         let rule = |(parameter, value)| {
             let message = open_background(parameter);
-            Rule::new(&message).when("scene.background", json!({"const": "alpha"})).must(parameter, json!({"not": {"const": value}}))
+            Rule::new(&message)
+                .when("scene.background", json!({"const": "alpha"}))
+                .must(parameter, json!({"not": {"const": value}}))
         };
         closed.map(rule).into()
     }

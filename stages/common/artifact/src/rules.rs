@@ -112,8 +112,12 @@ mod tests {
             sink: false,
             rules: vec![
                 Rule::new("weights are needed").when("method", methods).needs("weights"),
-                Rule::new("the scale must be whole").when("kernel", json!({"const": "average"})).must("scale", json!({"multipleOf": 1})),
-                Rule::new("it must be closed").when("scene.background", json!({"const": "alpha"})).must("method", json!({"const": "a"})),
+                Rule::new("the scale must be whole")
+                    .when("kernel", json!({"const": "average"}))
+                    .must("scale", json!({"multipleOf": 1})),
+                Rule::new("it must be closed")
+                    .when("scene.background", json!({"const": "alpha"}))
+                    .must("method", json!({"const": "a"})),
             ],
         }
     }
@@ -153,7 +157,10 @@ mod tests {
             (with(Rule::new("").must("scale", no_schema.clone())), "scale: not a JSON Schema"),
             (Description { parameters: no_schema, ..description() }, "parameter schema"),
             (Description { name: String::new(), ..description() }, "no name"),
-            (Description { output: Output::kind("x").with_subtree("../x", "x"), ..description() }, "not a path inside the folder"),
+            (
+                Description { output: Output::kind("x").with_subtree("../x", "x"), ..description() },
+                "not a path inside the folder",
+            ),
         ] {
             let problem = broken.check().unwrap_err();
             assert!(problem.contains(words), "{problem}");

@@ -134,7 +134,11 @@ mod tests {
             (json!({"type": "integer"}), json!(u64::MAX), json!(u64::MAX)),
             (json!({"$ref": "#/$defs/Size"}), json!(3.0), json!(3)),
             (json!({"anyOf": [{"$ref": "#/$defs/Size"}, {"type": "string"}]}), json!(3.0), json!(3)),
-            (json!({"type": "array", "items": {"type": "array", "items": {"type": "number"}}}), json!([[1, 2.0]]), json!([[1.0, 2.0]])),
+            (
+                json!({"type": "array", "items": {"type": "array", "items": {"type": "number"}}}),
+                json!([[1, 2.0]]),
+                json!([[1.0, 2.0]]),
+            ),
             (json!({"prefixItems": [{"type": "integer"}], "items": {"type": "number"}}), json!([1.0, 1]), json!([1, 1.0])),
             (json!({"properties": {"a": {"type": "number"}}}), json!({"a": 1, "b": 1.0}), json!({"a": 1.0, "b": 1})),
             (json!({"additionalProperties": {"type": "number"}}), json!({"a": 1}), json!({"a": 1.0})),

@@ -18,7 +18,7 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
     for signal in [signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM] {
         signal_hook::flag::register(signal, Arc::clone(&stop))?;
     }
-    let plan = session.plan(what)?;
+    let plan = session.plan_to_run(what, &stop)?;
     let outcome = execute::run(&plan, &session.store, options, &stop);
     if stop.load(Ordering::Relaxed) {
         return Err(Failure::Interrupted.into());
