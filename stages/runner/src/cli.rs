@@ -170,7 +170,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
                 "{}",
                 match format {
                     GraphFormat::Ascii => ascii(&plan, &states),
-                    GraphFormat::Dot => dot(&plan),
+                    GraphFormat::Dot => dot(&plan, &states),
                     GraphFormat::Svg => svg(&plan, &states),
                 }
             );

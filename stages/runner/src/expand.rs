@@ -44,9 +44,9 @@ impl<'a> Expansion<'a> {
             let program = Arc::clone(self.programs.require(stage)?);
             if program.description.sink {
                 let nodes = needs(self.pipeline, stage).flat_map(|shown| self.of_stage.get(shown).into_iter().flatten());
-                let shows = nodes.map(|(_, node)| *node).collect();
+                let shows: BTreeSet<usize> = nodes.map(|(_, node)| *node).collect();
                 let parameters = self.resolve(stage, &program, &Point::new())?;
-                sinks.push(Sink { stage: stage.clone(), program, parameters, shows });
+                sinks.push(Sink { stage: stage.clone(), program, parameters, shows: shows.into_iter().collect() });
             } else {
                 self.add_stage(stage, &program)?;
             }

@@ -130,9 +130,12 @@ impl Pipeline {
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let fail = |line: Option<usize>, problem: String| PipelineError { place: place(path, line), problem };
         let text = yaml::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
-        let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), e.to_string());
+        let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
         // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.
-        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(located)?;
+        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(|e| match yaml::line_of_duplicate(text) {
+            Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
+            None => located(e),
+        })?;
         let mut document = serde_yaml::Value::Mapping(mapping);
         let merged = yaml::merge(&mut document).map_err(located)?;
         let line_of = |keys: &[String]| yaml::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>());
@@ -183,6 +186,12 @@ impl Pipeline {
     pub(crate) fn error_in_default(&self, problem: String) -> PipelineError {
         PipelineError { place: place(&self.path, yaml::line_of(&self.text, &["default"])), problem }
     }
+}
+
+/// What the parser says, less the line, which is named before it.
+fn without_line(error: &serde_yaml::Error) -> String {
+    let text = error.to_string();
+    text.rsplit_once(" at line ").map_or(text.clone(), |(problem, _)| problem.to_owned())
 }
 
 /// File and, where known, line.

@@ -206,3 +206,7 @@ pub(crate) fn input_hashes(
     };
     node.inputs.iter().map(|input| Ok((input.name.clone(), hash(input)?))).collect()
 }
+
+#[cfg(test)]
+#[path = "plan_tests.rs"]
+mod tests;

@@ -1,8 +1,9 @@
 //! YAML as people write it: encodings, merge keys, and the lines on which keys stand.
 
+use std::collections::BTreeSet;
 use std::fmt;
 
-use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, Visitor};
+use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_yaml::Value;
 
 /// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and what to do.
@@ -53,16 +54,23 @@ pub(crate) fn not_finite(value: &Value) -> Option<Vec<String>> {
     }
 }
 
-/// What the search for a key ends with.
+/// What a search ends with: the parser says on which line an error came up, so what is found is reported as one.
 const FOUND: &str = "the key that was looked for";
+
+fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
+    let error = searched.err()?;
+    error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
+}
 
 /// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of the last one that is.
 pub(crate) fn line_of(text: &str, path: &[&str]) -> Option<usize> {
-    (1..=path.len()).rev().find_map(|length| {
-        // The parser says on which line an error came up; so the search reports what it finds as one.
-        let error = Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text)).err()?;
-        error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
-    })
+    let search = |length: usize| Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text));
+    (1..=path.len()).rev().find_map(|length| line_found(search(length)))
+}
+
+/// The line on which a key stands that its mapping has already.
+pub(crate) fn line_of_duplicate(text: &str) -> Option<usize> {
+    line_found(Duplicates.deserialize(serde_yaml::Deserializer::from_str(text)))
 }
 
 /// Looks for a key in nested mappings.
@@ -117,9 +125,88 @@ impl Visitor<'_> for Key<'_> {
         f.write_str("a key")
     }
 
-    fn visit_str<E: serde::de::Error>(self, key: &str) -> Result<bool, E> {
+    fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
         let is_it = key == self.name;
         if is_it && self.is_last { Err(E::custom(FOUND)) } else { Ok(is_it) }
+    }
+}
+
+/// Looks for a key that comes twice, in mappings inside of mappings and lists.
+struct Duplicates;
+
+impl<'de> DeserializeSeed<'de> for Duplicates {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Duplicates {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("anything")
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_u64<E>(self, _: u64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_unit<E>(self) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
+        while items.next_element_seed(Duplicates)?.is_some() {}
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let mut seen = BTreeSet::new();
+        while map.next_key_seed(NewKey(&mut seen))?.is_some() {
+            map.next_value_seed(Duplicates)?;
+        }
+        Ok(())
+    }
+}
+
+/// A key, reported where it was seen before.
+struct NewKey<'a>(&'a mut BTreeSet<String>);
+
+impl<'de> DeserializeSeed<'de> for NewKey<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for NewKey<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E: Error>(self, key: &str) -> Result<(), E> {
+        if self.0.insert(key.to_owned()) { Ok(()) } else { Err(E::custom(FOUND)) }
     }
 }
 
@@ -147,6 +234,13 @@ mod tests {
             assert_eq!(line_of(text, path), line, "{path:?}");
         }
         assert_eq!(line_of("a: [", &["a", "b"]), Some(1));
+        for (text, line) in [
+            ("a: 1\nb: {x: 1.5, y: [true, null, {z: 2,\n  z: -3}]}\n", Some(3)),
+            ("a: 1\nb: 2\na: text\n", Some(3)),
+            ("a: {x: 1}\nb: {x: 1}\n", None),
+        ] {
+            assert_eq!(line_of_duplicate(text), line, "{text}");
+        }
     }
 
     #[test]

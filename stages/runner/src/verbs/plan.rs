@@ -2,7 +2,7 @@ use std::process::ExitCode;
 
 use crate::plan::Request;
 use crate::session::Session;
-use crate::words::words;
+use crate::words::{shown, words};
 
 /// Shows what `run` would do.
 pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
@@ -10,6 +10,9 @@ pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode
     let states = session.states(&plan)?;
     for (i, state) in states.iter().enumerate() {
         println!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+    }
+    for sink in &plan.sinks {
+        println!("{:<40} {}", sink.stage, shown(&plan, sink, &states));
     }
     Ok(ExitCode::SUCCESS)
 }
