@@ -132,7 +132,7 @@ fn a_block_like_another_follows_it() {
     };
     assert_eq!(parameters("rehearsal-field", "levels", &[]), ["4"]);
     let both = ["-p", "supersample=1,2", "-p", "rays=50000"];
-    assert_eq!(parameters("rehearsal-field", "supersample", &both), ["1", "2"]);
+    assert_eq!(parameters("rehearsal-field", "supersample", &both), ["1.0", "2.0"]);
     assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
     assert_eq!(parameters("rehearsal-field", "rays", &both), ["40000", "40000"]);
     assert_eq!(parameters("rehearsal-field", "rays", &["-p", "rehearsal-field.rays=30000"]), ["30000"]);

@@ -75,7 +75,7 @@ fn views_are_enlarged_and_scored() {
         stage("upsample", params, &inputs, &output, &[]).fails(code, words);
         assert!(!output.exists());
     };
-    fails(r#"{"method": "imdn"}"#, None, 3, &["weights is missing", "imdn_x2.safetensors", "convert-weights.py"]);
+    fails(r#"{"method": "imdn"}"#, None, 2, &["weights is missing", "imdn", "convert-weights.py"]);
     fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["no file imdn_x2.safetensors"]);
     fails(r#"{"method": "imdn", "file": "liif.safetensors"}"#, Some(&weights), 3, &["fea_conv", "the right network"]);
     fails(r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#, Some(&weights), 2, &["no name of a file"]);

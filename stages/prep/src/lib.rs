@@ -19,13 +19,14 @@ mod sizes;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, Input, Output, Rule, Stage};
 use dataset::{Dataset, Format, Frame, Split};
 use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
 use scene::{Background, Bounds, Camera, Space, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 pub use bounds::{Sight, SpaceError, SpaceKind, place};
 pub use degrade::{LowResolution, degrade};
@@ -215,6 +216,19 @@ impl Stage for Prep {
             .with_subtree("cameras", "scene/cameras")
             .with_subtree("truth", "scene/truth")
             .with_subtree("references", "scene/references")
+    }
+
+    fn rules() -> Vec<Rule> {
+        let whole = |parameter: &str| {
+            let message = format!("parameter {parameter}: average needs a whole scale; choose box, or another scale");
+            Rule::new(&message).when(parameter, json!({"const": "average"})).must("scale", json!({"multipleOf": 1}))
+        };
+        let boxed = Rule::new("parameter hull: alpha carves a box; choose space: box, too");
+        vec![
+            whole("kernel"),
+            whole("degrade"),
+            boxed.when("hull", json!({"const": "alpha"})).must("space", json!({"enum": [null, "box"]})),
+        ]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {

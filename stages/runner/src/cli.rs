@@ -41,7 +41,8 @@ struct Cli {
 struct What {
     /// Stages to make [default: the pipeline's `default`]
     targets: Vec<String>,
-    /// Sets a parameter; several values run all combinations, sharing what they share
+    /// Sets a parameter; several values run all combinations, sharing what they share. A value is a JSON number, true, false or null, else a word;
+    /// nothing at all is null. The last of several for the same parameter counts
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Takes an input from a folder instead, e.g. -i dataset=scenes/lego
@@ -162,6 +163,7 @@ pub fn main() -> ExitCode {
             let plan_code = error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
                 PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
                 PlanError::Source(_) => 3,
+                PlanError::Interrupted => 130,
             });
             ExitCode::from(plan_code.unwrap_or_else(|| artifact::exit_code(&error)))
         }
@@ -197,7 +199,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let states = session.states(&plan)?;
             print_lines(&match format {
                 GraphFormat::Ascii => ascii(&plan, &states),
-                GraphFormat::Dot => dot(&plan),
+                GraphFormat::Dot => dot(&plan, &states),
                 GraphFormat::Svg => svg(&plan, &states),
             });
             Ok(ExitCode::SUCCESS)

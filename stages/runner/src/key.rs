@@ -28,7 +28,7 @@ pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> M
 }
 
 /// What differs between a key and the nearest earlier one of the same block, in words; `None` when there is no earlier one.
-pub(crate) fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
+pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
     let differences = |record: &Record| -> Vec<String> {
         let names: std::collections::BTreeSet<&String> = parts.keys().chain(record.key_parts.keys()).collect();
         names
@@ -45,10 +45,15 @@ pub(crate) fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record
     nearest.map(|(changes, _)| changes)
 }
 
+/// The beginning of a hash, for people.
+pub(crate) fn short(hash: &str) -> &str {
+    hash.get(..10).unwrap_or(hash)
+}
+
 fn describe_change(name: &str, before: Option<&Value>, now: Option<&Value>) -> String {
     let show = |value: Option<&Value>| match value {
         None => "absent".to_owned(),
-        Some(Value::String(hash)) if hash.len() == 64 => hash[..10].to_owned(),
+        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => short(hash).to_owned(),
         Some(value) => value.to_string(),
     };
     format!("{name}: {} → {}", show(before), show(now))

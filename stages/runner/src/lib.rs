@@ -1,17 +1,24 @@
 //! `nerf-sr`, the runner: pipeline.yaml → plan → run. It knows stages by their `describe` alone and artifacts by their hashes.
 //!
 //! * [`Pipeline`]: the file as written, checked whole before anything runs.
-//! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits.
+//! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
+//!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
+//! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
 //! * `execute`: runs nodes, some at once, each under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
+mod arguments;
+mod axes;
+mod check;
 mod cli;
 mod clock;
 mod counts;
+mod describing;
 mod execute;
+mod expand;
 mod gc;
 mod graph;
 mod key;
@@ -30,7 +37,9 @@ mod verbs;
 mod verdict;
 mod waiting;
 mod words;
+mod yaml;
 
 pub use cli::main;
-pub use pipeline::{Pipeline, PipelineError, StageBlock};
-pub use plan::{Node, Plan, PlanError};
+pub use key::explain;
+pub use pipeline::{Part, Pipeline, PipelineError, StageBlock};
+pub use plan::{Node, Plan, PlanError, Request};

@@ -92,7 +92,7 @@ impl Call<'_> {
 
     fn log_start(&self, log: &StageLog) {
         log.start(self.label);
-        let StageProgram { path, description } = self.program;
+        let StageProgram { path, description, .. } = self.program;
         log.line(format_args!("program: {} {}, {}", path.display(), description.version, counted(self.threads, "thread")));
         log.line(format_args!("device: {}", self.device));
         let parameters = std::fs::read(self.params).ok().and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());

@@ -1,11 +1,13 @@
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::Store;
+use artifact::{Store, check_device, known_names, report_text};
 
 use crate::pipeline::Pipeline;
 use crate::plan::{Plan, PlanError, Request, State};
+use crate::stages::Asking;
 
 /// What every verb works with.
 pub(crate) struct Session {
@@ -16,6 +18,7 @@ pub(crate) struct Session {
 
 impl Session {
     pub(crate) fn open(pipeline: &Path, store: Option<&Path>, device: &str) -> anyhow::Result<Self> {
+        check_device(device).map_err(PlanError::Usage)?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
         let root = store.map_or_else(|| pipeline.folder().join(".nerf-sr"), Path::to_path_buf);
         std::fs::create_dir_all(&root)
@@ -26,8 +29,20 @@ impl Session {
         Ok(Self { pipeline, store, device: device.to_owned() })
     }
 
+    /// The plan, to look at: no program is started that isn't the runner's own.
     pub(crate) fn plan(&self, what: &Request) -> anyhow::Result<Plan> {
-        Ok(Plan::new(&self.pipeline, &self.store, what)?)
+        self.plan_asking(what, Asking::Look)
+    }
+
+    /// The plan, to be run; asking stages what they are ends when `stop` is set.
+    pub(crate) fn plan_to_run(&self, what: &Request, stop: &AtomicBool) -> anyhow::Result<Plan> {
+        self.plan_asking(what, Asking::Run(stop))
+    }
+
+    fn plan_asking(&self, what: &Request, asking: Asking) -> anyhow::Result<Plan> {
+        let plan = Plan::new(&self.pipeline, &self.store, what, asking)?;
+        plan.notes.iter().for_each(|note| report_text(note));
+        Ok(plan)
     }
 
     pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {
@@ -39,11 +54,11 @@ impl Session {
 pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
     let found: Vec<usize> = (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
     if found.is_empty() {
+        if plan.sinks.iter().any(|sink| sink.stage == stage) {
+            return Err(PlanError::Usage(format!("{stage} is a sink: each run shows by it what it made; nothing of it is kept")));
+        }
         let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
-        return Err(PlanError::Usage(format!(
-            "no stage {stage:?} in this plan; there are: {}",
-            known.into_iter().collect::<Vec<_>>().join(", ")
-        )));
+        return Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {}", known_names(stage, known))));
     }
     Ok(found)
 }

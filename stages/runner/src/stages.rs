@@ -1,75 +1,245 @@
-use std::collections::BTreeMap;
+//! Which program each stage is, and what it says of itself: asked once for each build, and kept in the store.
+//!
+//! Programs beside the runner are its own. Any other one is somebody's file that a pipeline.yaml names: `run` alone starts it, and only where it
+//! is needed; the other verbs know it by what it answered then, while its bytes are the same.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Description, Store, write_atomically};
+use artifact::{Description, Schema, Store, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 
-use crate::pipeline::Pipeline;
+use crate::describing::ask_all;
+use crate::pipeline::{Part, Pipeline, PipelineError};
 
 /// A stage's executable and what it says of itself.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub(crate) struct StageProgram {
     pub(crate) path: PathBuf,
     pub(crate) description: Description,
+    pub(crate) schema: Schema,
 }
 
-/// Answers of `describe`, kept by path, size and modification time.
-#[derive(Default, Serialize, Deserialize)]
-struct Cache(BTreeMap<String, (u64, u128, Description)>);
+impl StageProgram {
+    fn new(path: &Path, description: Description) -> Result<Self, String> {
+        description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
+        let schema = Schema::new(&description.parameters)?;
+        Ok(Self { path: path.to_path_buf(), description, schema })
+    }
+}
 
-/// Asks every stage of the pipeline to describe itself; each error names the block.
-pub(crate) fn describe_all(pipeline: &Pipeline, store: &Store) -> Result<BTreeMap<String, StageProgram>, crate::PipelineError> {
-    pipeline.check_likeness()?;
-    let cache_file = store.root().join("cache/describe.json");
-    // A cache that can't be read is an empty one.
-    let mut cache: Cache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
-    let mut changed = false;
-    let mut programs = BTreeMap::new();
-    for name in pipeline.stages.keys() {
-        let path = executable(pipeline, name);
-        let fail = |problem: String| pipeline.error(name, Some("run"), problem);
-        let meta = std::fs::metadata(&path).map_err(|e| {
-            fail(format!("{}: {e}; build it (make build) or set `run:` to the stage's executable", path.display()))
-        })?;
-        let modified = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok()).map_or(0, |d| d.as_nanos());
-        let id = path.display().to_string();
-        let known = cache.0.get(&id).filter(|(size, time, _)| (*size, *time) == (meta.len(), modified));
-        let description = match known {
-            Some((_, _, description)) => description.clone(),
-            None => {
-                let description = describe(&path).map_err(fail)?;
-                cache.0.insert(id, (meta.len(), modified, description.clone()));
-                changed = true;
-                description
+/// Which programs may be started to ask what they are.
+#[derive(Clone, Copy)]
+pub(crate) enum Asking<'a> {
+    /// The runner's own, and others that are needed; ends when the flag is set.
+    Run(&'a AtomicBool),
+    /// The runner's own.
+    Look,
+}
+
+/// The asking was interrupted.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Interrupted;
+
+/// The stages' programs, as far as they are known, and why the others aren't.
+#[derive(Default)]
+pub(crate) struct Programs {
+    known: BTreeMap<String, Arc<StageProgram>>,
+    unknown: BTreeMap<String, PipelineError>,
+}
+
+impl Programs {
+    /// A stage's program, where it is known.
+    pub(crate) fn get(&self, stage: &str) -> Option<&StageProgram> {
+        self.known.get(stage).map(Arc::as_ref)
+    }
+
+    /// A stage's program, or why it isn't known.
+    pub(crate) fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
+        let missing = || self.unknown.get(stage).cloned();
+        self.known.get(stage).ok_or_else(|| {
+            missing().unwrap_or_else(|| PipelineError { place: stage.to_owned(), problem: "no such stage".to_owned() })
+        })
+    }
+
+    /// The stages whose programs aren't known, and why.
+    pub(crate) fn unknown(&self) -> impl Iterator<Item = (&str, &PipelineError)> {
+        self.unknown.iter().map(|(stage, reason)| (stage.as_str(), reason))
+    }
+
+    /// Programs by what they would answer; nothing is started.
+    pub(crate) fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
+        let mut programs = Self::default();
+        for stage in pipeline.stages.keys() {
+            let name = program_name(pipeline, stage);
+            let description = descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
+            programs.insert(pipeline, stage, description.and_then(|d| StageProgram::new(Path::new(name), d)).map(Arc::new));
+        }
+        programs
+    }
+
+    /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the stages that the targets come to.
+    pub(crate) fn ask(
+        pipeline: &Pipeline,
+        store: &Store,
+        needed: &BTreeSet<String>,
+        asking: Asking,
+    ) -> Result<Self, Interrupted> {
+        let file = store.root().join("cache/describe.json");
+        // A cache that can't be read is an empty one.
+        let mut cache: Cache = std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+        let mut answers: BTreeMap<PathBuf, Result<Arc<StageProgram>, String>> = BTreeMap::new();
+        let mut unasked: BTreeMap<PathBuf, Identity> = BTreeMap::new();
+        let paths: BTreeMap<&String, PathBuf> = pipeline.stages.keys().map(|s| (s, executable(pipeline, s))).collect();
+        for (stage, path) in &paths {
+            if answers.contains_key(path) || unasked.contains_key(path) {
+                continue;
             }
+            let is_needed = paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
+            match identify(path, program_name(pipeline, stage)) {
+                Err(problem) => _ = answers.insert(path.clone(), Err(problem)),
+                Ok(identity) => match cache.answer(path, &identity) {
+                    Some(description) => _ = answers.insert(path.clone(), StageProgram::new(path, description).map(Arc::new)),
+                    None if identity.may_be_asked(asking, is_needed) => _ = unasked.insert(path.clone(), identity),
+                    None => {
+                        let problem =
+                            format!("{} is not a part of nerf-sr: `nerf-sr run` starts it; read it first", path.display());
+                        answers.insert(path.clone(), Err(problem));
+                    }
+                },
+            }
+        }
+        let stop = match asking {
+            Asking::Run(stop) => Some(stop),
+            Asking::Look => None,
         };
-        programs.insert(name.clone(), StageProgram { path, description });
+        let asked = ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
+        let is_new = !asked.is_empty();
+        for (path, answer) in asked {
+            if let (Ok(description), Some(identity)) = (&answer, unasked.remove(&path)) {
+                cache.0.insert(id(&path), Answer { identity, description: description.clone() });
+            }
+            let program = answer.and_then(|description| StageProgram::new(&path, description)).map(Arc::new);
+            answers.insert(path, program);
+        }
+        if is_new && let Ok(bytes) = serde_json::to_vec(&cache) {
+            // Only a cache: without it the next start is slower.
+            write_atomically(&file, &bytes).ok();
+        }
+        let mut programs = Self::default();
+        for (stage, path) in paths {
+            programs.insert(pipeline, stage, answers[&path].clone());
+        }
+        Ok(programs)
     }
-    if changed && let Ok(bytes) = serde_json::to_vec(&cache) {
-        // Only a cache: without it the next start is slower.
-        write_atomically(&cache_file, &bytes).ok();
+
+    fn insert(&mut self, pipeline: &Pipeline, stage: &str, program: Result<Arc<StageProgram>, String>) {
+        match program {
+            Ok(program) => _ = self.known.insert(stage.to_owned(), program),
+            Err(problem) => _ = self.unknown.insert(stage.to_owned(), pipeline.error(stage, Part::Field("run"), problem)),
+        }
     }
-    Ok(programs)
+}
+
+/// Answers of `describe` by the program's path.
+#[derive(Default, Serialize, Deserialize)]
+struct Cache(BTreeMap<String, Answer>);
+
+#[derive(Serialize, Deserialize)]
+struct Answer {
+    #[serde(flatten)]
+    identity: Identity,
+    description: Description,
+}
+
+/// By what a program is known again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+struct Identity {
+    size: u64,
+    modified: u64,
+    /// The hash of its bytes, where it isn't one of the runner's own: then a run has started it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    blake3: Option<String>,
+}
+
+impl Cache {
+    fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
+        self.0.get(&id(path)).filter(|answer| answer.identity == *identity).map(|answer| answer.description.clone())
+    }
+}
+
+impl Identity {
+    fn may_be_asked(&self, asking: Asking, is_needed: bool) -> bool {
+        self.blake3.is_none() || (is_needed && matches!(asking, Asking::Run(_)))
+    }
+}
+
+fn id(path: &Path) -> String {
+    path.display().to_string()
+}
+
+/// What a stage runs: a path, or the name of a program beside the runner.
+fn program_name<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
+    let origin = pipeline.stages[stage].like.as_deref().unwrap_or(stage);
+    pipeline.stages[origin].run.as_deref().unwrap_or(origin)
 }
 
 pub(crate) fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
-    let origin = pipeline.stages[stage].like.as_deref().unwrap_or(stage);
-    let run = pipeline.stages[origin].run.as_deref().unwrap_or(origin);
-    if run.contains('/') {
-        let path = pipeline.folder().join(run);
+    let name = program_name(pipeline, stage);
+    if name.contains('/') {
+        let path = pipeline.folder().join(name);
         return path.canonicalize().unwrap_or(path);
     }
-    let beside = std::env::current_exe().ok().and_then(|exe| exe.parent().map(Path::to_path_buf));
-    beside.unwrap_or_default().join(run)
+    own_folder().join(name)
 }
 
-fn describe(path: &Path) -> Result<Description, String> {
-    let output = Command::new(path).arg("describe").output().map_err(|e| format!("{}: {e}", path.display()))?;
-    if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        return Err(format!("`{} describe` failed ({}): {}", path.display(), output.status, said.trim()));
+/// The runner's own folder.
+fn own_folder() -> PathBuf {
+    let exe = std::env::current_exe().and_then(|exe| exe.canonicalize());
+    exe.ok().and_then(|exe| exe.parent().map(Path::to_path_buf)).unwrap_or_default()
+}
+
+/// What a program is known by; else what is wrong and what to do.
+fn identify(path: &Path, name: &str) -> Result<Identity, String> {
+    let meta = std::fs::metadata(path).and_then(|meta| {
+        let kind = std::io::ErrorKind::IsADirectory;
+        if meta.is_dir() { Err(std::io::Error::from(kind)) } else { Ok(meta) }
+    });
+    let is_own = path.parent() == Some(&own_folder());
+    match meta {
+        Ok(meta) if is_own => Ok(Identity { size: meta.len(), modified: modified(&meta), blake3: None }),
+        Ok(meta) => {
+            let hash = hash_file(path).map_err(|e| format!("{}: {e}", path.display()))?;
+            Ok(Identity { size: meta.len(), modified: 0, blake3: Some(hash) })
+        }
+        Err(e) if name.contains('/') => Err(format!("{}: {e}; set `run:` to the stage's executable", path.display())),
+        Err(e) => {
+            let meant = neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
+            let build = format!("build it with `cargo build --release -p {name}` (`make build` builds all), or set `run:` to it");
+            Err(format!("{}: {e}; {meant}{build}", path.display()))
+        }
     }
-    serde_json::from_slice(&output.stdout).map_err(|e| format!("`{} describe` gave no description: {e}", path.display()))
+}
+
+/// The program beside the runner whose name is meant by another.
+fn neighbour(name: &str) -> Option<String> {
+    let files = std::fs::read_dir(own_folder()).ok()?.flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    let mut programs: Vec<String> = files.filter(|file| !file.contains('.')).collect();
+    programs.sort_unstable();
+    nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)
+}
+
+fn modified(meta: &Metadata) -> u64 {
+    let since = meta.modified().ok().and_then(|t| t.duration_since(UNIX_EPOCH).ok());
+    since.and_then(|d| u64::try_from(d.as_nanos()).ok()).unwrap_or(0)
+}
+
+fn hash_file(path: &Path) -> std::io::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(std::fs::File::open(path)?)?;
+    Ok(hasher.finalize().to_hex().to_string())
 }

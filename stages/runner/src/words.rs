@@ -6,7 +6,7 @@ use artifact::{Record, hash_json};
 
 use crate::execute::seconds;
 use crate::key;
-use crate::plan::{Plan, State};
+use crate::plan::{Plan, Sink, State};
 use crate::session::Session;
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
@@ -34,12 +34,22 @@ pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State,
         State::WillRun { key_parts } => match key::explain(key_parts, &plan.nodes[index].stage, records) {
             None => "will run: it never ran before".to_owned(),
             Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
-                Some(record) => format!("will run: its artifact {} is gone or incomplete", &record.output[..10]),
+                Some(record) => format!("will run: its artifact {} is gone or incomplete", key::short(&record.output)),
                 None => "will run".to_owned(),
             },
             Some(changes) => format!("will run: {}", changes.join("; ")),
         },
     }
+}
+
+/// What becomes of a sink at the end of a run. Whether its page is there is for `run` to see: it alone knows where pages are written.
+pub(crate) fn shown(plan: &Plan, sink: &Sink, states: &[State]) -> String {
+    let mut names: Vec<String> = sink.shows.iter().map(|&index| plan.nodes[index].stage.clone()).collect();
+    names.dedup();
+    let is_old = sink.shows.iter().all(|&index| matches!(states[index], State::Cached(_)));
+    let when =
+        if is_old { "all cached: a run writes it only where it isn't there" } else { "a run writes it anew where they change" };
+    format!("shows {}; {when}", names.join(", "))
 }
 
 pub(crate) fn age(record: &Record) -> String {

@@ -22,12 +22,13 @@ mod supervision;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
 use pixels::{DEGRADATION_FILE, Degradation, Filter};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Intrinsics, Photograph, Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
 use member::Member;
 pub use params::{Begun, FieldKind, Params, RateSchedule};
@@ -121,6 +122,17 @@ impl Stage for TrainSs {
 
     fn output() -> Output {
         Output::kind("field")
+    }
+
+    fn rules() -> Vec<Rule> {
+        let closed = [("supervision", json!("kernel")), ("pose_refinement", json!(true)), ("exposure", json!(true))];
+        let rule = |(parameter, value)| {
+            let message = open_background(parameter);
+            Rule::new(&message)
+                .when("scene.background", json!({"const": "alpha"}))
+                .must(parameter, json!({"not": {"const": value}}))
+        };
+        closed.map(rule).into()
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -254,6 +266,16 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
     views.views.iter().map(read).collect()
 }
 
+/// What to say to a parameter that an open background leaves no meaning.
+fn open_background(parameter: &str) -> String {
+    let problem = match parameter {
+        "supervision" => "kernel needs a background to render on; choose refiltered, or prep.background white",
+        "exposure" => "what shines through an open background has none; choose prep.background white or opaque",
+        _ => "photographs with an open background can't be compared with renderings; choose prep.background white or opaque",
+    };
+    format!("parameter {parameter}: {problem}")
+}
+
 /// What the field is compared with, by the parameters and by what the input says of its own making. What is wrong with a reference is said.
 pub fn supervision(
     input: &artifact::GivenInput,
@@ -280,19 +302,13 @@ pub fn supervision(
         let message = format!("parameter supervision: the scene has no {DEGRADATION_FILE} that names its kernel; choose average");
         return Err(Failure::Usage(message).into());
     }
-    if supervision == Supervision::Kernel && is_open {
-        let message =
-            "parameter supervision: kernel needs a background to render on; choose refiltered, or prep.background white";
-        return Err(Failure::Usage(message.to_owned()).into());
-    }
-    if params.pose_refinement && is_open {
-        let message = "parameter pose_refinement: photographs with an open background can't be compared with renderings; choose prep.background white or opaque";
-        return Err(Failure::Usage(message.to_owned()).into());
-    }
-    if params.exposure && is_open {
-        let message =
-            "parameter exposure: what shines through an open background has none; choose prep.background white or opaque";
-        return Err(Failure::Usage(message.to_owned()).into());
+    let closed = [
+        ("supervision", supervision == Supervision::Kernel),
+        ("pose_refinement", params.pose_refinement),
+        ("exposure", params.exposure),
+    ];
+    if let Some((parameter, _)) = closed.iter().find(|(_, asked)| is_open && *asked) {
+        return Err(Failure::Usage(open_background(parameter)).into());
     }
     let rays = params.rays(epoch(&photographs.views, params));
     let filter = made.map_or(Filter::Lanczos, |d| d.kernel.filter());

@@ -19,13 +19,14 @@ mod liif;
 mod swinir;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
 use nets::Weights;
 use pixels::{Filter, Mask, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png};
 use rayon::prelude::*;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 use tch::{TchError, Tensor, no_grad};
 
 /// Parameters of `upsample`.
@@ -54,6 +55,9 @@ pub enum Method {
     Swinir,
 }
 
+/// Where a network's file comes from.
+const MAKE_WEIGHTS: &str = "scripts/convert-weights.py makes it from the published checkpoint";
+
 /// The stage.
 pub struct Upsample;
 
@@ -73,6 +77,13 @@ impl Stage for Upsample {
 
     fn output() -> Output {
         Output::kind("views")
+    }
+
+    fn rules() -> Vec<Rule> {
+        let message = format!(
+            "input weights is missing: methods imdn, liif and swinir need a folder with their network's safetensors file; {MAKE_WEIGHTS}"
+        );
+        vec![Rule::new(&message).when("method", json!({"enum": ["imdn", "liif", "swinir"]})).needs("weights")]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -139,7 +150,7 @@ fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> a
         Method::Liif => ("liif.safetensors".to_owned(), |weights| Ok(Box::new(liif::Liif::read(weights)?))),
     };
     let file = params.file.as_ref().unwrap_or(&default);
-    let weights = open(context.optional_input("weights"), file)?;
+    let weights = open(context.input("weights")?, file)?;
     let networks = (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
     let scale = networks.first().and_then(|n| n.as_ref()?.scale());
@@ -162,17 +173,13 @@ fn fit(scale: Option<i64>, low: [i64; 2], high: [i64; 2]) -> Result<(), String> 
 }
 
 /// The network's tensors, from a file of that name in the input.
-fn open(input: Option<&GivenInput>, file: &str) -> anyhow::Result<Weights> {
-    let make = "scripts/convert-weights.py makes it from the published checkpoint";
-    let Some(input) = input else {
-        return Err(Failure::BadInput(format!("input weights is missing: give a folder with {file}; {make}")).into());
-    };
+fn open(input: &GivenInput, file: &str) -> anyhow::Result<Weights> {
     if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
         return Err(Failure::Usage(format!("file: {file:?} is no name of a file in input weights")).into());
     }
     let path = input.path(file);
     if !path.is_file() {
-        return Err(Failure::BadInput(format!("input weights: no file {file} in it; {make}")).into());
+        return Err(Failure::BadInput(format!("input weights: no file {file} in it; {MAKE_WEIGHTS}")).into());
     }
     Weights::read(&path).bad_input("input weights")
 }

@@ -4,6 +4,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::manifest::relative_path;
+use crate::parameters::Schema;
+use crate::rules::Rule;
+
 /// What `STAGE describe` prints: all that the runner knows of a stage.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -28,6 +32,26 @@ pub struct Description {
     /// A sink shows a run (times, hashes) and is never cached; its input `run` is the run's record.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sink: bool,
+    /// What parameters and inputs must be together.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub rules: Vec<Rule>,
+}
+
+impl Description {
+    /// Says what is wrong with a description that has the right form: what it names must be there, and its folders inside the output.
+    pub fn check(&self) -> Result<(), String> {
+        let schema = Schema::new(&self.parameters).map_err(|e| format!("its parameter schema is {e}"))?;
+        if self.name.is_empty() {
+            return Err("it has no name".to_owned());
+        }
+        for folder in self.output.subtrees.keys() {
+            relative_path(folder).map_err(|e| format!("its output: {e}"))?;
+        }
+        for (index, rule) in self.rules.iter().enumerate() {
+            rule.check(&schema.names(), &self.inputs).map_err(|e| format!("its rule {}: {e}", index + 1))?;
+        }
+        Ok(())
+    }
 }
 
 /// An input of a stage.

@@ -24,6 +24,7 @@ use crate::panics::install_panic_hook;
 use crate::parameters::Schema;
 use crate::progress::{Progress, ProgressMode, StopAfter, emit_events, failed_event};
 use crate::report_line;
+use crate::rules::Rule;
 use crate::signals::stop_on_signals;
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
@@ -50,6 +51,11 @@ pub trait Stage {
     /// What comes out.
     fn output() -> Output;
 
+    /// What parameters and inputs must be together.
+    fn rules() -> Vec<Rule> {
+        Vec::new()
+    }
+
     /// Does the work: reads inputs and writes outputs through `context`.
     fn run(context: &Context, params: &Self::Params) -> anyhow::Result<()>;
 
@@ -65,6 +71,7 @@ pub trait Stage {
             output: Self::output(),
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
+            rules: Self::rules(),
         }
     }
 }
@@ -323,8 +330,13 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if for_runner {
         emit_events();
     }
-    let params: S::Params = read_params(arguments.params.as_deref(), &description.parameters)?;
+    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), &description.parameters)?;
     let folders = input_folders(&arguments.inputs, description)?;
+    // What made an input isn't known here; rules about that are the runner's to check.
+    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
+    if let Some(problem) = description.broken_rule(&resolved, &given) {
+        return Err(Failure::Usage(problem).into());
+    }
     let threads = match arguments.threads {
         Some(0) => return Err(Failure::Usage("--threads 0: give at least 1".to_owned()).into()),
         Some(n) => n,
@@ -394,8 +406,8 @@ fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The parameters from the file, checked against the schema, or the defaults.
-fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<P> {
+/// The parameters from the file, checked against the schema, or the defaults: as JSON and as the stage's own type.
+fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<(Value, P)> {
     let place = file.map(|f| f.display().to_string()).unwrap_or_default();
     let given = match file {
         None => serde_json::Map::new(),
@@ -409,7 +421,8 @@ fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyh
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
     })?;
-    serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))
+    let params = serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))?;
+    Ok((resolved, params))
 }
 
 /// The output while it is being made: beside its final place, removed unless published.

@@ -4,7 +4,7 @@ use artifact::print_line;
 
 use crate::plan::Request;
 use crate::session::Session;
-use crate::words::words;
+use crate::words::{shown, words};
 
 /// Shows what `run` would do.
 pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
@@ -12,6 +12,9 @@ pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode
     let states = session.states(&plan)?;
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+    }
+    for sink in &plan.sinks {
+        print_line!("{:<40} {}", sink.stage, shown(&plan, sink, &states));
     }
     Ok(ExitCode::SUCCESS)
 }

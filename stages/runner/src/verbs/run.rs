@@ -18,7 +18,7 @@ use crate::waiting::enter;
 /// Makes what the targets need and shows it.
 pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Path, remedy: &Remedy) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
-    let plan = session.plan(what)?;
+    let plan = session.plan_to_run(what, &stop)?;
     let file = match register(session, &plan, &stop) {
         Ok(file) => file,
         Err(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),

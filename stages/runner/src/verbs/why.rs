@@ -4,18 +4,24 @@ use artifact::print_line;
 
 use crate::plan::Request;
 use crate::session::{Session, of_stage};
-use crate::words::{causes, words};
+use crate::words::{causes, shown, words};
 
-/// Says why a stage is cached, would run, or waits.
+/// Says why a stage is cached, would run, or waits; of a sink, what it shows.
 pub(crate) fn why(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     let records = session.store.records()?;
-    for i in of_stage(&plan, stage)? {
-        print_line!("{}: {}", plan.nodes[i].label(), words(session, &plan, i, &states[i], &records));
-        for cause in causes(&states, i) {
-            print_line!("  {}: {}", plan.nodes[cause].label(), words(session, &plan, cause, &states[cause], &records));
-        }
+    let say = |index: usize, indent: &str| {
+        print_line!("{indent}{}: {}", plan.nodes[index].label(), words(session, &plan, index, &states[index], &records));
+    };
+    if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
+        print_line!("{stage}: {}", shown(&plan, sink, &states));
+        sink.shows.iter().for_each(|&index| say(index, "  "));
+        return Ok(ExitCode::SUCCESS);
+    }
+    for index in of_stage(&plan, stage)? {
+        say(index, "");
+        causes(&states, index).into_iter().for_each(|cause| say(cause, "  "));
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -1,0 +1,200 @@
+//! What the command line sets: values of parameters and inputs, each for a stage, swept where there are several.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use artifact::known_names;
+use serde_json::Value;
+
+use crate::arguments;
+use crate::pipeline::Pipeline;
+use crate::plan::{PlanError, Request};
+use crate::stages::{Programs, StageProgram};
+
+/// A value that is set, or several that are swept.
+#[derive(Debug)]
+pub(crate) struct Axis {
+    pub(crate) stage: String,
+    pub(crate) kind: Kind,
+    pub(crate) name: String,
+    pub(crate) values: Vec<AxisValue>,
+    /// As it was given, for people.
+    given: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Parameter,
+    Input,
+}
+
+/// One value of an axis: as it was written, and what is meant; an input's is the folder's name.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct AxisValue {
+    pub(crate) text: String,
+    pub(crate) value: Value,
+}
+
+impl Kind {
+    fn flag(self) -> &'static str {
+        match self {
+            Self::Parameter => "-p",
+            Self::Input => "-i",
+        }
+    }
+
+    fn noun(self) -> &'static str {
+        match self {
+            Self::Parameter => "parameter",
+            Self::Input => "input",
+        }
+    }
+
+    fn article(self) -> &'static str {
+        match self {
+            Self::Parameter => "a",
+            Self::Input => "an",
+        }
+    }
+
+    fn names(self, program: &StageProgram) -> Vec<&str> {
+        match self {
+            Self::Parameter => program.schema.names(),
+            Self::Input => program.description.inputs.keys().map(String::as_str).collect(),
+        }
+    }
+}
+
+impl Axis {
+    /// The folder that a value of an input names.
+    pub(crate) fn folder(&self, value: usize) -> PathBuf {
+        PathBuf::from(&self.values[value].text)
+    }
+
+    fn is_of(&self, other: &Self) -> bool {
+        (&self.stage, self.kind, &self.name) == (&other.stage, other.kind, &other.name)
+    }
+}
+
+/// What names on the command line are looked up in.
+pub(crate) struct Scope<'a> {
+    pub(crate) pipeline: &'a Pipeline,
+    pub(crate) programs: &'a Programs,
+    /// The stages that the targets come to.
+    pub(crate) needed: &'a BTreeSet<String>,
+}
+
+impl Scope<'_> {
+    /// The axes in the order in which they were given, the last one where several set the same; and what to say of it.
+    pub(crate) fn axes(&self, request: &Request) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
+        let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
+        let parameters = request.parameters.iter().map(|text| (Kind::Parameter, text));
+        let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
+        for (kind, text) in parameters.chain(inputs) {
+            let axis = self.axis(kind, text, &mut notes)?;
+            if let Some(earlier) = axes.iter().position(|earlier| earlier.is_of(&axis)) {
+                notes.push(format!("{}: overridden by {}", axes.remove(earlier).given, axis.given));
+            }
+            axes.push(axis);
+        }
+        Ok((axes, notes))
+    }
+
+    fn axis(&self, kind: Kind, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
+        let given = format!("{} {text}", kind.flag());
+        let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
+        let (name, text) = text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
+        let (stage, name) = self.owner(kind, name)?;
+        let program = self.programs.require(&stage)?;
+        let values: Vec<AxisValue> = match kind {
+            Kind::Parameter => {
+                let canonical = |(text, value): (&str, Value)| AxisValue {
+                    text: text.to_owned(),
+                    value: program.schema.canonical_value(&name, &value),
+                };
+                arguments::values(text).map_err(usage)?.into_iter().map(canonical).collect()
+            }
+            Kind::Input => arguments::folders(text).map_err(usage)?.into_iter().map(folder).collect(),
+        };
+        let values = each_once(values, |again, first| notes.push(format!("{given}: {again} is {first} again; it is made once")));
+        if program.description.sink && kind == Kind::Input {
+            return Err(usage(format!("{stage} is a sink, which shows what the run made; it takes no folder")));
+        }
+        if program.description.sink && values.len() > 1 {
+            return Err(usage(format!("{stage} is a sink and shows all points of a sweep at once; give one value")));
+        }
+        Ok(Axis { stage, kind, name, values, given })
+    }
+
+    /// The stage that a name belongs to, and the name without it. Where several stages have the name, that one is meant that the targets need; a
+    /// block that is like another follows that one.
+    fn owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
+        // A stage's own name may have a point.
+        let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
+        let stated = splits.find(|(stage, _)| self.pipeline.stages.contains_key(*stage)).or_else(|| name.split_once('.'));
+        if let Some((stage, own)) = stated {
+            return self.stated_owner(kind, stage, own);
+        }
+        let has = |stage: &str| self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name));
+        let follows = |stage: &str| {
+            let block = &self.pipeline.stages[stage];
+            let own = block.gives(kind == Kind::Parameter, name);
+            block.like.as_ref().is_some_and(|other| self.needed.contains(other) || !own)
+        };
+        let with_name: Vec<&String> = self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
+        let meant: Vec<&String> = with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
+        match if meant.is_empty() { &with_name } else { &meant }[..] {
+            [] => Err(self.unknown(kind, name)),
+            [stage] => Ok((stage.clone(), name.to_owned())),
+            ref several => {
+                let options = several.iter().map(|s| format!("{s}.{name}")).collect::<Vec<_>>().join(", ");
+                let problem = format!("{} {name}: more than one stage has it; say which: {options}", kind.flag());
+                Err(PlanError::Usage(problem))
+            }
+        }
+    }
+
+    /// The stage that is named itself, which must have such a parameter or input.
+    fn stated_owner(&self, kind: Kind, stage: &str, own: &str) -> Result<(String, String), PlanError> {
+        let usage = |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
+        if !self.pipeline.stages.contains_key(stage) {
+            let known = known_names(stage, self.pipeline.stages.keys().map(String::as_str));
+            return Err(usage(format!("no stage {stage:?}; {known}")));
+        }
+        let names = kind.names(self.programs.require(stage)?);
+        if names.contains(&own) {
+            return Ok((stage.to_owned(), own.to_owned()));
+        }
+        Err(usage(format!("{stage} has no such {}; {}", kind.noun(), known_names(own, names))))
+    }
+
+    fn unknown(&self, kind: Kind, name: &str) -> PlanError {
+        let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
+        let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
+        let meant = artifact::nearest(name, known).map(|known| format!("did you mean {known}? ")).unwrap_or_default();
+        let problem =
+            format!("{} {name}: no stage has such {} {}; {meant}see `STAGE --help`", kind.flag(), kind.article(), kind.noun());
+        match self.programs.unknown().next() {
+            None => PlanError::Usage(problem),
+            Some((stage, reason)) => PlanError::Usage(format!("{problem}; {stage} couldn't be asked: {reason}")),
+        }
+    }
+}
+
+/// A folder's name, which means the folder that it leads to.
+fn folder(name: &str) -> AxisValue {
+    let leads_to = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
+    AxisValue { text: name.to_owned(), value: Value::from(leads_to.to_string_lossy()) }
+}
+
+/// Values without those that mean the same as an earlier one; `tell` is told of these and of the earlier ones.
+fn each_once(values: Vec<AxisValue>, mut tell: impl FnMut(&str, &str)) -> Vec<AxisValue> {
+    let mut kept: Vec<AxisValue> = Vec::new();
+    for value in values {
+        match kept.iter().find(|earlier| earlier.value == value.value) {
+            Some(earlier) => tell(&value.text, &earlier.text),
+            None => kept.push(value),
+        }
+    }
+    kept
+}

@@ -1,0 +1,152 @@
+//! Checks of the whole file, whatever is asked for: first of what it says alone, then of its blocks against their stages' descriptions.
+
+use std::collections::BTreeSet;
+
+use artifact::{Description, Input, known_names};
+
+use crate::pipeline::{Part, Pipeline, PipelineError, Source, StageBlock};
+use crate::stages::{Programs, StageProgram};
+
+/// Checks what the file says of itself; returns an order in which every stage comes after those it needs.
+pub(crate) fn structure(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
+    let known = |name: &str| known_names(name, pipeline.stages.keys().map(String::as_str));
+    for name in &pipeline.default {
+        if !pipeline.stages.contains_key(name) {
+            let problem = format!("stage {name}: named in `default`, but there is no such stage; {}", known(name));
+            return Err(pipeline.error_in_default(problem));
+        }
+    }
+    for (name, block) in &pipeline.stages {
+        likeness(pipeline, name, block)?;
+        for (input, source) in &block.inputs {
+            if let Some(other) = Source::of(source).stage().filter(|other| !pipeline.stages.contains_key(*other)) {
+                let problem = format!("input {input}: no stage {other:?}; a folder begins with ./ or /; {}", known(other));
+                return Err(pipeline.error(name, Part::Input(input), problem));
+            }
+        }
+    }
+    order(pipeline)
+}
+
+/// Checks what a block says of being like another.
+fn likeness(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), PipelineError> {
+    let Some(other) = &block.like else { return Ok(()) };
+    let problem = match pipeline.stages.get(other) {
+        None => {
+            let known = known_names(other, pipeline.stages.keys().map(String::as_str));
+            format!("like: there is no stage {other:?}; {known}")
+        }
+        Some(other_block) if other_block.like.is_some() => format!("like: {other:?} is itself like another; name that one"),
+        Some(_) if block.run.is_some() => "run: what it runs follows from `like`; give one of them".to_owned(),
+        Some(_) => return Ok(()),
+    };
+    Err(pipeline.error(name, Part::Field("like"), problem))
+}
+
+/// Checks every block whose stage is known against its description, and every input against what it names.
+pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), PipelineError> {
+    for (name, block) in &pipeline.stages {
+        let Some(program) = programs.get(name) else { continue };
+        if let Err(problems) = program.schema.resolve(&block.parameters) {
+            let parameter = problems[0].name.split('/').next().unwrap_or_default();
+            return Err(pipeline.error(name, Part::Parameter(parameter), problems[0].to_string()));
+        }
+        for (input, source) in &block.inputs {
+            check_input(&program.description, input, source, programs)
+                .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
+        }
+        for (input, port) in &program.description.inputs {
+            if !port.optional && !block.inputs.contains_key(input) {
+                return Err(pipeline.error(name, Part::Block, format!("input {input} is missing ({})", port.summary)));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Checks one input of a stage against what it names.
+fn check_input(description: &Description, input: &str, source: &str, programs: &Programs) -> Result<(), String> {
+    // A sink gets one record of all that it is shown; what its inputs are called is the file's own affair.
+    let record = || description.inputs.get("run").filter(|_| description.sink);
+    let Some(port) = description.inputs.get(input).or_else(record) else {
+        let known = known_names(input, description.inputs.keys().map(String::as_str));
+        return Err(format!("it has no input {input:?}; {known}"));
+    };
+    let Source::Stage { name: other, subtree } = Source::of(source) else {
+        let problem = format!("input {input}: a sink shows stages, and {source} is a folder; name a stage");
+        return if description.sink { Err(problem) } else { Ok(()) };
+    };
+    match programs.get(other) {
+        Some(made_by) if made_by.description.sink => {
+            Err(format!("input {input}: {other} is a sink, which shows a run; nothing can be made of that"))
+        }
+        Some(made_by) if !description.sink => check_kind((input, port), source, (other, subtree), made_by),
+        _ => Ok(()),
+    }
+}
+
+/// Checks that what an input names is of a kind that it takes.
+fn check_kind(
+    (input, port): (&str, &Input),
+    source: &str,
+    (other, subtree): (&str, Option<&str>),
+    made_by: &StageProgram,
+) -> Result<(), String> {
+    let output = &made_by.description.output;
+    let kind = match subtree {
+        None => &output.kind,
+        Some(folder) => output.subtrees.get(folder).ok_or_else(|| {
+            let known = known_names(folder, output.subtrees.keys().map(String::as_str));
+            format!("input {input}: {other} has no folder {folder:?}; {known}")
+        })?,
+    };
+    if port.kinds.contains(kind) {
+        return Ok(());
+    }
+    Err(format!("input {input} takes {}, but {source} is {kind}", port.kinds.join(" or ")))
+}
+
+/// The stages that a block names as inputs.
+pub(crate) fn needs<'a>(pipeline: &'a Pipeline, stage: &str) -> impl Iterator<Item = &'a str> {
+    pipeline.stages[stage].inputs.values().filter_map(|source| Source::of(source).stage())
+}
+
+/// The stages that targets come to, themselves included; `sources` are the stages that one names as inputs.
+pub(crate) fn closure(targets: &[String], sources: impl Fn(&str) -> Vec<String>) -> BTreeSet<String> {
+    let mut found: BTreeSet<String> = BTreeSet::new();
+    let mut open: Vec<String> = targets.to_vec();
+    while let Some(stage) = open.pop() {
+        if found.insert(stage.clone()) {
+            open.extend(sources(&stage));
+        }
+    }
+    found
+}
+
+/// Kahn's order, by name where there is a choice; what is left over is a cycle.
+fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
+    let mut left: BTreeSet<&str> = pipeline.stages.keys().map(String::as_str).collect();
+    let mut order: Vec<String> = Vec::new();
+    while !left.is_empty() {
+        let Some(ready) = left.iter().find(|s| needs(pipeline, s).all(|n| !left.contains(n))).copied() else {
+            return Err(cycle(pipeline, &left));
+        };
+        left.remove(ready);
+        order.push(ready.to_owned());
+    }
+    Ok(order)
+}
+
+/// Names a cycle among stages that all wait for others of them.
+fn cycle(pipeline: &Pipeline, left: &BTreeSet<&str>) -> PipelineError {
+    let mut path: Vec<&str> = left.first().copied().into_iter().collect();
+    // Walk from need to need inside what is left until a stage comes again.
+    while let Some(next) = path.last().and_then(|last| needs(pipeline, last).find(|n| left.contains(n))) {
+        if let Some(at) = path.iter().position(|s| *s == next) {
+            let cycle = [&path[at..], &[next]].concat().join(" ← ");
+            return pipeline.error(path[at], Part::Block, format!("its inputs lead back to it: {cycle}"));
+        }
+        path.push(next);
+    }
+    unreachable!("what is left needs something that is left")
+}

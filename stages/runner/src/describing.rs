@@ -1,0 +1,157 @@
+//! Asking programs what they are: `STAGE describe`, several at once, none for ever.
+
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::os::unix::process::CommandExt as _;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use artifact::Description;
+
+use crate::stages::Interrupted;
+
+/// After so long a program that has said nothing is taken to hang.
+const LONGEST: Duration = Duration::from_secs(120);
+/// Asking that takes longer than this is said.
+const SILENCE: Duration = Duration::from_secs(1);
+/// Descriptions are some kilobytes.
+const MOST_BYTES: u64 = 1 << 24;
+
+/// What came of asking, by path.
+type Answers = BTreeMap<PathBuf, Result<Description, String>>;
+
+/// Asks programs, as many at once as there are cores.
+pub(crate) fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
+    let is_stopped = || stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
+    let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
+    let next = AtomicUsize::new(0);
+    let (sender, receiver) = mpsc::channel();
+    let work = |sender: mpsc::Sender<(PathBuf, Result<Description, String>)>| {
+        while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped()) {
+            // The receiver lives as long as the scope.
+            sender.send((path.clone(), ask(path, LONGEST, &is_stopped))).ok();
+        }
+    };
+    let mut answers = Answers::new();
+    std::thread::scope(|scope| {
+        for _ in 0..threads {
+            let sender = sender.clone();
+            scope.spawn(|| work(sender));
+        }
+        drop(sender);
+        let mut patience = SILENCE;
+        loop {
+            match receiver.recv_timeout(patience) {
+                Ok((path, answer)) => _ = answers.insert(path, answer),
+                Err(mpsc::RecvTimeoutError::Timeout) => {
+                    artifact::report_line!("asking {} stages what they are, once for each build", paths.len());
+                    patience = Duration::MAX;
+                }
+                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+            }
+        }
+    });
+    if is_stopped() { Err(Interrupted) } else { Ok(answers) }
+}
+
+/// A program's answer, or what is wrong with it.
+fn ask(path: &Path, longest: Duration, is_stopped: &dyn Fn() -> bool) -> Result<Description, String> {
+    let command = format!("`{} describe`", path.display());
+    let fail = |problem: std::io::Error| format!("{command}: {problem}");
+    // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever it has started.
+    let mut child = Command::new(path)
+        .arg("describe")
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .process_group(0)
+        .spawn()
+        .map_err(fail)?;
+    let (stdout, stderr) = (read(child.stdout.take()), read(child.stderr.take()));
+    let deadline = Instant::now() + longest;
+    let ended = wait(&mut child, deadline, is_stopped).map_err(fail)?;
+    let left = || deadline.saturating_duration_since(Instant::now());
+    let answer = ended.and_then(|status| Some((status, stdout.recv_timeout(left()).ok()?, stderr.recv_timeout(left()).ok()?)));
+    let Some((status, stdout, stderr)) = answer else {
+        end(&mut child);
+        return Err(format!("{command} gave no answer in {longest:?}; end what it waits for, or set `run:` to another program"));
+    };
+    if !status.success() {
+        let said = String::from_utf8_lossy(&stderr);
+        let last = said.trim_end().lines().last().unwrap_or_default().replace(char::is_control, " ");
+        return Err(format!("{command} failed ({status}): {last}"));
+    }
+    serde_json::from_slice(&stdout).map_err(|e| format!("{command} gave no description: {e}"))
+}
+
+/// Waits for a program to end; `None` where it is too late or nobody waits any more.
+fn wait(child: &mut Child, deadline: Instant, is_stopped: &dyn Fn() -> bool) -> std::io::Result<Option<ExitStatus>> {
+    while Instant::now() < deadline && !is_stopped() {
+        if let Some(status) = child.try_wait()? {
+            return Ok(Some(status));
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    Ok(None)
+}
+
+/// Ends a program and all that it has started.
+fn end(child: &mut Child) {
+    if let Some(group) = rustix::process::Pid::from_raw(child.id() as i32) {
+        // It may have ended by itself.
+        rustix::process::kill_process_group(group, rustix::process::Signal::KILL).ok();
+    }
+    child.wait().ok();
+}
+
+/// Reads a pipe to its end, beside; nobody has to wait for that.
+fn read(pipe: Option<impl Read + Send + 'static>) -> mpsc::Receiver<Vec<u8>> {
+    let (sender, receiver) = mpsc::channel();
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        if let Some(pipe) = pipe {
+            // What can't be read any more is no description.
+            pipe.take(MOST_BYTES).read_to_end(&mut bytes).ok();
+        }
+        sender.send(bytes).ok();
+    });
+    receiver
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A program, written by another process: while this one's threads start others, a file that it has open itself can't be run.
+    fn program(folder: &Path, name: &str, text: &str) -> PathBuf {
+        let (source, target) = (folder.join(format!("{name}.sh")), folder.join(name));
+        std::fs::write(&source, text).unwrap();
+        assert!(Command::new("install").args(["-m", "755"]).args([&source, &target]).status().unwrap().success());
+        target
+    }
+
+    #[test]
+    fn programs_that_give_no_description() {
+        let folder = tempfile::tempdir().unwrap();
+        let never = || false;
+        for (text, longest, words) in [
+            ("#!/bin/sh\nsleep 1000\n", Duration::from_millis(50), "gave no answer in 50ms"),
+            ("#!/bin/sh\nsleep 1000 &\n", Duration::from_millis(200), "gave no answer in 200ms"),
+            ("#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n", LONGEST, "failed (exit status: 3): two [31m"),
+            ("#!/bin/sh\necho '{}'\n", LONGEST, "gave no description: missing field"),
+            ("#!/nowhere/at/all\n", LONGEST, "describe`: No such file"),
+        ] {
+            let path = program(folder.path(), "stage", text);
+            let problem = ask(&path, longest, &never).unwrap_err();
+            assert!(problem.contains(words), "{problem}");
+        }
+        let path = program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
+        let stop = AtomicBool::new(true);
+        assert!(matches!(ask_all(std::slice::from_ref(&path), Some(&stop)), Err(Interrupted)));
+        // Asked to end while it waits.
+        assert!(ask(&path, LONGEST, &|| true).is_err());
+    }
+}

@@ -1,0 +1,161 @@
+//! From stages and values to nodes: every stage once for each combination of the values that reach it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+
+use artifact::GivenInputs;
+use serde_json::{Map, Value};
+
+use crate::axes::{Axis, Kind};
+use crate::check::{closure, needs};
+use crate::pipeline::{Pipeline, Source};
+use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
+use crate::stages::{Programs, StageProgram};
+
+/// More nodes than anybody means.
+const MOST_NODES: usize = 10_000;
+
+/// The value (by number) of every axis that reaches a node.
+type Point = BTreeMap<usize, usize>;
+
+/// The expansion of stages to nodes.
+pub(crate) struct Expansion<'a> {
+    pipeline: &'a Pipeline,
+    programs: &'a Programs,
+    axes: &'a [Axis],
+    nodes: Vec<Node>,
+    /// The nodes of each stage, with the value (by number) of every axis that reaches them.
+    of_stage: BTreeMap<String, Vec<(Point, usize)>>,
+}
+
+impl<'a> Expansion<'a> {
+    pub(crate) fn new(pipeline: &'a Pipeline, programs: &'a Programs, axes: &'a [Axis]) -> Self {
+        Self { pipeline, programs, axes, nodes: Vec::new(), of_stage: BTreeMap::new() }
+    }
+
+    /// Makes the nodes of what the targets need, in an order in which each comes after those that it needs.
+    pub(crate) fn expand(mut self, order: &[String], targets: &[String]) -> Result<Plan, PlanError> {
+        // An input replaced from the command line needs nothing.
+        let sources =
+            |stage: &str| self.block_inputs(stage).filter_map(|(_, source)| source.stage()).map(str::to_owned).collect();
+        let wanted = closure(targets, sources);
+        let mut sinks = Vec::new();
+        for stage in order.iter().filter(|s| wanted.contains(*s)) {
+            let program = Arc::clone(self.programs.require(stage)?);
+            if program.description.sink {
+                let nodes = needs(self.pipeline, stage).flat_map(|shown| self.of_stage.get(shown).into_iter().flatten());
+                let shows: BTreeSet<usize> = nodes.map(|(_, node)| *node).collect();
+                let parameters = self.resolve(stage, &program, &Point::new())?;
+                sinks.push(Sink { stage: stage.clone(), program, parameters, shows: shows.into_iter().collect() });
+            } else {
+                self.add_stage(stage, &program)?;
+            }
+        }
+        Ok(Plan { nodes: self.nodes, sinks, notes: Vec::new() })
+    }
+
+    /// A block's inputs less those that the command line replaces.
+    fn block_inputs(&self, stage: &str) -> impl Iterator<Item = (&'a str, Source<'a>)> {
+        let replaced: Vec<&str> =
+            self.axes.iter().filter(|a| a.stage == stage && a.kind == Kind::Input).map(|a| a.name.as_str()).collect();
+        let inputs = self.pipeline.stages[stage].inputs.iter().map(|(name, source)| (name.as_str(), Source::of(source)));
+        inputs.filter(move |(name, _)| !replaced.contains(name))
+    }
+
+    /// Whether a value from the command line reaches a stage itself: given for it, or for the one it is like where it doesn't say otherwise.
+    fn sets(&self, axis: &Axis, stage: &str) -> bool {
+        let block = &self.pipeline.stages[stage];
+        let is_own = block.gives(axis.kind == Kind::Parameter, &axis.name);
+        axis.stage == stage || (block.like.as_deref() == Some(&axis.stage) && !is_own)
+    }
+
+    fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
+        for point in self.points(stage)? {
+            let inputs = self.node_inputs(stage, &point);
+            let parameters = self.resolve(stage, program, &point)?;
+            let node =
+                Node { stage: stage.to_owned(), point: self.label(&point), parameters, inputs, program: Arc::clone(program) };
+            let given: GivenInputs = node.inputs.iter().map(|input| (input.name.clone(), self.made_by(input))).collect();
+            if let Some(problem) = program.description.broken_rule(&node.parameters, &given) {
+                return Err(PlanError::Usage(format!("stage {}: {problem}", node.label())));
+            }
+            self.nodes.push(node);
+            self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len() - 1));
+        }
+        Ok(())
+    }
+
+    /// All combinations of the values that reach a stage: those of its own axes and of its parents'.
+    fn points(&self, stage: &str) -> Result<Vec<Point>, PlanError> {
+        let mut reach: BTreeSet<usize> = (0..self.axes.len()).filter(|&a| self.sets(&self.axes[a], stage)).collect();
+        for parent in self.block_inputs(stage).filter_map(|(_, source)| source.stage()) {
+            reach.extend(self.of_stage[parent].iter().flat_map(|(values, _)| values.keys().copied()));
+        }
+        let mut points: Vec<Point> = vec![Point::new()];
+        for axis in reach {
+            let values = self.axes[axis].values.len();
+            if points.len() * values + self.nodes.len() > MOST_NODES {
+                let problem = format!("the sweep comes to more than {MOST_NODES} points of {stage}; sweep fewer values at once");
+                return Err(PlanError::Usage(problem));
+            }
+            let with = |point: &Point, value| point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect();
+            points = points.iter().flat_map(|point| (0..values).map(move |value| with(point, value))).collect();
+        }
+        Ok(points)
+    }
+
+    /// Where a node's inputs come from, by name.
+    fn node_inputs(&self, stage: &str, point: &Point) -> Vec<NodeInput> {
+        let of_block = self.block_inputs(stage).map(|(name, source)| {
+            let from = match source {
+                Source::Folder(path) => Origin::Folder(self.pipeline.folder().join(path)),
+                Source::Stage { name, subtree } => {
+                    Origin::Node { index: self.parent(name, point), subtree: subtree.map(str::to_owned) }
+                }
+            };
+            NodeInput { name: name.to_owned(), from }
+        });
+        let of_command_line = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter_map(|(axis, value)| {
+            let reaches = axis.kind == Kind::Input && self.sets(axis, stage);
+            reaches.then(|| NodeInput { name: axis.name.clone(), from: Origin::Folder(axis.folder(value)) })
+        });
+        let mut inputs: Vec<NodeInput> = of_block.chain(of_command_line).collect();
+        inputs.sort_by(|a, b| a.name.cmp(&b.name));
+        inputs
+    }
+
+    /// A parent's node at a point of its child.
+    fn parent(&self, stage: &str, point: &Point) -> usize {
+        let fits = |values: &Point| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
+        let found = self.of_stage[stage].iter().find(|(values, _)| fits(values));
+        found.expect("a parent's axes reach its children").1
+    }
+
+    /// The parameters of the stage that an input comes from.
+    fn made_by(&self, input: &NodeInput) -> Option<Value> {
+        match input.from {
+            Origin::Node { index, .. } => Some(self.nodes[index].parameters.clone()),
+            Origin::Folder(_) => None,
+        }
+    }
+
+    /// What a point is called: the values of what is swept.
+    fn label(&self, point: &Point) -> String {
+        let values = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter(|(axis, _)| axis.values.len() > 1);
+        values.map(|(axis, value)| format!("{}={}", axis.name, axis.values[value].text)).collect::<Vec<_>>().join(", ")
+    }
+
+    /// A stage's parameters at a point: the command line's over the file's, those over what it is like, and that over the defaults.
+    fn resolve(&self, stage: &str, program: &StageProgram, point: &Point) -> Result<Value, PlanError> {
+        let mut given = Map::new();
+        for layer in self.pipeline.layers(stage) {
+            given.extend(self.pipeline.stages[layer].parameters.clone());
+            let set = self.axes.iter().enumerate().filter(|(_, axis)| axis.kind == Kind::Parameter && axis.stage == layer);
+            for (index, axis) in set.filter(|(_, axis)| self.sets(axis, stage)) {
+                let value = point.get(&index).copied().unwrap_or(0);
+                given.insert(axis.name.clone(), axis.values[value].value.clone());
+            }
+        }
+        program.schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
+    }
+}

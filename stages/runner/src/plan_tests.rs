@@ -1,0 +1,335 @@
+//! Files and command lines to nodes, with stages that would describe themselves so.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::*;
+
+const PIPELINE: &str = "default: [report]
+stages:
+  make: {}
+  prep:
+    inputs: {data: make}
+    parameters: {scale: 2}
+  train:
+    inputs:
+      scene: prep/train
+  again:
+    like: train
+    inputs: {scene: prep/train}
+    parameters:
+      rays: 7
+  score:
+    inputs: {field: train, truth: prep}
+  report:
+    inputs: {run: score}
+";
+
+/// What the stages of [`PIPELINE`] say of themselves.
+fn descriptions() -> BTreeMap<String, Description> {
+    let seed = json!({"type": "integer", "format": "uint64", "default": 0});
+    let described = json!([
+        {"name": "make", "output": {"kind": "data"}, "parameters": {"properties": {
+            "size": {"type": "integer", "format": "uint32", "minimum": 1, "default": 4}, "seed": seed}}},
+        {"name": "prep", "output": {"kind": "scene", "subtrees": {"train": "scene/train"}},
+         "inputs": {"data": {"kinds": ["data"], "summary": "pictures"}},
+         "parameters": {"properties": {
+            "scale": {"type": ["number", "null"], "default": null},
+            "kernel": {"anyOf": [{"enum": ["box", "average"]}, {"type": "null"}], "default": null},
+            "background": {"enum": ["white", "alpha"], "default": "white"},
+            "place": {"type": "array", "items": {"type": "number"}, "default": []}}},
+         "rules": [{"when": {"kernel": {"const": "average"}}, "must": {"scale": {"multipleOf": 1}}, "message": "average needs a whole scale"}]},
+        {"name": "train", "output": {"kind": "field"},
+         "inputs": {"scene": {"kinds": ["scene/train"], "summary": "scene"},
+                    "weights": {"kinds": ["weights"], "optional": true, "summary": "weights"}},
+         "parameters": {"properties": {
+            "rays": {"type": ["integer", "null"], "format": "uint64", "minimum": 1, "default": null},
+            "supersample": {"type": "number", "minimum": 1, "default": 2.0},
+            "method": {"enum": ["plain", "net"], "default": "plain"}, "open": {"type": "boolean", "default": false}, "seed": seed}},
+         "rules": [
+            {"when": {"method": {"const": "net"}}, "needs": ["weights"], "message": "input weights is missing: method net needs it"},
+            {"when": {"scene.background": {"const": "alpha"}}, "must": {"open": {"const": true}}, "message": "alpha needs open"}]},
+        {"name": "score", "output": {"kind": "metrics"},
+         "inputs": {"field": {"kinds": ["field"], "summary": "field"}, "truth": {"kinds": ["scene"], "summary": "truth"}}},
+        {"name": "report", "output": {"kind": "page"}, "sink": true, "inputs": {"run": {"kinds": ["run"], "summary": "a run"}},
+         "parameters": {"properties": {"views": {"type": "integer", "default": 4}}}}
+    ]);
+    let whole = |mut one: Value| -> (String, Description) {
+        for (name, value) in [
+            ("version", json!("1")),
+            ("code", json!("1")),
+            ("summary", json!("")),
+            ("inputs", json!({})),
+            ("parameters", json!({})),
+        ] {
+            one.as_object_mut().unwrap().entry(name).or_insert(value);
+        }
+        (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+    };
+    described.as_array().unwrap().iter().cloned().map(whole).collect()
+}
+
+fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
+    let mut request = Request::default();
+    let mut words = arguments.iter().map(|word| (*word).to_owned());
+    while let Some(word) = words.next() {
+        match word.as_str() {
+            "-p" => request.parameters.extend(words.next()),
+            "-i" => request.inputs.extend(words.next()),
+            _ => request.targets.push(word),
+        }
+    }
+    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+}
+
+#[track_caller]
+fn refused(text: &str, arguments: &[&str]) -> PlanError {
+    plan_of(text, arguments).map(|plan| plan.nodes.len()).unwrap_err()
+}
+
+#[test]
+fn every_combination_that_reaches_a_stage_is_a_node() {
+    for (arguments, expected) in [
+        (&[][..], &["make", "prep", "train", "score"][..]),
+        (&["make"], &["make"]),
+        (&["again", "-p", "supersample=1,2"], &["make", "prep", "again [supersample=1]", "again [supersample=2]"]),
+        (
+            &["train", "-p", "prep.scale=2,3", "-p", "rays=5,6"],
+            &[
+                "make",
+                "prep [scale=2]",
+                "prep [scale=3]",
+                "train [scale=2, rays=5]",
+                "train [scale=2, rays=6]",
+                "train [scale=3, rays=5]",
+                "train [scale=3, rays=6]",
+            ],
+        ),
+        // A folder in an input's place needs nothing; two are a sweep.
+        (&["train", "-i", "data=one,two"], &["prep [data=one]", "prep [data=two]", "train [data=one]", "train [data=two]"]),
+        (&["train", "-i", "train.scene=one"], &["train"]),
+        // Which seed is meant follows from the target.
+        (&["make", "-p", "seed=3"], &["make"]),
+    ] {
+        let plan = plan_of(PIPELINE, arguments).unwrap();
+        assert_eq!(plan.nodes.iter().map(Node::label).collect::<Vec<_>>(), expected, "{arguments:?}");
+    }
+    let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "-p", "views=2"]).unwrap();
+    assert_eq!((plan.sinks[0].stage.as_str(), &plan.sinks[0].shows[..]), ("report", &[4, 5][..]));
+    assert_eq!(plan.sinks[0].parameters, json!({"views": 2}));
+}
+
+#[test]
+fn a_block_like_another_follows_it_save_in_what_it_says() {
+    let plan = plan_of(PIPELINE, &["again", "train", "-p", "train.rays=9", "-p", "supersample=3"]).unwrap();
+    let of = |stage: &str| &plan.nodes.iter().find(|n| n.stage == stage).unwrap().parameters;
+    assert_eq!((&of("train")["rays"], &of("train")["supersample"]), (&json!(9), &json!(3.0)));
+    assert_eq!((&of("again")["rays"], &of("again")["supersample"]), (&json!(7), &json!(3.0)));
+}
+
+/// What is equal is one key, however it is written and wherever it is said; a default is the same said and unsaid.
+#[test]
+fn equal_values_are_one_key() {
+    let keys = |text: &str, arguments: &[&str]| -> Vec<String> {
+        let plan = plan_of(text, arguments).unwrap();
+        plan.nodes.iter().map(|node| artifact::hash_json(&key::parts(node, &[], "cpu"))).collect()
+    };
+    let same: [(&[&str], &[&str]); 9] = [
+        (&[], &["-p", "supersample=2"]),
+        (&[], &["-p", "supersample=2e0", "-p", "size=4.0", "-p", "train.seed=0"]),
+        (&[], &["-p", "prep.scale=2.0"]),
+        (&[], &["-p", "rays=", "-p", "kernel=null", "-p", "place=[]"]),
+        (&["-p", "rays=6e4"], &["-p", "rays=60000"]),
+        (&["-p", "prep.scale=3"], &["-p", "prep.scale=3.0"]),
+        (&["-p", "place=[1,2.5]"], &["-p", "place=[1.0,25e-1]"]),
+        (&["-p", "make.seed=18446744073709551615"], &["-p", "make.seed=18446744073709551615"]),
+        (&["-p", "supersample=3"], &["-p", "supersample=4", "-p", "train.supersample=3.0"]),
+    ];
+    for (one, other) in same {
+        assert_eq!(keys(PIPELINE, one), keys(PIPELINE, other), "{one:?} {other:?}");
+    }
+    for (from, to) in [
+        ("{scale: 2}", "{scale: 2.0}"),
+        ("{scale: 2}", "{scale: 2e0, kernel: ~, place: []}"),
+        ("{scale: 2}", "{scale: 0x2}"),
+        ("  make: {}", "  make: {parameters: {size: 4.0}}"),
+    ] {
+        assert_eq!(keys(&PIPELINE.replace(from, to), &[]), keys(PIPELINE, &[]), "{to}");
+    }
+    assert_ne!(keys(PIPELINE, &["-p", "supersample=3"]), keys(PIPELINE, &[]));
+}
+
+/// Of several values for one parameter the last one counts, and the plan says so.
+#[test]
+fn the_last_one_wins() {
+    for (arguments, notes, name, value) in [
+        (
+            &["-p", "kernel=box", "-p", "prep.kernel=average"][..],
+            &["-p kernel=box: overridden by -p prep.kernel=average"][..],
+            "kernel",
+            json!("average"),
+        ),
+        (
+            &["-p", "prep.scale=2", "-p", "scale=3", "-p", "scale=4"],
+            &["-p prep.scale=2: overridden by -p scale=3", "-p scale=3: overridden by -p scale=4"],
+            "scale",
+            json!(4.0),
+        ),
+        (
+            &["-p", "scale=1,1.0,2,2e0", "-p", "scale=3,3.0"],
+            &[
+                "-p scale=1,1.0,2,2e0: 1.0 is 1 again; it is made once",
+                "-p scale=1,1.0,2,2e0: 2e0 is 2 again; it is made once",
+                "-p scale=3,3.0: 3.0 is 3 again; it is made once",
+                "-p scale=1,1.0,2,2e0: overridden by -p scale=3,3.0",
+            ],
+            "scale",
+            json!(3.0),
+        ),
+        (
+            &["-i", "data=one", "-i", "prep.data=.", "-p", "kernel=box"],
+            &["-i data=one: overridden by -i prep.data=."],
+            "kernel",
+            json!("box"),
+        ),
+        (&["-i", "data=.,./,two"], &["-i data=.,./,two: ./ is . again; it is made once"], "kernel", json!(null)),
+    ] {
+        let plan = plan_of(PIPELINE, &[&["prep"], arguments].concat()).unwrap();
+        assert_eq!(plan.notes, notes);
+        assert_eq!(plan.nodes.last().unwrap().parameters[name], value, "{arguments:?}");
+    }
+    let plan = plan_of(PIPELINE, &["prep", "-i", "data=one", "-i", "data=two"]).unwrap();
+    assert!(matches!(&plan.nodes[0].inputs[0].from, Origin::Folder(folder) if folder == Path::new("two")));
+}
+
+#[test]
+fn command_lines_that_cannot_be_meant() {
+    for (arguments, words) in [
+        (&["evla"][..], "no stage \"evla\"; known: again, make, prep, report, score, train"),
+        (&["socre"], "no stage \"socre\"; did you mean score? known:"),
+        (&["-p", "kernal=box"], "-p kernal: no stage has such a parameter; did you mean kernel? see"),
+        (&["-i", "date=x"], "-i date: no stage has such an input; did you mean data?"),
+        (&["-p", "kernel"], "-p kernel: expected NAME=VALUE"),
+        (&["-p", "perp.kernel=box"], "-p perp.kernel: no stage \"perp\"; did you mean prep?"),
+        (
+            &["-p", "prep.kernle=box"],
+            "-p prep.kernle: prep has no such parameter; did you mean kernel? known: background, kernel, place, scale",
+        ),
+        (
+            &["-p", "kernel=bxo"],
+            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you mean \"box\"?",
+        ),
+        (&["-p", "seed=1"], "-p seed: more than one stage has it; say which: make.seed, train.seed"),
+        (&["-p", "rays=1,,2"], "-p rays=1,,2: a value between commas is empty; leave the comma out, or write null"),
+        (&["-p", "rays=,"], "between commas is empty"),
+        (&["-i", "data="], "-i data=: no folder is named"),
+        (&["-i", "data=a,"], "-i data=a,: a folder's name between commas is empty"),
+        (&["-p", "size=0x10"], "stage make: parameter size: \"0x10\" is not of type \"integer\""),
+        (&["-p", "size=+2"], "\"+2\" is not of type"),
+        (&["-p", "size= 2"], "\" 2\" is not of type"),
+        (&["-p", "size=02"], "\"02\" is not of type"),
+        (&["-p", "size=2.5"], "2.5 is not of type"),
+        (&["-p", "size=5000000000"], "maximum of 4294967295"),
+        (&["-p", "rays=18446744073709551616"], "maximum of 18446744073709551615"),
+        (&["-p", "supersample="], "parameter supersample: null is not of type"),
+        (&["-p", "views=1,2"], "report is a sink and shows all points of a sweep at once"),
+        (&["-i", "report.run=x"], "report is a sink, which shows what the run made"),
+        (&["-p", "kernel=average", "-p", "prep.scale=2,2.7"], "stage prep [scale=2.7]: average needs a whole scale"),
+        (&["-p", "method=net"], "stage train: input weights is missing: method net needs it"),
+        (&["-p", "background=alpha"], "stage train: alpha needs open"),
+        (&["-p", "method=plain,net"], "stage train [method=net]: input weights is missing"),
+    ] {
+        let problem = refused(PIPELINE, arguments);
+        assert!(matches!(problem, PlanError::Usage(_)), "{problem:?}");
+        assert!(problem.to_string().contains(words), "{arguments:?}: {problem}");
+    }
+    for fine in [
+        &["-p", "kernel=average"][..],
+        &["-p", "method=net", "-i", "weights=w"],
+        &["-p", "background=alpha", "-p", "open=true"],
+        &["-p", "background=alpha", "-i", "scene=elsewhere"],
+        &["prep", "-p", "background=alpha"],
+    ] {
+        assert!(plan_of(PIPELINE, fine).is_ok(), "{fine:?}");
+    }
+    let values = (0..120).map(|i| i.to_string()).collect::<Vec<_>>().join(",");
+    let arguments = [format!("make.seed={values}"), format!("train.seed={values}")];
+    let problem = refused(PIPELINE, &["train", "-p", &arguments[0], "-p", &arguments[1]]);
+    assert!(problem.to_string().contains("more than 10000 points of train"), "{problem}");
+}
+
+/// Each with its line.
+#[test]
+fn files_that_cannot_be_used() {
+    for (from, to, line, words) in [
+        (
+            "default: [report]",
+            "\n\ndefault: [reprot]",
+            3,
+            "stage reprot: named in `default`, but there is no such stage; did you mean report?",
+        ),
+        ("{data: make}", "{data: maek}", 5, "no stage \"maek\"; a folder begins with ./ or /; did you mean make?"),
+        ("{data: make}", "{date: make}", 5, "it has no input \"date\"; did you mean data?"),
+        ("like: train", "like: trian", 11, "like: there is no stage \"trian\"; did you mean train?"),
+        ("like: train", "like: train\n    run: x", 11, "give one of them"),
+        ("rays: 7", "rays: 0", 14, "parameter rays: 0 is less than the minimum"),
+        ("rays: 7", "rayz: 7", 14, "parameter rayz: unknown; did you mean rays?"),
+        ("rays: 7", "rays: .nan", 14, "stages.again.parameters.rays: a number is neither NaN nor infinite"),
+        ("rays: 7", "rays: -.inf", 14, "neither NaN nor infinite"),
+        ("rays: 7", "rays: 7\n    prameters: {}", 15, "unknown field `prameters`"),
+        (
+            "rays: 7",
+            "rays: 7\n      rays: 8",
+            15,
+            "stages.again.parameters: duplicate entry with key \"rays\"; leave one of them",
+        ),
+        ("      scene: prep/train", "      scene: prep/trian", 9, "prep has no folder \"trian\"; did you mean train?"),
+        ("truth: prep}", "truth: make}", 16, "input truth takes scene, but make is data"),
+        (
+            "{run: score}",
+            "{run: score}\n  late: {run: report, inputs: {run: report}}",
+            19,
+            "input run: report is a sink, which shows a run; nothing can be made of that",
+        ),
+        ("{run: score}", "{run: score, more: ./x}", 18, "input more: a sink shows stages, and ./x is a folder"),
+        ("{run: score}", "{}", 17, "input run is missing"),
+        ("  make: {}", "  make: {inputs: {x: score}}", 4, "its inputs lead back to it"),
+        ("  make: {}", "  ../make: {}", 3, "stage \"../make\": a stage's name begins with a letter"),
+        ("  make: {}", "  a/b: {}", 3, "stage \"a/b\": a stage's name has no `/`"),
+        ("  make: {}", "  a..b: {}", 3, "no `..`"),
+        ("  make: {}", "  -x: {}", 3, "not with `.` or `-`"),
+        ("  make: {}", "  '': {}", 3, "a stage's name is empty"),
+        ("  make: {}", "  \"a\\nb\": {}", 3, "stage \"a\\nb\": a stage's name has no white space and no control"),
+        ("  train:\n", "  train:\n    run: other\n", 8, "stage train: nothing describes other"),
+    ] {
+        let text = PIPELINE.replace(from, to);
+        let problem = refused(&text, &[]).to_string();
+        assert!(problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words), "{to}: {problem}");
+    }
+    // What isn't needed needn't be known.
+    let unneeded = plan_of(&format!("{PIPELINE}  other: {{}}\n"), &[]).unwrap();
+    assert_eq!(unneeded.nodes.len(), 4);
+    let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
+    assert!(problem.contains("such a parameter") && problem.contains("other couldn't be asked"), "{problem}");
+}
+
+#[test]
+fn files_as_editors_write_them() {
+    let expected = plan_of(PIPELINE, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>();
+    let windows = format!("\u{feff}{}", PIPELINE.replace('\n', "\r\n"));
+    let merged = PIPELINE.replace("{scale: 2}", "&prep {scale: 2}").replace("rays: 7", "<<: *prep\n      rays: 7");
+    for text in [windows.as_str(), PIPELINE] {
+        assert_eq!(plan_of(text, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>(), expected);
+    }
+    // A merged key is a key like others, right or wrong.
+    let problem = refused(&merged, &[]).to_string();
+    assert!(problem.starts_with("dir/pipeline.yaml:13: ") && problem.contains("parameter scale: unknown"), "{problem}");
+    let merged = PIPELINE
+        .replace("      scene: prep/train", "      <<: &scene {scene: prep/train}")
+        .replace("{scene: prep/train}\n    p", "*scene\n    p");
+    assert_eq!(plan_of(&merged, &["again"]).unwrap().nodes.len(), 3);
+    let merged = merged.replace("rays: 7", "rays: {x: 7}").replace("like: train", "like: [train]");
+    let problem = refused(&merged, &["again"]).to_string();
+    assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.like"), "{problem}");
+}

@@ -1,0 +1,270 @@
+//! YAML as people write it: encodings, merge keys, and the lines on which keys stand.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde_yaml::Value;
+
+/// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and what to do.
+pub(crate) fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
+    let is_utf16 = bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) || bytes.iter().take(2).any(|b| *b == 0);
+    if is_utf16 {
+        return Err((None, "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)".to_owned()));
+    }
+    let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
+    std::str::from_utf8(bytes).map_err(|e| {
+        let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
+        (Some(line), "the text isn't UTF-8; save the file as UTF-8".to_owned())
+    })
+}
+
+/// Replaces merge keys (`<<: *anchor`) by what they stand for; whether there were any.
+pub(crate) fn merge(document: &mut Value) -> Result<bool, serde_yaml::Error> {
+    let mut merged = false;
+    // What is merged may bring a merge key of its own.
+    while has_merge_key(document) {
+        document.apply_merge()?;
+        merged = true;
+    }
+    Ok(merged)
+}
+
+fn has_merge_key(value: &Value) -> bool {
+    match value {
+        Value::Mapping(entries) => entries.iter().any(|(key, value)| key.as_str() == Some("<<") || has_merge_key(value)),
+        Value::Sequence(items) => items.iter().any(has_merge_key),
+        Value::Tagged(tagged) => has_merge_key(&tagged.value),
+        _ => false,
+    }
+}
+
+/// Where a number stands that JSON doesn't have: `.nan` or `.inf`.
+pub(crate) fn not_finite(value: &Value) -> Option<Vec<String>> {
+    match value {
+        Value::Number(number) if !number.as_f64().is_none_or(f64::is_finite) => Some(Vec::new()),
+        Value::Mapping(entries) => entries.iter().find_map(|(key, value)| {
+            let mut path = not_finite(value)?;
+            path.insert(0, key.as_str().unwrap_or_default().to_owned());
+            Some(path)
+        }),
+        Value::Sequence(items) => items.iter().find_map(not_finite),
+        Value::Tagged(tagged) => not_finite(&tagged.value),
+        _ => None,
+    }
+}
+
+/// What a search ends with: the parser says on which line an error came up, so what is found is reported as one.
+const FOUND: &str = "the key that was looked for";
+
+fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
+    let error = searched.err()?;
+    error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
+}
+
+/// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of the last one that is.
+pub(crate) fn line_of(text: &str, path: &[&str]) -> Option<usize> {
+    let search = |length: usize| Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text));
+    (1..=path.len()).rev().find_map(|length| line_found(search(length)))
+}
+
+/// The line on which a key stands that its mapping has already.
+pub(crate) fn line_of_duplicate(text: &str) -> Option<usize> {
+    line_found(Duplicates.deserialize(serde_yaml::Deserializer::from_str(text)))
+}
+
+/// Looks for a key in nested mappings.
+struct Search<'a>(&'a [&'a str]);
+
+impl<'de> DeserializeSeed<'de> for Search<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_map(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Search<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a mapping")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
+        while let Some(is_first) = map.next_key_seed(Key { name: first, is_last: rest.is_empty() })? {
+            if is_first {
+                map.next_value_seed(Search(rest))?;
+            } else {
+                map.next_value::<IgnoredAny>()?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Compares a key with a name; the last one is reported.
+struct Key<'a> {
+    name: &'a str,
+    is_last: bool,
+}
+
+impl<'de> DeserializeSeed<'de> for Key<'_> {
+    type Value = bool;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<bool, D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for Key<'_> {
+    type Value = bool;
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E: Error>(self, key: &str) -> Result<bool, E> {
+        let is_it = key == self.name;
+        if is_it && self.is_last { Err(E::custom(FOUND)) } else { Ok(is_it) }
+    }
+}
+
+/// Looks for a key that comes twice, in mappings inside of mappings and lists.
+struct Duplicates;
+
+impl<'de> DeserializeSeed<'de> for Duplicates {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Duplicates {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("anything")
+    }
+
+    fn visit_bool<E>(self, _: bool) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_i64<E>(self, _: i64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_u64<E>(self, _: u64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_f64<E>(self, _: f64) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_str<E>(self, _: &str) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_unit<E>(self) -> Result<(), E> {
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
+        while items.next_element_seed(Duplicates)?.is_some() {}
+        Ok(())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let mut seen = BTreeSet::new();
+        while map.next_key_seed(NewKey(&mut seen))?.is_some() {
+            map.next_value_seed(Duplicates)?;
+        }
+        Ok(())
+    }
+}
+
+/// A key, reported where it was seen before.
+struct NewKey<'a>(&'a mut BTreeSet<String>);
+
+impl<'de> DeserializeSeed<'de> for NewKey<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_str(self)
+    }
+}
+
+impl Visitor<'_> for NewKey<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str("a key")
+    }
+
+    fn visit_str<E: Error>(self, key: &str) -> Result<(), E> {
+        if self.0.insert(key.to_owned()) { Ok(()) } else { Err(E::custom(FOUND)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keys_are_found_on_their_lines() {
+        let text = "default: [a]\nstages:\n  a:\n    inputs: {x: b, y: c}\n    # b: a comment\n    parameters:\n      'x': 1\n      z:\n        - 2\n  b: {parameters: {\n    x: 2}}\n  inputs:\n    run: &r ./x\n  c:\n    run: *r\n";
+        for (path, line) in [
+            (&["default"][..], Some(1)),
+            (&["stages", "a"], Some(3)),
+            (&["stages", "b"], Some(10)),
+            (&["stages", "inputs"], Some(12)),
+            (&["stages", "a", "inputs", "x"], Some(4)),
+            (&["stages", "a", "parameters", "x"], Some(7)),
+            (&["stages", "b", "parameters", "x"], Some(11)),
+            (&["stages", "a", "parameters", "nothing"], Some(6)),
+            (&["stages", "a", "parameters", "z", "deeper"], Some(8)),
+            (&["stages", "c", "run"], Some(15)),
+            (&["nothing"], None),
+            (&[], None),
+        ] {
+            assert_eq!(line_of(text, path), line, "{path:?}");
+        }
+        assert_eq!(line_of("a: [", &["a", "b"]), Some(1));
+        for (text, line) in [
+            ("a: 1\nb: {x: 1.5, y: [true, null, {z: 2,\n  z: -3}]}\n", Some(3)),
+            ("a: 1\nb: 2\na: text\n", Some(3)),
+            ("a: {x: 1}\nb: {x: 1}\n", None),
+        ] {
+            assert_eq!(line_of_duplicate(text), line, "{text}");
+        }
+    }
+
+    #[test]
+    fn encodings() {
+        assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
+        assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
+        let utf16 = |bytes: &[u8]| decode(bytes).unwrap_err().1.contains("UTF-16; save it as UTF-8");
+        assert!(utf16(b"\xff\xfea\0:\0") && utf16(b"\xfe\xff\0a\0:") && utf16(b"a\0:\0") && utf16(b"\0a\0:"));
+        let (line, problem) = decode(b"a: 1\nb: \xe4\n").unwrap_err();
+        assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
+    }
+
+    #[test]
+    fn merge_keys_are_followed() {
+        for (text, expected) in [
+            ("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}", "a: {x: 1, y: 2}\nb: {y: 3, x: 1}"),
+            ("a: &a {x: 1}\nb: &b {<<: *a}\nc: {<<: *b}", "a: {x: 1}\nb: {x: 1}\nc: {x: 1}"),
+            ("a: &a {x: 1}\nb: &b {y: 1}\nc: {<<: [*a, *b]}", "a: {x: 1}\nb: {y: 1}\nc: {x: 1, y: 1}"),
+        ] {
+            let [mut found, expected] = [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
+            assert!(merge(&mut found).unwrap());
+            assert_eq!(found, expected, "{text}");
+        }
+        let mut scalar = serde_yaml::from_str("a: {<<: 1}").unwrap();
+        assert!(merge(&mut scalar).is_err());
+    }
+}
