@@ -97,10 +97,13 @@ struct Made {
     _runs: Vec<RunFile>,
 }
 
-fn held<T>(locked: Locked<T>) -> T {
-    match locked {
-        Locked::Held(held) => held,
-        Locked::By(holder) => panic!("held by {holder:?}"),
+/// Attempts until it is held: other tests start programs, and a file that was open when one started stays locked until it is loaded.
+fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, artifact::StoreError>) -> T {
+    loop {
+        if let Locked::Held(held) = attempt().unwrap() {
+            return held;
+        }
+        std::thread::yield_now();
     }
 }
 
@@ -136,7 +139,7 @@ fn make(case: &Case) -> Made {
     let (mut locks, mut runs) = (Vec::new(), Vec::new());
     let key = |number: &u8| keys[*number as usize % keys.len()].clone();
     for (i, holder) in case.holders.iter().enumerate() {
-        let entered = held(store.try_enter().unwrap());
+        let entered = held(|| store.try_enter());
         match holder {
             Holder::Pin(numbers) => {
                 let actions: Vec<(String, String)> = numbers.iter().map(|n| ("s".to_owned(), key(n))).collect();
@@ -157,6 +160,8 @@ fn make(case: &Case) -> Made {
                     let path = store.root().join(format!("runs/{}.jsonl", run.id()));
                     drop(run);
                     let text = fs::read_to_string(&path).unwrap() + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
+                    // A file that was never locked.
+                    fs::remove_file(&path).unwrap();
                     fs::write(&path, text).unwrap();
                 }
             }
@@ -171,7 +176,7 @@ fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>, m
     if store.record(&key).is_some() {
         return key;
     }
-    let entered = held(store.try_enter().unwrap());
+    let entered = held(|| store.try_enter());
     let unfinished =
         Unfinished { stage: stage.clone(), key_parts: key_parts.clone(), made_of: made_of.clone(), ..Default::default() };
     let attempt = store.begin(&entered, &unfinished, &json!({})).unwrap();
@@ -256,7 +261,7 @@ proptest! {
 
         let verdict = judge(store, plan, choice).unwrap();
         prop_assert_eq!(verdict.lines().len(), store.objects().unwrap().len() + store.partials().unwrap().len());
-        verdict.carry_out(store, &held(store.try_close().unwrap())).unwrap();
+        verdict.carry_out(store, &held(|| store.try_close())).unwrap();
         store.empty_trash().unwrap();
 
         let left = |names: Vec<String>| -> BTreeSet<String> { names.into_iter().collect() };
@@ -284,6 +289,6 @@ fn orphans_go() {
     fs::write(store.action(&key, "json"), "{").unwrap();
     let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false }).unwrap();
     assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
-    verdict.carry_out(&store, &held(store.try_close().unwrap())).unwrap();
+    verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
 }
