@@ -34,6 +34,7 @@
 //! }
 //! ```
 
+mod amounts;
 mod canonical;
 mod describe;
 mod failure;
@@ -47,6 +48,7 @@ mod run_record;
 mod stage;
 mod store;
 
+pub use amounts::{amount, counted};
 pub use canonical::{canonical, hash_json};
 pub use describe::{Description, Input, Output};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
