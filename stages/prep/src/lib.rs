@@ -21,7 +21,7 @@ mod sizes;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage, counted, printable};
+use artifact::{Context, Failure, FailureExt as _, Input, Output, Stage, WARNING, counted, printable, with_warnings};
 use dataset::{Dataset, Format, Frame, Split};
 use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
@@ -269,9 +269,6 @@ impl Stage for Prep {
         job.run(&set, notes, &chosen(&split.train), &chosen(&split.test))
     }
 }
-
-/// How a note begins that warns.
-const WARNING: &str = "warning: ";
 
 /// Warnings of what looks wrong about poses; such as can't be right are refused.
 fn pose_warnings(set: &Dataset, split: &Split) -> anyhow::Result<Vec<String>> {
@@ -674,7 +671,7 @@ impl Job<'_> {
     ) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let scale = [f64::from(hr.0) / f64::from(lr.0), f64::from(hr.1) / f64::from(lr.1)];
-        let warnings: String = notes.iter().filter(|n| n.starts_with(WARNING)).map(|warning| format!("\n{warning}")).collect();
+        let warnings: Vec<String> = notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         self.context.write_json(
             "scene.json",
             &SceneSummary {
@@ -693,8 +690,8 @@ impl Job<'_> {
                 notes,
             },
         )?;
-        self.context.write_summary(&format!(
-            "{} at {}×{} from {}×{} ({:?}), {}; rays from {:.2} to {:.2}{warnings}",
+        let summary = format!(
+            "{} at {}×{} from {}×{} ({:?}), {}; rays from {:.2} to {:.2}",
             counted(train.len(), "training view"),
             lr.0,
             lr.1,
@@ -704,6 +701,7 @@ impl Job<'_> {
             counted(test.len(), "test view"),
             bounds.near,
             bounds.far
-        ))
+        );
+        self.context.write_summary(&with_warnings(&summary, &warnings))
     }
 }

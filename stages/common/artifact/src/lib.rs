@@ -47,6 +47,7 @@ mod progress;
 mod run_record;
 mod stage;
 mod store;
+mod warnings;
 
 pub use amounts::{amount, counted};
 pub use canonical::{canonical, hash_json};
@@ -60,3 +61,4 @@ pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run_record::{RunInput, RunNode, RunRecord};
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, KeyLock, Record, Store, StoreError};
+pub use warnings::{WARNING, warnings_of, with_warnings};
