@@ -639,7 +639,7 @@ fn the_paper_s_network_refines_by_references() {
     project.ok(&["run", "eval-paper"]);
     let folder = |stage: &str| project.artifact(stage, &["eval-paper"]);
     let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
-    assert!(summary.contains("3 views by 1 references"), "{summary}");
+    assert!(summary.contains("3 views by 1 reference"), "{summary}");
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));
     let file: serde_json::Value = serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
     assert_eq!(file["network"]["paper"]["width"], 4);

@@ -96,8 +96,8 @@ impl Stage for CameraPath {
         views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
-            "{} frames of {width}×{height}, {}",
-            views.views.len(),
+            "{} of {width}×{height}, {}",
+            artifact::counted(views.views.len(), "frame"),
             format!("{kind:?}").to_lowercase()
         ))
     }

@@ -117,9 +117,9 @@ impl Stage for DemoScene {
                 .context("cannot write the cameras")?;
         }
         context.write_summary(&format!(
-            "{} training and {} test views, {size}×{size}",
-            params.train,
-            params.test,
+            "{}, {}, {size}×{size}",
+            artifact::counted(params.train as usize, "training view"),
+            artifact::counted(params.test as usize, "test view"),
             size = params.size
         ))
     }

@@ -413,6 +413,6 @@ fn summary(metrics: &Metrics) -> String {
     if let (Some(low), None) = (mean.low_resolution, mean.psnr) {
         parts.push(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", low.psnr, low.ssim));
     }
-    parts.push(format!("{} views", metrics.views.len()));
+    parts.push(artifact::counted(metrics.views.len(), "view"));
     parts.join(" · ")
 }

@@ -5,9 +5,12 @@
 //! by a pixel costs more decibels than anything a field gets wrong. Only LR photographs are looked at where there are any: HR ones are what
 //! views are scored by.
 
-use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage};
-use pixels::PixelError;
-use poses::{Moved, Options, Pyramid, refine};
+use std::error::Error;
+
+use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings};
+use pixels::{Picture, PixelError};
+use poses::{Moved, Options, Pyramid, Step, refine};
+use radiance::RayField;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -57,34 +60,71 @@ impl Stage for Locate {
         let given = Views::read(input)?;
         let shown = members.file.background.shown();
         let progress = context.progress("locating", given.views.len() as u64);
-        let mut cameras = Vec::with_capacity(given.views.len());
-        let (mut located, mut errors) = (0u32, [0.0; 2]);
+        let mut found = Vec::with_capacity(given.views.len());
         for view in &given.views {
             context.check_interrupt()?;
             let place = || format!("view {}", view.camera.name);
-            let mut camera = view.camera.clone();
-            if let Some(photograph) = read(view, input).bad_input(place())? {
-                let pyramid = Pyramid::new(&photograph.over(shown).known(), params.smaller);
-                let found = |camera: &Camera, level: u32, renderings: u32| {
-                    let options = Options { renderings, background: shown, ..Options::default() };
-                    refine(&members, camera, &pyramid, level, &options).map_err(|e| anyhow::anyhow!("{}: {e}", place()))
-                };
-                errors[0] += found(&camera, 0, 1)?.before;
-                for level in (1..=pyramid.smaller()).rev() {
-                    camera = found(&camera, level, params.renderings)?.camera;
+            let photograph = read(view, input).bad_input(place())?;
+            let located = match photograph {
+                Some(photograph) => {
+                    let picture = photograph.over(shown).known();
+                    Located::by(&members, &view.camera, &picture, params, shown)
+                        .map_err(|e| anyhow::anyhow!("{}: {e}", place()))?
                 }
-                let last = found(&camera, 0, params.renderings)?;
-                errors[1] += last.after;
-                camera = last.camera;
-                located += 1;
-            }
-            cameras.push(camera);
+                None => Located::unknown(&view.camera),
+            };
+            found.push(located);
             progress.add(1);
         }
-        let summary = summary(&given, &cameras, located, errors);
-        let views = cameras.into_iter().map(View::camera_only).collect();
+        let (summary, warning) = summary(&found);
+        warning.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
+        let views = found.into_iter().map(|located| View::camera_only(located.to)).collect();
         context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(given.background, given.bounds, views) })?;
-        context.write_summary(&summary)
+        context.write_summary(&with_warnings(&summary, warning.as_slice()))
+    }
+}
+
+/// Where a photograph was taken from.
+struct Located {
+    /// The given camera; its pixels are the photograph's.
+    from: Camera,
+    /// The camera that was found.
+    to: Camera,
+    /// Middle depth of what that sees.
+    depth: Option<f64>,
+    /// How the photograph is met from either; none where there is no photograph.
+    errors: Option<[f64; 2]>,
+}
+
+impl Located {
+    /// Of a view without a photograph nothing is known.
+    fn unknown(camera: &Camera) -> Self {
+        Self { from: camera.clone(), to: camera.clone(), depth: None, errors: None }
+    }
+
+    /// By what a field renders, from coarse to fine. The given pose stays where the whole photograph is met no better from the one found: smaller
+    /// sizes may have led astray.
+    fn by(
+        field: &dyn RayField,
+        camera: &Camera,
+        picture: &Picture,
+        params: &Params,
+        background: f32,
+    ) -> Result<Self, Box<dyn Error + Send + Sync>> {
+        let pyramid = Pyramid::new(picture, params.smaller);
+        let moved = |camera: &Camera, level: u32, renderings: u32| {
+            let options = Options { renderings, background, ..Options::default() };
+            refine(field, camera, &pyramid, level, &options)
+        };
+        let given = moved(camera, 0, 1)?;
+        let mut to = camera.clone();
+        for level in (1..=pyramid.smaller()).rev() {
+            to = moved(&to, level, params.renderings)?.camera;
+        }
+        let last = moved(&to, 0, params.renderings)?;
+        let best = if last.after < given.before { last } else { given.clone() };
+        let from = camera.resized(picture.width as u32, picture.height as u32);
+        Ok(Self { from, to: best.camera, depth: best.depth, errors: Some([given.before, best.after]) })
     }
 }
 
@@ -96,9 +136,18 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
     })
 }
 
-/// How far cameras went, and what it was good for.
-fn summary(given: &Views, cameras: &[Camera], located: u32, errors: [f64; 2]) -> String {
-    let moved = Moved::between(given.views.iter().map(|view| &view.camera).zip(cameras));
-    let [before, after] = errors.map(|e| (e / f64::from(located.max(1))).sqrt());
-    format!("{located} of {} cameras located: {moved}; error (Huber's) {before:.4} before, {after:.4} after", cameras.len())
+/// How far cameras went, and what it was good for; a warning, where they went far.
+fn summary(found: &[Located]) -> (String, Option<String>) {
+    let moved = Moved::between(found.iter().map(|Located { from, to, depth, .. }| Step { from, to, depth: *depth }));
+    let errors: Vec<[f64; 2]> = found.iter().filter_map(|located| located.errors).collect();
+    let mean = |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
+    let (count, all, before, after) = (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));
+    let summary = format!("{count} of {all} located: {moved}; error (Huber's) {before:.4} before, {after:.4} after");
+    let warning = format!(
+        "cameras have {moved}, which is far: unless the given poses are that far off, the field or the photographs are of something else"
+    );
+    (summary, moved.is_far().then_some(warning))
 }
+
+#[cfg(test)]
+mod tests;

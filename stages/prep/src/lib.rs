@@ -3,6 +3,7 @@
 //! * `sizes`: LR and HR size from `lr`, `hr`, `scale`.
 //! * `degrade`: HR and LR pictures of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see; `hull`: tighter, from alpha, where that is allowed.
+//! * `pose_warnings`: poses that can't be right, or hardly.
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
 //!
@@ -13,13 +14,14 @@
 mod bounds;
 mod degrade;
 mod hull;
+mod pose_warnings;
 mod references;
 mod sizes;
 
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Rule, Stage};
+use artifact::{Context, Failure, FailureExt as _, Input, Output, Rule, Stage, WARNING, counted, printable, with_warnings};
 use dataset::{Dataset, Format, Frame, Split};
 use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
 use rayon::prelude::*;
@@ -257,6 +259,7 @@ impl Stage for Prep {
                 split.test = (0..most).map(|i| split.test[i * all / most]).collect();
             }
         }
+        let warnings = pose_warnings(&set, &split)?;
         let first = set.frames[split.train[0]].intrinsics();
         let native = (first.width, first.height);
         let making = Making::new(&set, params).map_err(Failure::Usage)?;
@@ -266,7 +269,7 @@ impl Stage for Prep {
             enlarged(native, params.hr, params.scale)
         };
         let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
-        let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).collect();
+        let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
         if making.kernel == Kernel::Average {
             let mut all = split.train.iter().chain(&split.test).map(|&i| job.sizes_of(&set.frames[i].intrinsics()));
@@ -279,6 +282,15 @@ impl Stage for Prep {
         let chosen = |numbers: &[usize]| numbers.iter().map(|&i| &set.frames[i]).collect::<Vec<_>>();
         job.run(&set, notes, &chosen(&split.train), &chosen(&split.test))
     }
+}
+
+/// Warnings of what looks wrong about poses; such as can't be right are refused.
+fn pose_warnings(set: &Dataset, split: &Split) -> anyhow::Result<Vec<String>> {
+    let camera = |&i: &usize| set.frames[i].camera();
+    let training: Vec<Camera> = split.train.iter().map(camera).collect();
+    let test: Vec<Camera> = split.test.iter().filter(|i| !split.train.contains(i)).map(camera).collect();
+    pose_warnings::check(&training).map_err(|reason| Failure::BadInput(format!("dataset: {reason}")))?;
+    Ok(pose_warnings::warnings(&training, &test).into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 
 /// What lies behind a scene: nothing, where the space holds all that is seen and one of the pictures is opaque.
@@ -585,9 +597,10 @@ impl Job<'_> {
         let Sizes { lr, hr } = self.sizes;
         let kernel = format!("{:?}", self.making.kernel).to_lowercase();
         let both = split.train.iter().filter(|i| split.test.contains(i)).count();
+        let (train, test) = (counted(split.train.len(), "view"), split.test.len());
         let parts = match both {
-            0 => format!("{} views to train on, {} others for testing", split.train.len(), split.test.len()),
-            _ => format!("{} views to train on, {} for testing, {both} of them for both", split.train.len(), split.test.len()),
+            0 => format!("{train} to train on, {} for testing", counted(test, "other")),
+            _ => format!("{train} to train on, {test} for testing, {both} of them for both"),
         };
         if self.making.has_truth {
             format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
@@ -638,7 +651,8 @@ impl Job<'_> {
     /// True depth at HR size: that of the nearest native pixel centre, since averaging depths across an edge invents surfaces.
     fn write_depth(&self, source: &Path, name: &str, (width, height): (usize, usize)) -> anyhow::Result<()> {
         let native = read_exr(source)?;
-        let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", source.display()));
+        let shown = source.display().to_string();
+        let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", printable(&shown)));
         let (depth, opacity) = (channel("Z")?, channel("A")?);
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
@@ -671,6 +685,7 @@ impl Job<'_> {
     ) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let scale = [f64::from(hr.0) / f64::from(lr.0), f64::from(hr.1) / f64::from(lr.1)];
+        let warnings: Vec<String> = notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         self.context.write_json(
             "scene.json",
             &SceneSummary {
@@ -689,17 +704,18 @@ impl Job<'_> {
                 notes,
             },
         )?;
-        self.context.write_summary(&format!(
-            "{} training views at {}×{} from {}×{} ({:?}), {} test views; rays from {:.2} to {:.2}",
-            train.len(),
+        let summary = format!(
+            "{} at {}×{} from {}×{} ({:?}), {}; rays from {:.2} to {:.2}",
+            counted(train.len(), "training view"),
             lr.0,
             lr.1,
             hr.0,
             hr.1,
             self.making.kernel,
-            test.len(),
+            counted(test.len(), "test view"),
             bounds.near,
             bounds.far
-        ))
+        );
+        self.context.write_summary(&with_warnings(&summary, &warnings))
     }
 }

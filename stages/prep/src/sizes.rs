@@ -39,6 +39,14 @@ pub enum SizeError {
         /// That width.
         limit: u32,
     },
+    /// LR images would be the HR ones.
+    #[error("scale = {scale} makes LR images of {hr} pixels from HR images of {hr}; give larger images, or choose scale = 1")]
+    Unchanged {
+        /// Scale.
+        scale: f64,
+        /// HR width.
+        hr: u32,
+    },
     /// Nothing would be left.
     #[error("scale = {scale} leaves no pixel of {hr}; choose a smaller scale")]
     Nothing {
@@ -52,6 +60,8 @@ pub enum SizeError {
 /// LR and HR size from what is given of `lr`, `hr` and `scale`. Widths are given; heights follow the data's aspect.
 pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option<f64>) -> Result<Sizes, SizeError> {
     let times = |w: u32, s: f64| (f64::from(w) * s).round() as u32;
+    // Where both widths are given, they say the scale.
+    let given = if lr.is_some() && hr.is_some() { scale } else { Some(scale.unwrap_or(2.0)) };
     let (lr, hr) = match (lr, hr, scale) {
         (Some(lr), Some(hr), Some(scale)) if times(lr, scale) != hr => return Err(SizeError::Contradiction { lr, hr, scale }),
         (Some(lr), Some(hr), _) => (lr, hr),
@@ -63,6 +73,9 @@ pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option
     };
     if lr == 0 {
         return Err(SizeError::Nothing { scale: scale.unwrap_or(2.0), hr });
+    }
+    if let Some(scale) = given.filter(|scale| *scale > 1.0 && lr == hr) {
+        return Err(SizeError::Unchanged { scale, hr });
     }
     if hr > native.0 {
         let name = if lr > native.0 { "lr" } else { "hr" };
@@ -135,5 +148,9 @@ mod tests {
         assert!(matches!(sizes((800, 800), Some(500), Some(400), None), Err(SizeError::TooLarge { larger: "hr", .. })));
         assert!(matches!(sizes((800, 800), Some(100), Some(300), Some(2.0)), Err(SizeError::Contradiction { .. })));
         assert!(matches!(sizes((4, 4), None, None, Some(16.0)), Err(SizeError::Nothing { .. })));
+        assert_eq!(sizes((1, 1), None, None, None), Err(SizeError::Unchanged { scale: 2.0, hr: 1 }));
+        assert_eq!(sizes((10, 10), Some(10), None, Some(1.01)), Err(SizeError::Unchanged { scale: 1.01, hr: 10 }));
+        assert_eq!(sizes((1, 1), None, None, Some(1.0)), Ok(Sizes { lr: (1, 1), hr: (1, 1) }));
+        assert_eq!(sizes((9, 9), Some(9), Some(9), None), Ok(Sizes { lr: (9, 9), hr: (9, 9) }));
     }
 }

@@ -14,7 +14,7 @@
 
 use std::path::Path;
 
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage, counted};
 use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
@@ -133,12 +133,12 @@ impl Stage for Refine {
         let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
         let is_mean =
             |view: &&View| job.enlarged.as_ref().is_some_and(|enlarged| enlarged.views.taken_by(&view.camera).is_some());
+        let all = counted(views.views.len(), "view");
         let means = match views.views.iter().filter(is_mean).count() {
             0 => String::new(),
             count => format!("; {count} are means with their enlarged photographs"),
         };
-        context
-            .write_summary(&format!("{} views{by}, with {strength:.2} of what the network adds{means}{own}", views.views.len()))
+        context.write_summary(&format!("{all}{by}, with {strength:.2} of what the network adds{means}{own}"))
     }
 }
 
@@ -384,12 +384,12 @@ impl Job<'_> {
 
     /// Says which references were of no use; in a word or two, of what use all were.
     fn say_of(&self, uses: &[Use]) -> String {
-        let count = self.references.len();
-        if count == 0 {
+        if self.references.is_empty() {
             return String::new();
         }
+        let references = counted(self.references.len(), "reference");
         if self.network.guidance().is_none() {
-            return format!(" by {count} references");
+            return format!(" by {references}");
         }
         let mut all = Use::default();
         for (reference, of_use) in self.references.iter().zip(uses) {
@@ -399,9 +399,9 @@ impl Job<'_> {
             }
         }
         if all.seen == 0 {
-            return format!(" by {count} references that see nothing of them");
+            return format!(" by {references} that see nothing of them");
         }
-        format!(" by {count} references, trusted by {:.0} %", 100.0 * all.trusted())
+        format!(" by {references}, trusted by {:.0} %", 100.0 * all.trusted())
     }
 
     /// A view's file with other colours.

@@ -7,7 +7,7 @@
 //! written sixteen at a time, so memory doesn't grow with the image.
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, Stage};
+use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
 use fields::Members;
 use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
 use radiance::{Ray, RayField};
@@ -87,7 +87,8 @@ impl Stage for RenderDepth {
         }
         let count = views.len();
         context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(file.background, cameras.bounds, views) })?;
-        context.write_summary(&format!("{count} views, {:.1} M pixels", pixels_of(&cameras, params.size) as f64 / 1e6))
+        let pixels = amount(pixels_of(&cameras, params.size));
+        context.write_summary(&format!("{}, {pixels} pixels", counted(count, "view")))
     }
 }
 

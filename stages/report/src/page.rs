@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::Params;
 use crate::compare::compare;
 use crate::pictures::{colour, depth, depths_of, shown_in_gallery};
-use crate::results::{metrics, scored};
+use crate::results::{metrics, scored, warnings_by_node};
 
 const STYLE: &str = "
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
@@ -20,6 +20,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums } th { font-weight:
 figure img { width: 100%; border: 1px solid #ddd; display: block } img.lr, img.px { image-rendering: pixelated }
 /* One column a method, the same in both rows. */
 .compare figure { flex: 1 1 0; min-width: 110px }
+#warnings { border: 2px solid #b3261e; background: #fdecea; padding: 0 1rem .2rem; margin: 1rem 0 } #warnings h2 { margin: .6rem 0 }
 figcaption { font-size: .82rem; color: #555 } code { font-size: .85em } details { margin: .3rem 0 } small { color: #666 }
 ";
 
@@ -48,6 +49,7 @@ pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
             }
             body {
                 h1 { "nerf-sr report" }
+                (warnings(run))
                 (scores(run, &points))
                 (compared)
                 @for (point, gallery) in points.iter().zip(&galleries) {
@@ -58,6 +60,19 @@ pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
             }
         }
     })
+}
+
+/// What stages warned of, before anything else.
+fn warnings(run: &RunRecord) -> Markup {
+    let found = warnings_by_node(run);
+    html! {
+        @if !found.is_empty() {
+            div id="warnings" {
+                h2 { "Warnings" }
+                ul { @for (node, warning) in &found { li { b { (node) } ": " (warning) } } }
+            }
+        }
+    }
 }
 
 /// A table of means, one row a point, the best figure of each column in bold.

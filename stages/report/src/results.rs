@@ -2,7 +2,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::{RunNode, RunRecord};
+use artifact::{RunNode, RunRecord, SUMMARY_FILE, warnings_of};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -42,6 +42,17 @@ pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
     let path = node.folder.join("metrics.json");
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
+}
+
+/// What each node's stage warned of in its summary, with the node's name, in the order of the run.
+pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
+    let of_node = |node: &RunNode| {
+        let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
+        let name = if node.point.is_empty() { node.stage.clone() } else { format!("{} [{}]", node.stage, node.point) };
+        let warnings: Vec<_> = warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect();
+        warnings
+    };
+    run.nodes.iter().flat_map(of_node).collect()
 }
 
 /// The nodes that scored, each with its place in the list: what came through fewer stages first, so that what is rendered stands before what is

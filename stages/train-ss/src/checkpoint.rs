@@ -47,6 +47,7 @@ impl Curve {
             curve: self.points,
             exposures: Vec::new(),
             poses: Vec::new(),
+            warnings: Vec::new(),
         }
     }
 }

@@ -6,6 +6,7 @@
 //! * `memory`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
 //! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
 //! * `exposure`: how bright each photograph is, where that is asked for.
+//! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`: whether it was better to ask.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
 mod checkpoint;
@@ -16,13 +17,16 @@ mod memory;
 mod moving_cameras;
 mod order;
 mod params;
+mod pose_choice;
 mod references;
 mod supervision;
 
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
+use artifact::{
+    Context, Failure, FailureExt as _, GivenInput, Input, Output, Progress, Rule, Stage, WARNING, amount, with_warnings,
+};
 use pixels::{DEGRADATION_FILE, Degradation, Filter};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Intrinsics, Photograph, Space, Views};
@@ -51,9 +55,12 @@ pub struct TrainingLog {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exposures: Vec<[f32; 3]>,
     /// Where each training view was found to be taken from, `camera_to_world` in the order of `views.json`, where that was asked for; of the first
-    /// member.
+    /// member. The given poses where no better ones were found.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub poses: Vec<[[f64; 4]; 3]>,
+    /// What looks wrong about it, a line each.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub warnings: Vec<String>,
 }
 
 impl TrainingLog {
@@ -64,6 +71,7 @@ impl TrainingLog {
         if self.steps == 0 {
             (self.exposures, self.poses) = (next.exposures, next.poses);
         }
+        self.warnings.extend(next.warnings);
         self.curve.extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
         self.steps += next.steps;
         self.rays += next.rays;
@@ -156,24 +164,45 @@ impl Stage for TrainSs {
             _ => 0,
         };
         let all = params.rays(epoch);
-        let progress = context.progress("training", all);
+        let members: Vec<Params> = (0..params.members).map(|index| params.member(index, all)).collect();
+        let compared = if params.pose_refinement { members[0].rays(epoch) } else { 0 };
+        let progress = context.progress("training", compared + all);
+        let data = TrainingData { input, references, views: &views, progress: &progress };
         let mut log = TrainingLog::default();
-        for index in 0..params.members {
-            let from = begun.as_ref().map(|begun| (begun.member(index), kept));
-            let member = Member::new(context, params.member(index, all), (model, from), first + index, log.rays)?;
-            log.add(member.run(input, references, &views, &progress)?);
-            progress.set(log.rays, "");
+        let mut done = compared;
+        for (index, own) in members.into_iter().enumerate() {
+            // What the first member finds of poses holds for all.
+            let own = Params { pose_refinement: own.pose_refinement && (index == 0 || moves_cameras(&log, &views)), ..own };
+            let from = begun.as_ref().map(|begun| (begun.member(index as u32), kept));
+            let before = if index == 0 { 0 } else { done };
+            let member = Member::new(context, own, (model, from), first + index as u32, before)?;
+            let trained = if index == 0 { pose_choice::train(&member, &data)? } else { member.run(&data)? };
+            trained.warnings.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
+            done += trained.rays;
+            log.add(trained);
+            progress.set(done, "");
         }
         context.write_json(FIELD_FILE, &file)?;
         context.write_json("training.json", &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
-        context.write_summary(&format!(
-            "{:.1} M rays in {} steps, {:.1} samples a ray, training PSNR {psnr:.2} dB",
-            log.rays as f64 / 1e6,
-            log.steps,
-            log.samples_per_ray
-        ))
+        let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
+        let summary = format!("{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB");
+        context.write_summary(&with_warnings(&summary, &log.warnings))
     }
+}
+
+/// Whether a training has found other poses than the given ones.
+fn moves_cameras(log: &TrainingLog, views: &Views) -> bool {
+    log.poses.iter().zip(&views.views).any(|(pose, view)| *pose != view.camera.camera_to_world)
+}
+
+/// What a training learns from, and where it says how far it is.
+#[derive(Clone, Copy)]
+pub(crate) struct TrainingData<'a> {
+    input: &'a GivenInput,
+    references: Option<&'a GivenInput>,
+    views: &'a Views,
+    progress: &'a Progress,
 }
 
 /// A field to go on from.
@@ -225,7 +254,7 @@ pub fn epoch(views: &Views, params: &Params) -> u64 {
     views.views.iter().map(pixels).sum::<u64>() * params.side().pow(2)
 }
 
-/// Photographs to train on, each with its view: over the background, or premultiplied RGBA where that is open.
+/// Photographs to train on, each with its view: premultiplied RGBA as they are read, or over the background.
 #[derive(Clone, Debug)]
 pub struct Photographs {
     /// Where they were taken from.
@@ -247,6 +276,16 @@ impl Photographs {
         let pictures = read_pictures(input, &views)?;
         Ok(Self { views, pictures })
     }
+
+    /// Over the background, but where that is open.
+    fn over_background(self) -> Self {
+        let background = self.views.background;
+        if background == scene::Background::Alpha {
+            return self;
+        }
+        let pictures = self.pictures.into_iter().map(|photograph| photograph.over(background.shown())).collect();
+        Self { pictures, ..self }
+    }
 }
 
 fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
@@ -260,8 +299,7 @@ fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<
             let message = format!("{place}: view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
             return Err(Failure::BadInput(message).into());
         }
-        let is_open = views.background == scene::Background::Alpha;
-        Ok(if is_open { photograph } else { photograph.over(views.background.shown()) })
+        Ok(photograph)
     };
     views.views.iter().map(read).collect()
 }
@@ -325,7 +363,7 @@ pub fn supervision(
         pose_refinement: params.pose_refinement,
         seed: params.seed,
     };
-    Ok(Supersampling::new(photographs, references, &options))
+    Ok(Supersampling::new(photographs.over_background(), references.map(Photographs::over_background), &options))
 }
 
 fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {

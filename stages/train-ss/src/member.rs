@@ -1,13 +1,13 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, GivenInput, Progress};
+use artifact::{Context, Failure};
+use poses::Moved;
 use radiance::{FieldFile, FieldModel};
-use scene::Views;
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
-use crate::{Begun, Params, Photographs, TrainingLog, epoch, read_hull, supervision};
+use crate::{Begun, Params, Photographs, TrainingData, TrainingLog, epoch, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
@@ -27,6 +27,10 @@ pub(crate) struct Member<'a> {
 const DONE_WEIGHTS: &str = "field.safetensors";
 const DONE_LOG: &str = "training.json";
 
+fn far_warning(moved: &Moved) -> String {
+    format!("pose refinement: cameras have {moved}, which is far: unless the given poses are that far off, train without it")
+}
+
 impl<'a> Member<'a> {
     pub(crate) fn new(
         context: &'a Context,
@@ -40,14 +44,31 @@ impl<'a> Member<'a> {
         Ok(Self { context, params, model, from, output, work, before })
     }
 
+    /// Its parameters.
+    pub(crate) fn params(&self) -> &Params {
+        &self.params
+    }
+
+    /// Where its weights go.
+    pub(crate) fn output(&self) -> &Path {
+        &self.output
+    }
+
+    /// The same with or without pose refinement, with checkpoints in a folder of its own, its weights elsewhere, and so many rays more before it.
+    pub(crate) fn variant(&self, pose_refinement: bool, name: &str, output: PathBuf, more: u64) -> Self {
+        Self {
+            context: self.context,
+            params: Params { pose_refinement, ..self.params.clone() },
+            model: self.model,
+            from: self.from.clone(),
+            output,
+            work: self.work.as_ref().map(|work| work.join(name)),
+            before: self.before + more,
+        }
+    }
+
     /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
-    pub(crate) fn run(
-        &self,
-        input: &GivenInput,
-        references: Option<&GivenInput>,
-        views: &Views,
-        progress: &Progress,
-    ) -> anyhow::Result<TrainingLog> {
+    pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.finished() {
             self.context.say("going on from a field that an earlier run has trained");
             return Ok(log);
@@ -60,7 +81,7 @@ impl<'a> Member<'a> {
             }
             // A folder each, so that a checkpoint goes on with the seed it began with.
             let work = self.work.as_ref().map(|w| if restart == 0 { w.clone() } else { w.join(format!("restart-{restart}")) });
-            match self.train(&params, work.as_deref(), (input, references), views, progress) {
+            match self.train(&params, work.as_deref(), data) {
                 Err(error) => match error.downcast_ref() {
                     Some(Collapsed(message)) => said.clone_from(message),
                     None => return Err(error),
@@ -80,17 +101,10 @@ impl<'a> Member<'a> {
     }
 
     /// Trains to the end, with checkpoints, progress and a curve.
-    fn train(
-        &self,
-        params: &Params,
-        work: Option<&Path>,
-        (input, references): (&GivenInput, Option<&GivenInput>),
-        views: &Views,
-        progress: &Progress,
-    ) -> anyhow::Result<TrainingLog> {
-        let context = self.context;
+    fn train(&self, params: &Params, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+        let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
         let most = params.references.map_or(usize::MAX, |most| most as usize);
-        let references = references.map(|input| Photographs::read_first(input, most)).transpose()?;
+        let references = data.references.map(|input| Photographs::read_first(input, most)).transpose()?;
         let mut supervision = supervision(input, params, Photographs::read(input)?, references, &|text| context.say(text))?;
         let epoch = epoch(views, params);
         let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
@@ -124,14 +138,12 @@ impl<'a> Member<'a> {
             progress.set(self.before + rays, &curve.note());
             checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
         }
-        let refined = supervision.refined_cameras();
-        if !refined.is_empty() {
-            let moved = poses::Moved::between(views.views.iter().map(|view| &view.camera).zip(refined));
-            context.say(format!("cameras have {moved}"));
-        }
+        let moved = supervision.moved(|| trainer.field())?;
+        moved.iter().for_each(|moved| context.say(format!("cameras have {moved}")));
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         log.exposures = supervision.exposures().to_vec();
-        log.poses = refined.iter().map(|camera| camera.camera_to_world).collect();
+        log.poses = supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
+        log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
         trainer.finish(&self.output)?;
         if let Some((from, Begun::Averaged)) = &self.from {
             average(self.model, views.bounds, from, &self.output).context("cannot average the weights")?;

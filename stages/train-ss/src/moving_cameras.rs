@@ -1,5 +1,5 @@
 use pixels::Picture;
-use poses::{Options, Pyramid, refine, take_back_common_motion};
+use poses::{Moved, Options, Pyramid, Step, refine, take_back_common_motion};
 use radiance::RayField;
 use scene::Camera;
 
@@ -61,6 +61,21 @@ impl MovingCameras {
         Ok(())
     }
 
+    /// How far the first `count` of them have gone, by the depth that a field shows them.
+    pub(crate) fn moved(
+        &self,
+        field: &dyn RayField,
+        count: usize,
+        background: f32,
+    ) -> Result<Moved, Box<dyn std::error::Error + Send + Sync>> {
+        let options = Options { renderings: 1, background, ..Options::default() };
+        let seen = self.now.iter().zip(&self.photographs).take(count);
+        let depths = seen.map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
+        let depths = depths.collect::<Result<Vec<_>, Box<dyn std::error::Error + Send + Sync>>>()?;
+        let steps = self.were.iter().zip(&self.now).zip(depths).map(|((from, to), depth)| Step { from, to, depth });
+        Ok(Moved::between(steps))
+    }
+
     /// All that a resumed training needs.
     pub(crate) fn bytes(&self) -> Vec<u8> {
         let poses = self.now.iter().flat_map(|camera| camera.camera_to_world.into_iter().flatten());
@@ -111,6 +126,8 @@ mod tests {
         }
         assert_eq!(count, ROUNDS);
         moving.now[1].camera_to_world[2][3] = 4.25;
+        let moved = moving.moved(&field, 2, 1.0).unwrap();
+        assert!((moved.distance - 0.125).abs() < 0.05 && moved.pixels.is_finite(), "{moved:?}");
         let mut other = new();
         let bytes = moving.bytes();
         assert_eq!(bytes.len(), other.len());

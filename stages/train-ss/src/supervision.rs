@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use pixels::{Filter, Picture, Resampling};
+use poses::Moved;
 use radiance::{Draws, Ray, RayField};
 use scene::{Background, Camera, Intrinsics, Photograph};
 use schemars::JsonSchema;
@@ -286,6 +287,16 @@ impl Supersampling {
     fn place_views(&mut self) {
         let cameras = self.moving.iter().flat_map(MovingCameras::cameras);
         self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.place(camera));
+    }
+
+    /// How far cameras of photographs have gone, where that was asked for. `field` is only made then.
+    pub(crate) fn moved<'a>(
+        &self,
+        field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
+    ) -> anyhow::Result<Option<Moved>> {
+        let Some(moving) = &self.moving else { return Ok(None) };
+        let moved = moving.moved(&*field()?, self.low, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
+        Ok(Some(moved))
     }
 
     /// Where the photographs were taken from, where that was asked for.

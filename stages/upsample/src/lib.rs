@@ -115,7 +115,7 @@ impl Stage for Upsample {
         let large = Views { hull: None, ..Views::new(views.background, views.bounds, large.collect()) };
         context.write_json(VIEWS_FILE, &large)?;
         let name = format!("{:?}", params.method).to_lowercase();
-        context.write_summary(&format!("{} views, by {name}", large.views.len()))
+        context.write_summary(&format!("{}, by {name}", artifact::counted(large.views.len(), "view")))
     }
 }
 

@@ -39,21 +39,6 @@ fn write_line(to: &mut impl Write, text: &str) {
     to.write_all(format!("{}\n", printable(text)).as_bytes()).ok();
 }
 
-/// `1 stage`, `2 stages`.
-pub fn counted(count: usize, one: &str) -> String {
-    if count == 1 { format!("1 {one}") } else { format!("{count} {one}s") }
-}
-
-/// A size as people say it: `512 bytes`, `3.9 MB`.
-pub fn sized(bytes: u64) -> String {
-    match bytes {
-        0..1_000 => counted(bytes as usize, "byte"),
-        1_000..1_000_000 => format!("{:.1} kB", bytes as f64 / 1e3),
-        1_000_000..1_000_000_000 => format!("{:.1} MB", bytes as f64 / 1e6),
-        _ => format!("{:.1} GB", bytes as f64 / 1e9),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -74,12 +59,5 @@ mod tests {
         write_line(&mut written, "a\u{1b}[31mb\nc");
         assert_eq!(written, b"a\\u{1b}[31mb\\nc\n");
         write_line(&mut Closed, "nobody hears this");
-    }
-
-    #[test]
-    fn quantities_in_words() {
-        assert_eq!([0, 1, 2].map(|n| counted(n, "stage")), ["0 stages", "1 stage", "2 stages"]);
-        let sizes = [1, 999, 1_500, 99_532_800, 2_580_000_000].map(sized);
-        assert_eq!(sizes, ["1 byte", "999 bytes", "1.5 kB", "99.5 MB", "2.6 GB"]);
     }
 }

@@ -36,6 +36,7 @@
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
+mod amounts;
 mod canonical;
 mod console;
 mod describe;
@@ -58,9 +59,11 @@ mod signals;
 mod stage;
 mod store;
 mod values;
+mod warnings;
 
+pub use amounts::{amount, counted, sized};
 pub use canonical::{canonical, hash_json};
-pub use console::{counted, print_lines, print_text, report_text, sized};
+pub use console::{print_lines, print_text, report_text};
 pub use describe::{Description, Input, Output};
 pub use device::check_device;
 pub use failure::{Failure, FailureExt, exit_code, one_line};
@@ -79,6 +82,7 @@ pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished};
+pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.
 pub fn unix_time() -> u64 {

@@ -1,4 +1,4 @@
-use crate::console::sized;
+use crate::amounts::sized;
 
 /// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
 const MARKS: [&str; 4] = ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];

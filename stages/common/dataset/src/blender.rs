@@ -1,27 +1,28 @@
 use std::path::Path;
 
-use crate::transforms::{self, Missing};
-use crate::{Dataset, DatasetError, Format, Split};
+use artifact::counted;
 
-/// Reads `transforms_train.json` and `transforms_test.json`: NeRF's synthetic scenes. A picture that isn't there is an error, and names
-/// may leave out `.png`.
+use crate::transforms::{self, Missing};
+use crate::{Dataset, DatasetError, Format, Split, is_file};
+
+/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. A picture that isn't there is an
+/// error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
-    let mut frames = Vec::new();
-    let mut split = Split::default();
-    for (name, numbers) in [("train", &mut split.train), ("test", &mut split.test)] {
-        let path = folder.join(format!("transforms_{name}.json"));
-        if !path.is_file() {
-            return Err(DatasetError::format(
-                &path,
-                "is not there; a Blender data set has transforms_train.json and transforms_test.json",
-            ));
-        }
-        let read = transforms::read_file(folder, &path, Missing::Refused)?;
-        numbers.extend(frames.len()..frames.len() + read.frames.len());
-        frames.extend(read.frames);
+    let path = folder.join("transforms_train.json");
+    let mut frames = transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;
+    let train = frames.len();
+    let path = folder.join("transforms_test.json");
+    if is_file(&path)? {
+        frames.extend(transforms::read_file(folder, &path, Missing::Refused)?.frames);
     }
-    let notes = vec![format!("Blender's form: {} training views, {} test views", split.train.len(), split.test.len())];
-    Ok(Dataset { format: Format::Blender, frames, split: Some(split), notes })
+    let (train, test) = (0..train, train..frames.len());
+    let notes = vec![if test.is_empty() {
+        format!("Blender's form: {}; none is said to be for testing", counted(train.len(), "view"))
+    } else {
+        format!("Blender's form: {}, {}", counted(train.len(), "training view"), counted(test.len(), "test view"))
+    }];
+    let split = (!test.is_empty()).then(|| Split { train: train.collect(), test: test.collect() });
+    Ok(Dataset { format: Format::Blender, frames, split, notes })
 }
 
 #[cfg(test)]
@@ -59,10 +60,69 @@ mod tests {
         assert_eq!(merged.split, None);
     }
 
+    /// Nothing says which views are for testing where there is no file of them, or none in it.
+    #[test]
+    fn there_need_be_no_test_views() {
+        let dir = folder(&with_pose("1"));
+        let test = dir.path().join("transforms_test.json");
+        std::fs::write(&test, r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap();
+        let empty = Dataset::read(dir.path()).unwrap();
+        std::fs::remove_file(&test).unwrap();
+        let missing = Dataset::read(dir.path()).unwrap();
+        assert_eq!((missing.frames.len(), &missing.split), (1, &None));
+        assert_eq!(missing, empty);
+        assert_eq!(missing.notes, ["Blender's form: 1 view; none is said to be for testing"]);
+        assert_eq!(missing.clone().merged(), missing);
+        std::fs::create_dir(&test).unwrap();
+        let message = Dataset::read(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("transforms_test.json is a folder, not a file"), "{message}");
+    }
+
+    #[test]
+    fn text_may_have_a_mark_and_other_line_ends() {
+        let json = with_pose("1").replace(", ", ",\r\n");
+        let dir = folder(&format!("\u{feff}{json}"));
+        assert_eq!(Dataset::read(dir.path()).unwrap(), {
+            std::fs::write(dir.path().join("transforms_train.json"), with_pose("1")).unwrap();
+            Dataset::read(dir.path()).unwrap()
+        });
+    }
+
+    #[test]
+    fn what_stands_where_a_picture_should_be_is_named() {
+        let dir = folder(&with_pose("1"));
+        let picture = dir.path().join("train/r_0.png");
+        std::fs::remove_file(&picture).unwrap();
+        let message = || Dataset::read(dir.path()).unwrap_err().to_string();
+        assert!(message().ends_with("r_0.png is not there; remove the frame or restore the file"), "{}", message());
+        std::os::unix::fs::symlink("r_0.png", &picture).unwrap();
+        assert!(message().contains("r_0.png is a symbolic link that leads nowhere"), "{}", message());
+        std::fs::remove_file(&picture).unwrap();
+        std::fs::create_dir(&picture).unwrap();
+        assert!(message().contains("r_0.png is a folder, not a picture"), "{}", message());
+    }
+
+    /// Whatever a frame is called, a message stays on its line and moves no cursor.
+    #[test]
+    fn names_are_printed_without_control_characters() {
+        let title = r"\u001b]0;PWN\u0007\n";
+        let dir = folder(&with_pose("1").replace("r_0", title));
+        let message = Dataset::read(dir.path()).unwrap_err().to_string();
+        assert!(!message.contains(char::is_control) && message.contains(r"(./train/\u{1b}]0;PWN\u{7}\n)"), "{message}");
+        write_png(&dir.path().join("train/\u{1b}]0;PWN\u{7}\n.png"), 10, 6);
+        assert_eq!(Dataset::read(dir.path()).unwrap().frames[0].name, "_]0;PWN__");
+    }
+
     #[test]
     fn bad_ones_are_named() {
         for (json, words) in [
             (with_pose("NaN"), "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is NaN"),
+            (with_pose("Infinity"), "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is infinite"),
+            (with_pose("-Infinity"), "camera_to_world[0][0] is infinite"),
+            (with_pose("-1"), "transform_matrix: camera_to_world is a reflection"),
+            (with_pose("1").replace("1,4]", "1,1e30]"), "transform_matrix: the camera's centre (0e0, 0e0, 1e30)"),
+            (with_pose("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
+            (format!("\u{feff}\u{feff}{}", with_pose("1")), "line 1"),
             (with_pose("2"), "no rigid motion"),
             (with_pose("1").replace("0.7", "0"), "focal length inf"),
             (with_pose("1").replace("0.7", "3.2"), "between 0 and π"),

@@ -66,7 +66,9 @@ impl<'a> Bytes<'a> {
             return Err(self.error(format!("{what} doesn't end")));
         };
         let bytes = &self.take(end + 1, what)?[..end];
-        std::str::from_utf8(bytes).map_err(|_| self.error(format!("{what} is not UTF-8")))
+        std::str::from_utf8(bytes).map_err(|_| {
+            self.error(format!("{what}, {}, is not UTF-8; rename the file, and make the model again", bytes.escape_ascii()))
+        })
     }
 
     pub(crate) fn is_empty(&self) -> bool {

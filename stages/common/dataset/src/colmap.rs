@@ -1,14 +1,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use artifact::relative_path;
+use artifact::{counted, relative_path};
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 
 use crate::bytes::Bytes;
+use crate::found::{Found, find, shown};
 use crate::frame::{names, pose_from_world_to_camera};
 use crate::photograph::{fitted, look};
-use crate::{Dataset, DatasetError, Format, Frame, read_text};
+use crate::text::read_text;
+use crate::{Dataset, DatasetError, Format, Frame};
 
 /// A reconstruction as COLMAP writes it (its documentation, "Output format").
 #[derive(Debug, Default)]
@@ -70,8 +72,11 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
     let list = path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
     // By name: the order in which COLMAP happened to register them means nothing.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
-    let mut notes =
-        vec![format!("COLMAP: {} photographs of {}", model.images.len(), path.strip_prefix(folder).unwrap_or(path).display())];
+    let mut notes = vec![format!(
+        "COLMAP: {} of {}",
+        counted(model.images.len(), "photograph"),
+        path.strip_prefix(folder).unwrap_or(path).display()
+    )];
     if models.len() > 1 {
         notes.push(format!("of {} models the one with most images is taken: {}", models.len(), sizes.join(", ")));
     }
@@ -80,16 +85,20 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
     for (index, image) in model.images.iter().enumerate() {
         let of_frame = |reason: String| DatasetError::Frame { path: list.clone(), index, file: image.name.clone(), reason };
         let file = relative_path(&image.name).map_err(of_frame)?;
-        if !pictures.join(&file).is_file() {
-            missing.push(&image.name);
-            continue;
+        match find(&pictures.join(&file), "a picture") {
+            Found::File => {}
+            Found::Nothing(_) => {
+                missing.push(&image.name);
+                continue;
+            }
+            Found::Other(reason) => return Err(of_frame(format!("{reason}; put the photograph there"))),
         }
         frames.push(model.frame(image, pictures.join(&file)).map_err(of_frame)?);
         files.push(file);
     }
     if frames.is_empty() {
         let reason = match missing.first() {
-            Some(first) => format!("not one of its {} pictures is in {}, first {first}", missing.len(), pictures.display()),
+            Some(first) => format!("not one of its {} pictures is in {}, first {first}", missing.len(), shown(&pictures)),
             None => "it has no images; at least one is needed".to_owned(),
         };
         return Err(DatasetError::format(&list, reason));
@@ -437,6 +446,24 @@ mod tests {
         assert!((a.camera_to_world[0][3] - 1.0).abs() < 1e-12 && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12);
     }
 
+    /// As an editor on Windows leaves them.
+    #[test]
+    fn text_may_have_a_mark_and_other_line_ends() {
+        let changed = [CAMERAS, IMAGES, POINTS].map(|text| format!("\u{feff}{}", text.replace('\n', "\r\n")));
+        let (plain, other) = (
+            folder("sparse/0", &text(CAMERAS, IMAGES, POINTS)),
+            folder("sparse/0", &text(&changed[0], &changed[1], &changed[2])),
+        );
+        let poses = |dir: &tempfile::TempDir| -> Vec<_> {
+            let frames = Dataset::read(dir.path()).unwrap().frames;
+            frames.into_iter().map(|f| (f.name, f.taken_with, f.camera_to_world, f.depths)).collect()
+        };
+        assert_eq!(poses(&plain), poses(&other));
+        let latin = folder("sparse/0", &[("cameras.txt", CAMERAS.as_bytes()), ("images.txt", b"1 1 0 0 0 0 0 3 1 \xe4.png\n\n")]);
+        let message = Dataset::read(latin.path()).unwrap_err().to_string();
+        assert!(message.contains(r"images.txt: line 1: \xe4.png is not UTF-8"), "{message}");
+    }
+
     #[test]
     fn the_largest_model_is_taken_and_said() {
         let small = "1 1 0 0 0 0 0 3 1 a.png\n\n";
@@ -476,6 +503,8 @@ mod tests {
         }
         let gone = reads(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
         assert!(gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"), "{:?}", gone.notes);
+        let forged = reads(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
+        assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
         let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
         assert!(none.contains("not one of its 2 pictures"), "{none}");
         assert!(reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images"));

@@ -5,6 +5,7 @@ use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics};
 
 use crate::DatasetError;
+use crate::found::shown;
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]
@@ -66,10 +67,11 @@ pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> 
 /// Names for pictures, by their paths inside the data set: the files' names alone where those differ, else with their folders.
 pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
     let text = |index: usize, part: Option<&std::ffi::OsStr>| {
-        part.and_then(|p| p.to_str()).map(str::to_owned).ok_or_else(|| DatasetError::Frame {
+        // Names become files' names and are printed everywhere: no control characters.
+        part.and_then(|p| p.to_str()).map(|name| name.replace(char::is_control, "_")).ok_or_else(|| DatasetError::Frame {
             path: list.to_path_buf(),
             index,
-            file: paths[index].display().to_string(),
+            file: shown(&paths[index]),
             reason: "its name is not UTF-8; rename the file".to_owned(),
         })
     };
@@ -89,7 +91,7 @@ pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, Datas
         Some(index) => Err(DatasetError::Frame {
             path: list.to_path_buf(),
             index,
-            file: paths[index].display().to_string(),
+            file: shown(&paths[index]),
             reason: format!("a second view named {:?}; file names must differ", short[index]),
         }),
     }
@@ -111,6 +113,11 @@ mod tests {
         assert_eq!(of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
         assert_eq!(of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
         assert!(of(&["x/a.jpg", "x/a.png"]).unwrap_err().to_string().contains("frame 1 (x/a.png): a second view named \"a\""));
+        assert_eq!(of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
+        assert!(of(&["a\n.png", "a\t.png"]).unwrap_err().to_string().contains("frame 1 (a\\t.png): a second view named \"a_\""));
+        let odd = std::os::unix::ffi::OsStrExt::from_bytes(b"images/\xff\xfe.png");
+        let message = names("list".as_ref(), &[PathBuf::from(<&std::ffi::OsStr>::from(odd))]).unwrap_err().to_string();
+        assert_eq!(message, "list: frame 0 (images/\\xFF\\xFE.png): its name is not UTF-8; rename the file");
     }
 
     /// A point in front of an OpenCV camera is seen by ours at the same pixel.

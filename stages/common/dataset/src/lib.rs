@@ -1,6 +1,6 @@
 //! Posed photographs as folders have them. The form is found by looking: [`Dataset::read`] takes
 //!
-//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json` and `transforms_test.json`, one angle for all, PNG;
+//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json`, `transforms_test.json` if there are test views, one angle for all, PNG;
 //! * **transforms** (instant-ngp, nerfstudio): `transforms.json`, intrinsics for all or for each, lens distortion, masks;
 //! * **LLFF**: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …);
 //! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
@@ -22,16 +22,22 @@
 mod blender;
 mod bytes;
 mod colmap;
+mod found;
 mod frame;
 mod llff;
+mod number;
 mod photograph;
 mod split;
+mod text;
 mod transforms;
 
 use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use artifact::{counted, printable};
+
+use found::{Found, find, shown};
 pub use frame::Frame;
 pub use split::Split;
 
@@ -51,7 +57,7 @@ pub struct Dataset {
 /// Forms of folders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// `transforms_train.json` and `transforms_test.json`.
+    /// `transforms_train.json`, and `transforms_test.json` where some views are for testing.
     Blender,
     /// `transforms.json`.
     Transforms,
@@ -77,23 +83,30 @@ impl fmt::Display for Format {
 pub enum DatasetError {
     /// The folder has none of the forms.
     #[error(
-        "{path}: no data set; expected transforms_train.json and transforms_test.json (Blender), transforms.json (instant-ngp, \
-         nerfstudio), poses_bounds.npy (LLFF), or sparse/0 (COLMAP)"
+        "{}: no data set; expected transforms_train.json (Blender), transforms.json (instant-ngp, nerfstudio), poses_bounds.npy \
+         (LLFF), or sparse/0 (COLMAP)",
+        shown(path)
     )]
     Unknown {
         /// The folder.
         path: PathBuf,
     },
     /// A file can't be read.
-    #[error("{path}: {source}")]
+    #[error("{}: {source}", shown(path))]
     Io {
         /// The file.
         path: PathBuf,
         /// Why.
         source: io::Error,
     },
+    /// A file can't be where something else stands.
+    #[error("{reason}")]
+    Place {
+        /// What stands where, and what was expected.
+        reason: String,
+    },
     /// A file isn't of its form.
-    #[error("{path}: {reason}")]
+    #[error("{}: {}", shown(path), printable(reason))]
     Format {
         /// The file.
         path: PathBuf,
@@ -101,7 +114,7 @@ pub enum DatasetError {
         reason: String,
     },
     /// Something about one frame.
-    #[error("{path}: frame {index} ({file}): {reason}")]
+    #[error("{}: frame {index} ({}): {}", shown(path), printable(file), printable(reason))]
     Frame {
         /// The file that lists the frames.
         path: PathBuf,
@@ -113,8 +126,15 @@ pub enum DatasetError {
         reason: String,
     },
     /// A picture that can't be read.
-    #[error(transparent)]
-    Pixels(#[from] pixels::PixelError),
+    #[error("{}", printable(&.0.to_string()))]
+    Pixels(pixels::PixelError),
+}
+
+// Not its source: whoever prints a chain of errors would print a file's name as it is.
+impl From<pixels::PixelError> for DatasetError {
+    fn from(error: pixels::PixelError) -> Self {
+        Self::Pixels(error)
+    }
 }
 
 impl DatasetError {
@@ -126,13 +146,12 @@ impl DatasetError {
 impl Dataset {
     /// Reads a folder, whichever form it has. Pictures are looked at for their size alone.
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
-        let has = |name: &str| folder.join(name).is_file();
         // The most explicit form first: a folder often has what its poses were made from, too.
-        let mut set = if has("transforms_train.json") {
+        let mut set = if is_file(&folder.join("transforms_train.json"))? {
             blender::read(folder)?
-        } else if has("transforms.json") {
+        } else if is_file(&folder.join("transforms.json"))? {
             transforms::read(folder)?
-        } else if has("poses_bounds.npy") {
+        } else if is_file(&folder.join("poses_bounds.npy"))? {
             llff::read(folder)?
         } else if let Some(models) = colmap::models(folder) {
             colmap::read(folder, &models)?
@@ -140,6 +159,9 @@ impl Dataset {
             return Err(DatasetError::Unknown { path: folder.to_path_buf() });
         };
         set.note_what_is_special();
+        for note in &mut set.notes {
+            *note = printable(note).into_owned();
+        }
         Ok(set)
     }
 
@@ -174,7 +196,7 @@ impl Dataset {
             frame.pinhole = Some(pinhole);
         }
         if undone > 0 {
-            self.notes.push(format!("lens distortion of {undone} photographs is undone"));
+            self.notes.push(format!("lens distortion of {} is undone", counted(undone, "photograph")));
         }
         Ok(self)
     }
@@ -188,7 +210,7 @@ impl Dataset {
             ignored += 1;
         }
         if ignored > 0 {
-            self.notes.push(format!("lens distortion of {ignored} photographs is ignored"));
+            self.notes.push(format!("lens distortion of {} is ignored", counted(ignored, "photograph")));
         }
         self
     }
@@ -200,10 +222,12 @@ impl Dataset {
         let size = |f: &Frame| (f.taken_with.width, f.taken_with.height);
         let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
         if distorted > 0 {
-            self.notes.push(format!("{distorted} photographs have lens distortion"));
+            let have = if distorted == 1 { "has" } else { "have" };
+            self.notes.push(format!("{} {have} lens distortion", counted(distorted, "photograph")));
         }
         if turned > 0 {
-            self.notes.push(format!("{turned} photographs are turned upright, as their EXIF data ask"));
+            let are = if turned == 1 { "is" } else { "are" };
+            self.notes.push(format!("{} {are} turned upright, as EXIF data ask", counted(turned, "photograph")));
         }
         if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
             let text = |(w, h): &(u32, u32)| format!("{w}×{h}");
@@ -212,7 +236,11 @@ impl Dataset {
     }
 }
 
-/// A whole text file.
-fn read_text(path: &Path) -> Result<String, DatasetError> {
-    std::fs::read_to_string(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })
+/// Whether a file is there; something else in its place is refused.
+fn is_file(path: &Path) -> Result<bool, DatasetError> {
+    match find(path, "a file") {
+        Found::File => Ok(true),
+        Found::Nothing(_) => Ok(false),
+        Found::Other(reason) => Err(DatasetError::Place { reason }),
+    }
 }

@@ -1,11 +1,13 @@
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
+use artifact::counted;
 use glam::DVec3;
 use scene::{Distortion, Intrinsics};
 
+use crate::found::{Found, find};
 use crate::frame::{names, pose};
-use crate::photograph::{Stored, fitted, is_picture, look};
+use crate::photograph::{Stored, fitted, is_picture_name, look};
 use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal length), near and far.
@@ -29,7 +31,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
             .and_then(|frame| frame.check().map(|()| frame).map_err(|e| e.to_string()));
         frames.push(frame.map_err(of_frame)?);
     }
-    let mut notes = vec![format!("LLFF (poses_bounds.npy): {} photographs from {from}", frames.len())];
+    let mut notes = vec![format!("LLFF (poses_bounds.npy): {} from {from}", counted(frames.len(), "photograph"))];
     notes.extend(note);
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
@@ -85,19 +87,34 @@ fn frame(row: &[f64; NUMBERS], distortion: Distortion, stored: Stored, name: Str
     })
 }
 
+/// Pictures of a folder by name, and what is named like one but can't be read, in words.
+fn pictures_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
+    let named = std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_picture_name(p));
+    let mut named: Vec<PathBuf> = named.collect();
+    named.sort();
+    let mut odd = None;
+    named.retain(|path| match find(path, "a picture") {
+        Found::File => true,
+        Found::Nothing(reason) | Found::Other(reason) => {
+            odd.get_or_insert(reason);
+            false
+        }
+    });
+    Some((named, odd))
+}
+
 /// All pictures of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
 fn pictures(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
     let mut folders = vec!["images".to_owned()];
     folders.extend((2..=64).map(|n| format!("images_{n}")));
     let mut seen = Vec::new();
     for name in folders {
-        let Ok(entries) = std::fs::read_dir(folder.join(&name)) else { continue };
-        let mut files: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| is_picture(p)).collect();
-        files.sort();
+        let Some((files, odd)) = pictures_of(&folder.join(&name)) else { continue };
         if files.len() == count {
             return Ok((files, name));
         }
-        seen.push(format!("{name} has {}", files.len()));
+        let odd = odd.map(|reason| format!(" ({reason})")).unwrap_or_default();
+        seen.push(format!("{name} has {}{odd}", files.len()));
     }
     let seen = if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
     Err(format!("{count} poses, but {seen}; pictures and poses must be as many"))
@@ -208,7 +225,7 @@ mod tests {
         cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
         assert_eq!(
             distortion(),
-            (0.02, "LLFF (poses_bounds.npy): 1 photographs from images; 1 photographs have lens distortion".into())
+            (0.02, "LLFF (poses_bounds.npy): 1 photograph from images; 1 photograph has lens distortion".into())
         );
         for (text, words) in [
             ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "another focal length"),
@@ -241,6 +258,13 @@ mod tests {
             let message = Dataset::read(folder(&bytes, &[("images", images)]).path()).unwrap_err().to_string();
             assert!(message.contains(words) && message.contains("poses_bounds.npy"), "{message}");
         }
+        let dir = folder(&npy(&[ROW, ROW]), &[("images", 1)]);
+        std::fs::create_dir(dir.path().join("images/IMG_9.png")).unwrap();
+        let message = Dataset::read(dir.path()).unwrap_err().to_string();
+        assert!(
+            message.contains("2 poses, but images has 1 (") && message.contains("IMG_9.png is a folder, not a picture)"),
+            "{message}"
+        );
         // A header that claims more than there is.
         let mut claimed = npy(&[ROW]);
         let place = claimed.windows(7).position(|w| w == b"(1, 17)").unwrap();

@@ -10,9 +10,9 @@ use scene::Intrinsics;
 use crate::{DatasetError, Frame};
 
 /// Whether a file's name is that of a picture.
-pub(crate) fn is_picture(path: &Path) -> bool {
+pub(crate) fn is_picture_name(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
-    path.is_file() && matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
+    matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
 }
 
 pub(crate) fn is_exr(path: &Path) -> bool {
@@ -50,8 +50,12 @@ pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
     }
     let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
     let (width, height) = decoder.dimensions();
-    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 || width == 0 || height == 0 {
+    if width == 0 || height == 0 {
         return Err(format(format!("{width}×{height} pixels")));
+    }
+    if u64::from(width) * u64::from(height) > MAX_PIXELS as u64 {
+        let (width, height) = (width as usize, height as usize);
+        return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
     }
     Ok(Stored { size: (width, height), is_sideways: decoder.orientation().is_ok_and(is_sideways) })
 }
@@ -187,6 +191,17 @@ pub(crate) mod tests {
             std::fs::write(&path, &bytes[..end]).unwrap();
             drop(super::read(&path, false));
         }
+        // What its header says is looked at before anything is allocated, and the limit is said.
+        let mut huge = bytes.clone();
+        let frame = huge.windows(2).position(|marker| marker == b"\xff\xc0").unwrap();
+        huge[frame + 5..frame + 9].copy_from_slice(&[20_000u16.to_be_bytes(), 20_000u16.to_be_bytes()].concat());
+        std::fs::write(&path, &huge).unwrap();
+        let message = look(&path).unwrap_err().to_string();
+        assert!(
+            message
+                .ends_with("20000×20000 pixels; at most 268435456 are read (16384×16384, for example): make the picture smaller"),
+            "{message}"
+        );
         // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's shape says so, else left alone.
         let mut turned = bytes[..2].to_vec();
         turned.extend(b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0");

@@ -1,12 +1,15 @@
 use std::path::{Path, PathBuf};
 
-use artifact::relative_path;
+use artifact::{counted, relative_path};
 use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
+use crate::found::{Found, find};
 use crate::frame::names;
+use crate::number::{Number, words_as_text};
 use crate::photograph::{Stored, fitted, is_exr, look};
-use crate::{Dataset, DatasetError, Format, Frame, Split, read_text};
+use crate::text::read_text;
+use crate::{Dataset, DatasetError, Format, Frame, Split};
 
 /// `transforms.json`. What a frame doesn't say for itself holds for all.
 #[derive(Deserialize)]
@@ -23,20 +26,20 @@ struct Transforms {
 #[derive(Clone, Default, Deserialize)]
 struct LensEntry {
     camera_model: Option<String>,
-    camera_angle_x: Option<f64>,
-    camera_angle_y: Option<f64>,
-    fl_x: Option<f64>,
-    fl_y: Option<f64>,
-    cx: Option<f64>,
-    cy: Option<f64>,
-    w: Option<f64>,
-    h: Option<f64>,
-    k1: Option<f64>,
-    k2: Option<f64>,
-    k3: Option<f64>,
-    k4: Option<f64>,
-    p1: Option<f64>,
-    p2: Option<f64>,
+    camera_angle_x: Option<Number>,
+    camera_angle_y: Option<Number>,
+    fl_x: Option<Number>,
+    fl_y: Option<Number>,
+    cx: Option<Number>,
+    cy: Option<Number>,
+    w: Option<Number>,
+    h: Option<Number>,
+    k1: Option<Number>,
+    k2: Option<Number>,
+    k3: Option<Number>,
+    k4: Option<Number>,
+    p1: Option<Number>,
+    p2: Option<Number>,
     is_fisheye: Option<bool>,
 }
 
@@ -45,8 +48,8 @@ struct FrameEntry {
     file_path: String,
     mask_path: Option<String>,
     depth_file_path: Option<String>,
-    /// `None` is a NaN: Python writes them, JSON has none.
-    transform_matrix: Vec<Vec<Option<f64>>>,
+    /// `None` is `null`: what some programs write for a NaN.
+    transform_matrix: Vec<Vec<Option<Number>>>,
     #[serde(flatten)]
     own: LensEntry,
 }
@@ -71,44 +74,54 @@ pub(crate) struct Read {
 /// Reads `transforms.json`: instant-ngp's form and nerfstudio's.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("transforms.json");
-    let Read { frames, missing, split } = read_file(folder, &path, Missing::LeftOut)?;
-    let mut notes = vec![format!("transforms.json (instant-ngp, nerfstudio): {} photographs", frames.len())];
+    let Read { frames, missing, split } = read_file(folder, &path, Missing::LeftOut)?.not_empty(&path)?;
+    let mut notes = vec![format!("transforms.json (instant-ngp, nerfstudio): {}", counted(frames.len(), "photograph"))];
     if let (Some(first), count) = missing {
         notes.push(format!("{count} of {} frames have no picture and are left out, first {first}", frames.len() + count));
     }
     let masked = frames.iter().filter(|f| f.mask.is_some()).count();
     if masked > 0 {
-        notes.push(format!("{masked} frames have a mask: what is black there is neither trained on nor scored"));
+        let have = if masked == 1 { "has" } else { "have" };
+        notes.push(format!("{} {have} a mask: what is black there is neither trained on nor scored", counted(masked, "frame")));
     }
     Ok(Dataset { format: Format::Transforms, frames, split, notes })
 }
 
-/// Reads a file of frames.
+impl Read {
+    /// Refuses a file without frames.
+    pub(crate) fn not_empty(self, path: &Path) -> Result<Self, DatasetError> {
+        if self.frames.is_empty() {
+            return Err(DatasetError::format(path, "`frames` is empty; at least one view is needed"));
+        }
+        Ok(self)
+    }
+}
+
+/// Reads a file of frames; there may be none.
 pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Result<Read, DatasetError> {
     let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e.to_string()))?;
-    if transforms.frames.is_empty() {
-        return Err(DatasetError::format(path, "`frames` is empty; at least one view is needed"));
-    }
     let (mut frames, mut files) = (Vec::new(), Vec::new());
     let (mut first_missing, mut missing) = (None, 0);
     for (index, entry) in transforms.frames.iter().enumerate() {
         let of_frame =
             |reason: String| DatasetError::Frame { path: path.to_path_buf(), index, file: entry.file_path.clone(), reason };
         let file = picture_file(folder, &entry.file_path).map_err(of_frame)?;
-        if !folder.join(&file).is_file() {
-            if on_missing == Missing::Refused {
-                let shown = folder.join(&file).display().to_string();
-                return Err(of_frame(format!("{shown} is not there; remove the frame or restore the file")));
+        match find(&folder.join(&file), "a picture") {
+            Found::File => {}
+            Found::Nothing(reason) if on_missing == Missing::Refused => {
+                return Err(of_frame(format!("{reason}; remove the frame or restore the file")));
             }
-            first_missing.get_or_insert_with(|| entry.file_path.clone());
-            missing += 1;
-            continue;
+            Found::Nothing(_) => {
+                first_missing.get_or_insert_with(|| entry.file_path.clone());
+                missing += 1;
+                continue;
+            }
+            Found::Other(reason) => return Err(of_frame(format!("{reason}; remove the frame or name its picture"))),
         }
         frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
         files.push(file);
     }
-    if frames.is_empty() {
-        let first = first_missing.unwrap_or_default();
+    if let Some(first) = first_missing.as_ref().filter(|_| frames.is_empty()) {
         return Err(DatasetError::format(path, format!("not one of its {missing} pictures is there, first {first}")));
     }
     for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
@@ -129,15 +142,11 @@ fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
     (!train.is_empty() && !test.is_empty()).then_some(Split { train, test })
 }
 
-/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those become `null`, so that the frame can be named.
+/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers, so that the frame can be named.
 fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
-    serde_json::from_str(text).or_else(|error| {
-        if text.contains("NaN") || text.contains("Infinity") {
-            let readable = text.replace("-Infinity", "null").replace("Infinity", "null").replace("NaN", "null");
-            serde_json::from_str(&readable).map_err(|_| error)
-        } else {
-            Err(error)
-        }
+    serde_json::from_str(text).or_else(|error| match words_as_text(text) {
+        Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
+        None => Err(error),
     })
 }
 
@@ -161,17 +170,16 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
     }
     for (row, values) in camera_to_world.iter_mut().enumerate() {
         for (column, value) in values.iter_mut().enumerate() {
-            *value = matrix[row][column].unwrap_or(f64::NAN);
+            *value = matrix[row][column].map_or(f64::NAN, |number| number.0);
         }
     }
     let image = folder.join(file);
     let beside = |text: &Option<String>| -> Result<Option<PathBuf>, String> {
         let Some(text) = text else { return Ok(None) };
         let path = folder.join(relative_path(text)?);
-        if path.is_file() {
-            Ok(Some(path))
-        } else {
-            Err(format!("{} is not there; remove the entry or restore the file", path.display()))
+        match find(&path, "a picture") {
+            Found::File => Ok(Some(path)),
+            Found::Nothing(reason) | Found::Other(reason) => Err(format!("{reason}; remove the entry or restore the file")),
         }
     };
     let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
@@ -182,8 +190,8 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
         Frame { name: String::new(), image, turned, mask, depth, taken_with, pinhole: None, camera_to_world, depths: None };
     match frame.check() {
         Ok(()) => Ok(frame),
-        Err(e @ (CameraError::NotFinite { .. } | CameraError::NotRigid { .. })) => Err(format!("transform_matrix: {e}")),
-        Err(e) => Err(e.to_string()),
+        Err(e @ (CameraError::Intrinsics { .. } | CameraError::Distortion(_) | CameraError::Empty { .. })) => Err(e.to_string()),
+        Err(e) => Err(format!("transform_matrix: {e}")),
     }
 }
 
@@ -203,22 +211,22 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
     if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model) {
         return Err(format!("camera_model {model:?} is not supported; undistort the pictures first (colmap image_undistorter)"));
     }
-    if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k != 0.0) {
+    if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k.0 != 0.0) {
         return Err("fisheye lenses are not supported; undistort the pictures first".to_owned());
     }
     // The size that the numbers are for; the stored picture may be a smaller copy.
-    let whole = |value: Option<f64>, name: &str, stored: u32| match value {
+    let whole = |value: Option<Number>, name: &str, stored: u32| match value {
         None => Ok(stored),
-        Some(v) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(v) => Err(format!("{name} is {v}; a picture has at least one pixel")),
+        Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
+        Some(Number(v)) => Err(format!("{name} is {v}; a picture has at least one pixel")),
     };
     let (width, height) = (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
-    let focal = |length: Option<f64>, angle: Option<f64>, name: &str, size: u32| match (length, angle) {
-        (Some(length), _) => Ok(Some(length)),
-        (None, Some(angle)) if angle > 0.0 && angle < std::f64::consts::PI => {
+    let focal = |length: Option<Number>, angle: Option<Number>, name: &str, size: u32| match (length, angle) {
+        (Some(Number(length)), _) => Ok(Some(length)),
+        (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
             Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
         }
-        (None, Some(angle)) => {
+        (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
             Err(format!("{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"))
         }
@@ -229,10 +237,11 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
         return Err("no focal length: neither fl_x nor camera_angle_x is given".to_owned());
     };
-    let (cx, cy) = (entry.cx.unwrap_or(0.5 * f64::from(width)), entry.cy.unwrap_or(0.5 * f64::from(height)));
+    let or = |number: Option<Number>, otherwise: f64| number.map_or(otherwise, |number| number.0);
+    let (cx, cy) = (or(entry.cx, 0.5 * f64::from(width)), or(entry.cy, 0.5 * f64::from(height)));
     let distortion = Distortion {
-        radial: [entry.k1, entry.k2, entry.k3].map(Option::unwrap_or_default),
-        tangential: [entry.p1, entry.p2].map(Option::unwrap_or_default),
+        radial: [entry.k1, entry.k2, entry.k3].map(|k| or(k, 0.0)),
+        tangential: [entry.p1, entry.p2].map(|p| or(p, 0.0)),
     };
     fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)
 }

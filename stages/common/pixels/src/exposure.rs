@@ -48,11 +48,12 @@ impl Exposure {
         self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1) && self.offset.iter().all(|o| o.abs() <= 0.05)
     }
 
-    /// Gives a picture the right exposure: colours in 0..1.
+    /// Gives a picture the right exposure: colours in 0..1, or from 0 to alpha where they are premultiplied.
     pub fn take_back(&self, picture: &mut Picture) {
         for pixel in picture.data.chunks_exact_mut(picture.channels) {
+            let alpha = if let [_, _, _, alpha] = pixel { *alpha } else { 1.0 };
             for (c, value) in pixel.iter_mut().take(3).enumerate() {
-                *value = ((*value - self.offset[c]) / self.gain[c]).clamp(0.0, 1.0);
+                *value = ((*value - self.offset[c] * alpha) / self.gain[c]).clamp(0.0, alpha.max(0.0));
             }
         }
     }

@@ -172,8 +172,9 @@ fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
 /// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any view has is refused.
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
     let meta = exr::meta::MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
-    if meta.headers.iter().any(|h| h.layer_size.area() > MAX_PIXELS) {
-        return Err(format(path, "its header asks for more pixels than any view has"));
+    if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
+        let (width, height) = (header.layer_size.width(), header.layer_size.height());
+        return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
     }
     let first = meta.headers.first().ok_or_else(|| format(path, "it has no layer"))?;
     Ok((first.layer_size.width(), first.layer_size.height()))

@@ -69,6 +69,18 @@ pub enum PixelError {
         /// What is wrong.
         reason: String,
     },
+    /// A picture that is larger than any that is read.
+    #[error(
+        "{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for example): make the picture smaller"
+    )]
+    TooLarge {
+        /// The file.
+        path: PathBuf,
+        /// Columns.
+        width: usize,
+        /// Rows.
+        height: usize,
+    },
     /// A sample that isn't finite was about to be written.
     #[error("{path}: channel {channel} holds {value} at pixel ({x}, {y}); nothing was written")]
     NotFinite {

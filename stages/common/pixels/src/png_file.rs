@@ -12,7 +12,8 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    let image = reader.decode().map_err(|e| format(format!("not a whole PNG ({e})")))?.into_rgba8();
+    let image =
+        reader.decode().map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?.into_rgba8();
     let (width, height) = (image.width() as usize, image.height() as usize);
     Ok(Rgba8::new(width, height, image.into_raw()))
 }

@@ -22,7 +22,7 @@
 //! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
 //! let photograph = Picture::new(16, 16, 3, vec![0.5; 16 * 16 * 3]);
 //! let pyramid = Pyramid::new(&photograph, 2);
-//! let Refinement { camera: found, before, after } = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
+//! let Refinement { camera: found, before, after, .. } = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
 //! // A grey wall says nothing of where it was seen from.
 //! assert!(found == camera && before == after);
 //! ```
@@ -137,6 +137,8 @@ pub struct Refinement {
     pub before: f64,
     /// The same where it is.
     pub after: f64,
+    /// Middle depth of what is seen from where it is, in scene units; none where nothing is.
+    pub depth: Option<f64>,
 }
 
 /// Moves a camera, whose intrinsics have any size, to where a pyramid's level is met best. It stays where that says too little, and never ends
@@ -162,7 +164,7 @@ pub fn refine(
             damping *= 16.0;
         }
     }
-    Ok(Refinement { camera: best, before, after: equations.error })
+    Ok(Refinement { camera: best, before, after: equations.error, depth: equations.depth })
 }
 
 /// Damping of the first step, as a share of the equations' own diagonal.
@@ -177,7 +179,9 @@ const THIN: f32 = 0.02;
 struct Equations {
     matrix: Matrix6<f64>,
     right: Vector6<f64>,
-    /// Unit of translation: the middle distance of what is seen, so that turning and moving weigh alike.
+    /// Middle depth of what is seen, where anything is.
+    depth: Option<f64>,
+    /// Unit of translation: that depth, so that turning and moving weigh alike.
     unit: f64,
     error: f64,
     pixels: usize,
@@ -206,8 +210,9 @@ impl Equations {
             .collect();
         let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();
         sorted.sort_unstable_by(f64::total_cmp);
-        let unit = sorted.get(sorted.len() / 2).copied().unwrap_or(1.0);
-        let mut sums = Self { matrix: Matrix6::zeros(), right: Vector6::zeros(), unit, error: 0.0, pixels: 0 };
+        let depth = sorted.get(sorted.len() / 2).copied();
+        let unit = depth.unwrap_or(1.0);
+        let mut sums = Self { matrix: Matrix6::zeros(), right: Vector6::zeros(), depth, unit, error: 0.0, pixels: 0 };
         for ((pixel, seen), depth) in level.telling.iter().zip(&rendered).zip(&depths) {
             let errors = [0, 1, 2].map(|c| f64::from(pixel.colour[c] * options.exposure[c] - seen.colour[c]));
             sums.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
@@ -295,6 +300,17 @@ fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
     Camera { camera_to_world: [row(0), row(1), row(2)], ..camera.clone() }
 }
 
+/// A camera before and after.
+#[derive(Clone, Copy, Debug)]
+pub struct Step<'a> {
+    /// Where it was; its pixels are the photograph's.
+    pub from: &'a Camera,
+    /// Where it is.
+    pub to: &'a Camera,
+    /// Middle depth of what it sees, in scene units, where anything is known of it.
+    pub depth: Option<f64>,
+}
+
 /// How far cameras have moved, in the mean.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Moved {
@@ -302,25 +318,39 @@ pub struct Moved {
     pub angle: f64,
     /// Distance of their centres from where they were, in scene units.
     pub distance: f64,
+    /// How far that moves what they see across their photographs, in pixels.
+    pub pixels: f64,
 }
 
+/// Poses that are known at all are commonly right to within these.
+const FAR_TURN: f64 = 1.0;
+const FAR_PIXELS: f64 = 3.0;
+
 impl Moved {
-    /// From the first to the second of each pair.
-    pub fn between<'a>(pairs: impl Iterator<Item = (&'a Camera, &'a Camera)>) -> Self {
-        let (mut count, mut sum) = (0.0f64, Self { angle: 0.0, distance: 0.0 });
-        for (from, to) in pairs {
+    /// Over all cameras.
+    pub fn between<'a>(steps: impl Iterator<Item = Step<'a>>) -> Self {
+        let (mut count, mut sum) = (0.0f64, Self { angle: 0.0, distance: 0.0, pixels: 0.0 });
+        for Step { from, to, depth } in steps {
             count += 1.0;
+            let distance = from.centre().distance(to.centre());
             sum.angle += rotation(from).angle_between(rotation(to));
-            sum.distance += from.centre().distance(to.centre());
+            sum.distance += distance;
+            sum.pixels += depth.map_or(0.0, |depth| from.intrinsics.fx * distance / depth);
         }
         let count = count.max(1.0);
-        Self { angle: sum.angle / count, distance: sum.distance / count }
+        Self { angle: sum.angle / count, distance: sum.distance / count, pixels: sum.pixels / count }
+    }
+
+    /// Whether that is farther than given poses are commonly off: by more than 1°, or by more than 3 pixels of the photographs.
+    pub fn is_far(&self) -> bool {
+        self.angle.to_degrees() > FAR_TURN || self.pixels > FAR_PIXELS
     }
 }
 
 impl fmt::Display for Moved {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "turned by {:.3}° and moved by {:.4} in the mean", self.angle.to_degrees(), self.distance)
+        let Self { angle, distance, pixels } = self;
+        write!(f, "turned by {:.3}° and moved by {distance:.4} ({pixels:.1} LR pixels) in the mean", angle.to_degrees())
     }
 }
 

@@ -164,9 +164,15 @@ fn what_says_nothing_moves_nothing() {
 fn motions_are_told() {
     let camera = camera(2);
     let moved = motion([0.0, 0.01, 0.0], [0.3, 0.0, -0.4]).applied_to(&camera);
-    let told = Moved::between([(&camera, &moved), (&camera, &camera)].into_iter());
+    let step = |to, depth| Step { from: &camera, to, depth };
+    let told = Moved::between([step(&moved, Some(4.0)), step(&camera, None)].into_iter());
     assert!((told.angle - 0.005).abs() < 1e-6 && (told.distance - 0.25).abs() < 1e-9, "{told:?}");
-    assert_eq!(told.to_string(), "turned by 0.286° and moved by 0.2500 in the mean");
+    // Half of a focal length of 70 pixels times 0.5 / 4.
+    assert!((told.pixels - 4.375).abs() < 1e-9, "{told:?}");
+    assert_eq!(told.to_string(), "turned by 0.286° and moved by 0.2500 (4.4 LR pixels) in the mean");
+    for (angle, pixels, is_far) in [(0.9f64, 2.9, false), (1.1, 0.0, true), (0.0, 3.1, true)] {
+        assert_eq!(Moved { angle: angle.to_radians(), pixels, distance: 0.0 }.is_far(), is_far, "{angle}° {pixels}");
+    }
     assert_eq!(Moved::between(std::iter::empty()).distance, 0.0);
 }
 

@@ -73,7 +73,7 @@ impl Ray {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
     /// A number that isn't finite.
-    #[error("camera_to_world[{row}][{column}] is {value}; poses must be finite")]
+    #[error("camera_to_world[{row}][{column}] is {}; poses must be finite", if value.is_nan() { "NaN" } else { "infinite" })]
     NotFinite {
         /// Row of the pose.
         row: usize,
@@ -101,6 +101,20 @@ pub enum CameraError {
         /// Rows.
         height: u32,
     },
+    /// A place that no scene reaches to.
+    #[error(
+        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than {FARTHEST:e}; is the pose right, and its unit?",
+        .0[0], .0[1], .0[2]
+    )]
+    FarAway([f64; 3]),
+    /// The left 3×3 part has determinant -1.
+    #[error(
+        "camera_to_world is a reflection (its determinant is {determinant:.3}): axes must be right-handed; negate one of its columns"
+    )]
+    Mirrored {
+        /// Determinant of R.
+        determinant: f64,
+    },
     /// The left 3×3 part isn't a rotation.
     #[error("camera_to_world is no rigid motion: R·Rᵀ is off the identity by {error:.3}; remove scale or shear from the pose")]
     NotRigid {
@@ -108,6 +122,9 @@ pub enum CameraError {
         error: f64,
     },
 }
+
+/// Scene units from the origin beyond which there are no cameras: f32, by which rays are cast, tells no neighbours apart there.
+const FARTHEST: f64 = 1e9;
 
 /// Cameras that turn at most so far from their mean direction look one way: cos 45°.
 const ONE_WAY: f64 = 0.707;
@@ -177,7 +194,7 @@ impl Camera {
         Self { intrinsics: self.intrinsics.resized(width, height), ..self.clone() }
     }
 
-    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale or shear.
+    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale, shear or a reflection, or far from all scenes.
     pub fn check(&self) -> Result<(), CameraError> {
         let k = &self.intrinsics;
         if k.width == 0 || k.height == 0 {
@@ -201,7 +218,15 @@ impl Camera {
         let r = self.rotation();
         let error = (r * r.transpose() - DMat3::IDENTITY).to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
         // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far off.
-        if error > 1e-2 { Err(CameraError::NotRigid { error }) } else { Ok(()) }
+        if error > 1e-2 {
+            return Err(CameraError::NotRigid { error });
+        }
+        let determinant = r.determinant();
+        if determinant < 0.0 {
+            return Err(CameraError::Mirrored { determinant });
+        }
+        let centre = self.centre();
+        if centre.length() > FARTHEST { Err(CameraError::FarAway(centre.to_array())) } else { Ok(()) }
     }
 }
 
@@ -296,6 +321,19 @@ mod tests {
         bad.camera_to_world[0][0] *= 1.1;
         bad.camera_to_world[0][1] += 0.2;
         assert!(matches!(bad.check(), Err(CameraError::NotRigid { .. })));
+        let mut bad = good.clone();
+        bad.camera_to_world.iter_mut().for_each(|row| row[1] = -row[1]);
+        let reflection = bad.check().unwrap_err();
+        assert!(
+            matches!(reflection, CameraError::Mirrored { .. }) && reflection.to_string().contains("is -1.000"),
+            "{reflection}"
+        );
+        let mut bad = good.clone();
+        bad.camera_to_world[0][3] = 1e30;
+        let far = bad.check().unwrap_err();
+        assert!(far.to_string().contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e9"), "{far}");
+        bad.camera_to_world[0][3] = f64::NEG_INFINITY;
+        assert!(bad.check().unwrap_err().to_string().contains("camera_to_world[0][3] is infinite; poses must be finite"));
         let mut bad = good;
         bad.intrinsics.height = 0;
         assert!(matches!(bad.check(), Err(CameraError::Empty { .. })));

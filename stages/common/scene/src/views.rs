@@ -263,17 +263,23 @@ impl Views {
         let mut names = BTreeSet::new();
         for view in &self.views {
             let name = &view.camera.name;
-            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1);
+            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1) && !name.contains(char::is_control);
             if !plain || !names.insert(name) {
                 return Err(ViewsError::Name(name.clone()));
             }
             view.camera.check().map_err(|source| ViewsError::Camera { name: name.clone(), source })?;
             for path in [&view.image, &view.mask, &view.depth, &view.low_resolution].into_iter().flatten() {
-                relative_path(path).map_err(ViewsError::Path)?;
+                check_path(path)?;
             }
         }
-        self.hull.iter().try_for_each(|path| relative_path(path).map(|_| ()).map_err(ViewsError::Path))
+        self.hull.iter().try_for_each(|path| check_path(path))
     }
+}
+
+/// Refuses paths that leave the folder, or that would do something to a terminal where they are printed.
+fn check_path(path: &str) -> Result<(), ViewsError> {
+    relative_path(path).map_err(ViewsError::Path)?;
+    if path.contains(char::is_control) { Err(ViewsError::Path(format!("{path:?} has control characters"))) } else { Ok(()) }
 }
 
 #[cfg(test)]
@@ -310,6 +316,12 @@ mod tests {
         let mut v = views();
         v.views[0].camera.name = "../x".into();
         assert!(matches!(v.check(), Err(ViewsError::Name(_))));
+        let mut v = views();
+        v.views[0].camera.name = "\u{1b}]0;PWN\u{7}".into();
+        assert!(!v.check().unwrap_err().to_string().contains(char::is_control));
+        let mut v = views();
+        v.views[0].image = Some("images/\u{9b}31m.png".into());
+        assert!(!v.check().unwrap_err().to_string().contains(char::is_control));
         let mut v = views();
         v.bounds.max[1] = -1.0;
         assert!(matches!(v.check(), Err(ViewsError::Bounds(_))));

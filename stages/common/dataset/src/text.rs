@@ -1,0 +1,56 @@
+use std::path::Path;
+
+use crate::DatasetError;
+
+/// A whole text file: UTF-8, with or without a byte order mark.
+pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
+    let bytes = std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
+    decoded(bytes).map_err(|reason| DatasetError::format(path, reason))
+}
+
+const UTF8_MARK: &[u8] = b"\xef\xbb\xbf";
+
+/// The text of a file, or what it is instead and what to do about that.
+fn decoded(mut bytes: Vec<u8>) -> Result<String, String> {
+    if is_utf16(&bytes) {
+        return Err("is UTF-16; save it as UTF-8".to_owned());
+    }
+    if bytes.starts_with(UTF8_MARK) {
+        bytes.drain(..UTF8_MARK.len());
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let (bytes, place) = (error.as_bytes(), error.utf8_error().valid_up_to());
+        let line = 1 + bytes[..place].iter().filter(|b| **b == b'\n').count();
+        let (before, after) = bytes.split_at(place);
+        let start = before.iter().rposition(u8::is_ascii_whitespace).map_or(0, |space| space + 1);
+        let end = after.iter().position(u8::is_ascii_whitespace).map_or(bytes.len(), |space| place + space);
+        let word = bytes[start..end].escape_ascii();
+        format!("line {line}: {word} is not UTF-8; save the file as UTF-8, and rename what it names so")
+    })
+}
+
+/// Whether a byte order mark says so, or a null byte beside the first character.
+fn is_utf16(bytes: &[u8]) -> bool {
+    matches!(bytes, [0xff, 0xfe, ..] | [0xfe, 0xff, ..] | [0, _, ..] | [_, 0, ..])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn marks_are_no_text_and_other_encodings_are_named() {
+        let utf16 = |text: &str, of: fn(u16) -> [u8; 2]| text.encode_utf16().flat_map(of).collect::<Vec<_>>();
+        assert_eq!(decoded(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
+        assert_eq!(decoded("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
+        assert_eq!(decoded(Vec::new()).unwrap(), "");
+        for text in ["{}", "\u{feff}{}"] {
+            for bytes in [utf16(text, u16::to_le_bytes), utf16(text, u16::to_be_bytes)] {
+                assert_eq!(decoded(bytes).unwrap_err(), "is UTF-16; save it as UTF-8");
+            }
+        }
+        let latin = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
+        let reason = decoded(latin).unwrap_err();
+        assert!(reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"), "{reason}");
+    }
+}
