@@ -78,8 +78,8 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
                 let threads = (options.threads / together).max(1);
                 scope.spawn(move || {
                     let job = Job { node: &plan.nodes[index], store, file, options, threads, display, stop };
-                    // Whatever happens to a worker, the run hears of it. The receiver lives as long as the scope.
-                    sender.send((index, unwound(|| job.run(&parents)))).ok();
+                    // The receiver lives as long as the scope. A panic doesn't come here: it ends the program (`panics`).
+                    sender.send((index, job.run(&parents))).ok();
                 });
             }
             if running == 0 {
@@ -105,18 +105,6 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
     outcome.skipped = (0..count).filter(|&i| matches!(progress[i], Progress::Pending)).collect();
     outcome
 }
-
-/// Turns a panic into a failure: a fault of ours ends the run, it doesn't hang it.
-fn unwound<T>(work: impl FnOnce() -> Result<T, StageFailure>) -> Result<T, StageFailure> {
-    std::panic::catch_unwind(std::panic::AssertUnwindSafe(work)).unwrap_or_else(|payload| {
-        let text = payload.downcast_ref::<String>().map(String::as_str).or_else(|| payload.downcast_ref::<&str>().copied());
-        let message = format!("internal error of nerf-sr: {}; please report it", text.unwrap_or("a panic"));
-        Err(StageFailure { code: INTERNAL_ERROR, message })
-    })
-}
-
-/// Exit code of a fault of ours.
-const INTERNAL_ERROR: u8 = 70;
 
 /// One node's work.
 struct Job<'a> {
@@ -323,17 +311,5 @@ impl Watcher for StageView<'_> {
 
     fn said(&self, line: &str) {
         self.display.line(&format!("{}: {line}", self.label));
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_panic_of_a_worker_is_a_failure() {
-        let failure = unwound::<()>(|| panic!("{} went wrong", "this")).unwrap_err();
-        assert_eq!((failure.code, failure.message.contains("this went wrong")), (INTERNAL_ERROR, true));
-        assert_eq!(unwound(|| Ok(3)).unwrap(), 3);
     }
 }

@@ -103,10 +103,15 @@ pub(crate) enum State {
     Waits { on: Vec<usize> },
 }
 
+/// A stage and a sweep's point, as people read it.
+pub(crate) fn label(stage: &str, point: &str) -> String {
+    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
+}
+
 impl Node {
     /// Stage and point, as people read it.
     pub fn label(&self) -> String {
-        if self.point.is_empty() { self.stage.clone() } else { format!("{} [{}]", self.stage, self.point) }
+        label(&self.stage, &self.point)
     }
 
     /// What a record of it looks like, while its inputs aren't known.

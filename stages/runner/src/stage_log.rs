@@ -5,14 +5,10 @@ use std::fs::File;
 use std::io::{self, Write as _};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
-use std::time::{SystemTime, UNIX_EPOCH};
 
-use artifact::printable;
+use artifact::{printable, unix_time};
 
 use crate::clock::utc;
-
-/// What stands between a stage's label and the time in the first line of each of its runs.
-const STARTED: &str = ": started ";
 
 /// The file, which the readers of both pipes write to.
 pub(crate) struct StageLog {
@@ -27,8 +23,7 @@ impl StageLog {
 
     /// The first line of a run.
     pub(crate) fn start(&self, label: &str) {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs());
-        self.line(format_args!("{label}{STARTED}{}", utc(now)));
+        self.line(format_args!("{label}: started {}", utc(unix_time())));
     }
 
     /// Writes a line, control characters spelled out.
@@ -37,14 +32,6 @@ impl StageLog {
         // The log is for people; a full disk shows itself in the output.
         self.file.lock().unwrap_or_else(PoisonError::into_inner).write_all(line.as_bytes()).ok();
     }
-}
-
-/// The label of the last run that a log tells of.
-pub(crate) fn label_in(log: &str) -> Option<&str> {
-    log.lines()
-        .rev()
-        .find_map(|line| line.rsplit_once(STARTED).filter(|(_, time)| time.ends_with(" UTC")))
-        .map(|(label, _)| label)
 }
 
 /// Thins out progress: a line at each tenth of a piece of work.
@@ -83,12 +70,5 @@ mod tests {
         assert_eq!((told.len(), told[0].as_str(), told[9].as_str()), (10, "training: 10% PSNR 20", "training: 100% PSNR 20"));
         // Other work begins anew; counts may be as large as can be.
         assert_eq!(tenths.told("rendering", u64::MAX / 2, u64::MAX, ""), Some("rendering: 40%".to_owned()));
-    }
-
-    #[test]
-    fn a_log_says_whose_it_is() {
-        let log = "train-ss [x=1]: started 1970 UTC\ntrain-ss [x=2]: started 1971 UTC\nit: started late\n";
-        assert_eq!(label_in(log), Some("train-ss [x=2]"));
-        assert_eq!(label_in(""), None);
     }
 }

@@ -14,6 +14,8 @@ use std::collections::BTreeMap;
 
 use artifact::{Closed, Store, StoreError, unix_time};
 
+use crate::plan::label;
+
 pub(crate) use roots::{Choice, Root};
 
 use contents::Contents;
@@ -41,9 +43,8 @@ impl Verdict {
     pub(crate) fn lines(&self) -> Vec<String> {
         let mut makers: BTreeMap<&str, String> = BTreeMap::new();
         for record in self.contents.records.values() {
-            let point = if record.point.is_empty() { String::new() } else { format!(" [{}]", record.point) };
             let age = unix_time().saturating_sub(record.started_unix) / 3600;
-            makers.entry(&record.output).or_insert_with(|| format!("{}{point}, {age} h old", record.stage));
+            makers.entry(&record.output).or_insert_with(|| format!("{}, {age} h old", label(&record.stage, &record.point)));
         }
         let fate = |why: Option<&String>| why.map_or("goes".to_owned(), |why| format!("stays: {why}"));
         let objects = self.contents.objects.iter().map(|(identity, bytes)| {

@@ -5,9 +5,8 @@ use std::time::UNIX_EPOCH;
 use artifact::{Store, StoreError, hash_json, print_line, print_lines};
 
 use crate::clock::utc;
-use crate::plan::{Plan, Request, State};
+use crate::plan::{Plan, Request, State, label};
 use crate::session::{Session, of_stage};
-use crate::stage_log::label_in;
 
 /// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
 pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
@@ -66,23 +65,17 @@ struct Run {
 
 /// The last run of a stage, finished or not, whatever it was run with.
 fn last_of(store: &Store, stage: &str) -> Result<Option<Run>, StoreError> {
-    let finished = store.records()?.into_iter().filter(|record| record.stage == stage).map(|record| {
-        let label = if record.point.is_empty() { record.stage.clone() } else { format!("{} [{}]", record.stage, record.point) };
-        Run { unix: record.started_unix + record.seconds as u64, label, path: store.action(&record.key(), "log") }
+    let finished = store.records()?.into_iter().map(|record| {
+        let unix = record.started_unix + record.seconds as u64;
+        (record.stage.clone(), Run { unix, label: label(&record.stage, &record.point), path: store.action(&record.key(), "log") })
     });
-    let unfinished = store.partials()?.into_iter().filter_map(|key| unfinished(attempt_log(store, &key), stage));
-    Ok(finished.chain(unfinished).filter(|run| run.path.is_file()).max_by_key(|run| run.unix))
-}
-
-/// An attempt that hasn't ended well, where its log says that it is the stage's.
-fn unfinished(path: PathBuf, stage: &str) -> Option<Run> {
-    let text = text_of(&path);
-    let label = label_in(&text)?;
-    if label.split(" [").next() != Some(stage) {
-        return None;
-    }
-    let unix = std::fs::metadata(&path).ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()?.as_secs();
-    Some(Run { unix, label: label.to_owned(), path })
+    let unfinished = store.partials()?.into_iter().filter_map(|key| {
+        let (action, path) = (store.unfinished(&key)?, attempt_log(store, &key));
+        let unix = std::fs::metadata(&path).ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()?.as_secs();
+        Some((action.stage.clone(), Run { unix, label: label(&action.stage, &action.point), path }))
+    });
+    let of_stage = finished.chain(unfinished).filter(|(name, run)| name == stage && run.path.is_file());
+    Ok(of_stage.map(|(_, run)| run).max_by_key(|run| run.unix))
 }
 
 fn text_of(path: &Path) -> String {
