@@ -52,7 +52,7 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 # libFuzzer's coverage on a stable compiler; for the target alone, since build scripts have no libFuzzer to link with.
 FUZZ_FLAGS := -Cpasses=sancov-module $(addprefix -Cllvm-args=-sanitizer-coverage-,level=4 inline-8bit-counters pc-table trace-compares)
 FUZZ_HOST = $(shell rustc -vV | sed -n 's/^host: //p')
-FUZZ_TARGETS ?= colmap llff transforms picture field
+FUZZ_TARGETS ?= colmap llff transforms picture field runner
 FUZZ_SECONDS ?= 60
 IN_FUZZ = cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz
 fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"

@@ -111,6 +111,11 @@ fn pipeline_blocks_are_valid() {
         let end =
             after.match_indices("\n  ").map(|(i, _)| i + 1).find(|&i| !after[i + 2..].starts_with(' ')).unwrap_or(after.len());
         project.write("pipeline.yaml", &format!("{}{block}{}", &text[..start], &after[end..]));
+        if block.contains("run: ./") {
+            // Somebody's program: it is for `run` to start.
+            project.run(&["plan"]).fails(2, &["read it first"]);
+            project.ok(&["run"]);
+        }
         project.ok(&["plan"]);
     }
 }

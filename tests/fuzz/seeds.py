@@ -2,6 +2,7 @@
 """Writes a few whole files for each fuzz target to start from: seeds.py FOLDER."""
 
 import base64
+import json
 import pathlib
 import struct
 import sys
@@ -64,3 +65,51 @@ seed("picture", "exr", b"\x02" + exr)
 
 names = '{"grid":{"dtype":"F32","shape":[4],"data_offsets":[0,16]}}'
 seed("field", "one", struct.pack("<Q", len(names)) + names.encode() + bytes(16))
+
+pipeline = """default: [report]
+stages:
+  make: {}
+  train:
+    inputs: {data: make/part}
+    parameters: &own {rays: 2, place: [1, 2.5]}
+  again:
+    like: train
+    inputs: {data: ./folder}
+    parameters:
+      <<: *own
+      rate: 2e0
+  report:
+    inputs: {run: train, more: again}
+"""
+stage = lambda name, **more: {"name": name, "version": "", "code": "", "summary": "", "inputs": {}, "parameters": {}} | more
+number, seed_type = {"type": ["number", "null"], "default": None}, {"type": "integer", "format": "uint64", "default": 0}
+kernel = {"oneOf": [{"const": "box", "type": "string"}, {"const": "average", "type": "string"}]}
+words = {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}], "default": None}
+make = stage("make", output={"kind": "data", "subtrees": {"part": "data/part"}}, parameters={"properties": {"seed": seed_type}})
+train = stage(
+    "train",
+    output={"kind": "field"},
+    inputs={"data": {"kinds": ["data/part"], "summary": ""}, "weights": {"kinds": ["w"], "optional": True, "summary": ""}},
+    parameters={
+        "properties": {
+            "rays": {"type": "integer", "minimum": 1, "default": 3},
+            "rate": number,
+            "kernel": words,
+            "place": {"type": "array", "items": {"type": "number"}, "default": [0.5]},
+        },
+        "$defs": {"Kernel": kernel},
+    },
+    rules=[
+        {"when": {"kernel": {"const": "average"}}, "needs": ["weights"], "message": "weights are needed"},
+        {"when": {"data.seed": {"minimum": 5}}, "must": {"rate": {"multipleOf": 1}}, "message": "the rate must be whole"},
+    ],
+)
+report = stage("report", output={"kind": "page"}, sink=True, inputs={"run": {"kinds": ["run"], "summary": ""}})
+record = {"stage": "train", "point": "rays=2", "key_parts": {"code": "0" * 64, "parameter rate": 2.5}, "output": "0" * 64}
+record |= {"started_unix": 1, "seconds": 0.5, "threads": 2, "host": "h"}
+seed("runner", "pipeline", b"\x00" + pipeline.encode())
+for one in (make, train, report):
+    seed("runner", f"describe-{one['name']}", b"\x01" + json.dumps(one).encode())
+seed("runner", "arguments", b"\x02pseed=1,2\npkernel=box\nptrain.rate=2,2.0,3\npplace=[1,2]\nidata=a,b\nprays=6e4\nttrain\nitrain.weights=w")
+seed("runner", "arguments-wrong", b'\x02pplace=[1,"a,b"],2\nidata=a,,b\nprays=0x10')
+seed("runner", "record", b"\x03" + json.dumps(record).encode())

@@ -174,10 +174,11 @@ impl Scope<'_> {
         let meant = artifact::nearest(name, known).map(|known| format!("did you mean {known}? ")).unwrap_or_default();
         let problem =
             format!("{} {name}: no stage has such {} {}; {meant}see `STAGE --help`", kind.flag(), kind.article(), kind.noun());
-        match self.programs.unknown().next() {
-            None => PlanError::Usage(problem),
-            Some((stage, reason)) => PlanError::Usage(format!("{problem}; {stage} couldn't be asked: {reason}")),
+        let unasked: Vec<&str> = self.programs.unknown().collect();
+        if unasked.is_empty() {
+            return PlanError::Usage(problem);
         }
+        PlanError::Usage(format!("{problem}; {} couldn't be asked", unasked.join(", ")))
     }
 }
 

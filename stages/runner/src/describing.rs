@@ -21,7 +21,7 @@ const SILENCE: Duration = Duration::from_secs(1);
 const MOST_BYTES: u64 = 1 << 24;
 
 /// What came of asking, by path.
-type Answers = BTreeMap<PathBuf, Result<Description, String>>;
+pub(crate) type Answers = BTreeMap<PathBuf, Result<Description, String>>;
 
 /// Asks programs, as many at once as there are cores.
 pub(crate) fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
@@ -47,7 +47,7 @@ pub(crate) fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<An
             match receiver.recv_timeout(patience) {
                 Ok((path, answer)) => _ = answers.insert(path, answer),
                 Err(mpsc::RecvTimeoutError::Timeout) => {
-                    artifact::report_line!("asking {} stages what they are, once for each build", paths.len());
+                    artifact::report_line!("asking the stages what they are, once for each build");
                     patience = Duration::MAX;
                 }
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,

@@ -13,7 +13,7 @@ use std::time::UNIX_EPOCH;
 use artifact::{Description, Schema, Store, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 
-use crate::describing::ask_all;
+use crate::describing::{Answers, ask_all};
 use crate::pipeline::{Part, Pipeline, PipelineError};
 
 /// A stage's executable and what it says of itself.
@@ -45,41 +45,32 @@ pub(crate) enum Asking<'a> {
 #[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Interrupted;
 
-/// The stages' programs, as far as they are known, and why the others aren't.
-#[derive(Default)]
-pub(crate) struct Programs {
-    known: BTreeMap<String, Arc<StageProgram>>,
-    unknown: BTreeMap<String, PipelineError>,
-}
+/// The stages' programs, or why they aren't known.
+pub(crate) struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);
 
 impl Programs {
     /// A stage's program, where it is known.
     pub(crate) fn get(&self, stage: &str) -> Option<&StageProgram> {
-        self.known.get(stage).map(Arc::as_ref)
+        self.0.get(stage)?.as_deref().ok()
     }
 
     /// A stage's program, or why it isn't known.
     pub(crate) fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
-        let missing = || self.unknown.get(stage).cloned();
-        self.known.get(stage).ok_or_else(|| {
-            missing().unwrap_or_else(|| PipelineError { place: stage.to_owned(), problem: "no such stage".to_owned() })
-        })
+        self.0[stage].as_ref().map_err(Clone::clone)
     }
 
-    /// The stages whose programs aren't known, and why.
-    pub(crate) fn unknown(&self) -> impl Iterator<Item = (&str, &PipelineError)> {
-        self.unknown.iter().map(|(stage, reason)| (stage.as_str(), reason))
+    /// The stages whose programs aren't known.
+    pub(crate) fn unknown(&self) -> impl Iterator<Item = &str> {
+        self.0.iter().filter(|(_, program)| program.is_err()).map(|(stage, _)| stage.as_str())
     }
 
     /// Programs by what they would answer; nothing is started.
     pub(crate) fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
-        let mut programs = Self::default();
-        for stage in pipeline.stages.keys() {
+        Self::new(pipeline, |stage| {
             let name = program_name(pipeline, stage);
             let description = descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
-            programs.insert(pipeline, stage, description.and_then(|d| StageProgram::new(Path::new(name), d)).map(Arc::new));
-        }
-        programs
+            description.and_then(|description| StageProgram::new(Path::new(name), description))
+        })
     }
 
     /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the stages that the targets come to.
@@ -92,23 +83,18 @@ impl Programs {
         let file = store.root().join("cache/describe.json");
         // A cache that can't be read is an empty one.
         let mut cache: Cache = std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
-        let mut answers: BTreeMap<PathBuf, Result<Arc<StageProgram>, String>> = BTreeMap::new();
-        let mut unasked: BTreeMap<PathBuf, Identity> = BTreeMap::new();
-        let paths: BTreeMap<&String, PathBuf> = pipeline.stages.keys().map(|s| (s, executable(pipeline, s))).collect();
+        let (mut answers, mut unasked) = (Answers::new(), BTreeMap::new());
+        let paths: BTreeMap<&str, PathBuf> = pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
-            if answers.contains_key(path) || unasked.contains_key(path) {
-                continue;
-            }
             let is_needed = paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
             match identify(path, program_name(pipeline, stage)) {
                 Err(problem) => _ = answers.insert(path.clone(), Err(problem)),
                 Ok(identity) => match cache.answer(path, &identity) {
-                    Some(description) => _ = answers.insert(path.clone(), StageProgram::new(path, description).map(Arc::new)),
+                    Some(description) => _ = answers.insert(path.clone(), Ok(description)),
                     None if identity.may_be_asked(asking, is_needed) => _ = unasked.insert(path.clone(), identity),
                     None => {
-                        let problem =
-                            format!("{} is not a part of nerf-sr: `nerf-sr run` starts it; read it first", path.display());
-                        answers.insert(path.clone(), Err(problem));
+                        let problem = "is no part of nerf-sr: `nerf-sr run` starts it; read it first";
+                        answers.insert(path.clone(), Err(format!("{} {problem}", path.display())));
                     }
                 },
             }
@@ -117,31 +103,28 @@ impl Programs {
             Asking::Run(stop) => Some(stop),
             Asking::Look => None,
         };
-        let asked = ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
-        let is_new = !asked.is_empty();
-        for (path, answer) in asked {
-            if let (Ok(description), Some(identity)) = (&answer, unasked.remove(&path)) {
-                cache.0.insert(id(&path), Answer { identity, description: description.clone() });
+        answers.extend(ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?);
+        for (path, identity) in &unasked {
+            if let Ok(description) = &answers[path] {
+                cache.0.insert(id(path), Answer { identity: identity.clone(), description: description.clone() });
             }
-            let program = answer.and_then(|description| StageProgram::new(&path, description)).map(Arc::new);
-            answers.insert(path, program);
         }
-        if is_new && let Ok(bytes) = serde_json::to_vec(&cache) {
+        if !unasked.is_empty()
+            && let Ok(bytes) = serde_json::to_vec(&cache)
+        {
             // Only a cache: without it the next start is slower.
             write_atomically(&file, &bytes).ok();
         }
-        let mut programs = Self::default();
-        for (stage, path) in paths {
-            programs.insert(pipeline, stage, answers[&path].clone());
-        }
-        Ok(programs)
+        Ok(Self::new(pipeline, |stage| StageProgram::new(&paths[stage], answers[&paths[stage]].clone()?)))
     }
 
-    fn insert(&mut self, pipeline: &Pipeline, stage: &str, program: Result<Arc<StageProgram>, String>) {
-        match program {
-            Ok(program) => _ = self.known.insert(stage.to_owned(), program),
-            Err(problem) => _ = self.unknown.insert(stage.to_owned(), pipeline.error(stage, Part::Field("run"), problem)),
-        }
+    /// What each stage's program turns out to be; what is wrong with it, is wrong with the block.
+    fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, String>) -> Self {
+        let programs = pipeline.stages.keys().map(|stage| {
+            let program = find(stage).map(Arc::new).map_err(|problem| pipeline.error(stage, Part::Field("run"), problem));
+            (stage.clone(), program)
+        });
+        Self(programs.collect())
     }
 }
 

@@ -1,0 +1,226 @@
+//! What comes before a run: asking programs what they are, checking what is asked for, and saying what will be done.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::io::{BufRead as _, BufReader, Read as _};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use common::{Finished, Project, TINY, bin, signal, wait_until};
+
+/// A copy of a program, made by another process: one that this process has open for writing can't be started.
+fn install(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+    assert!(Command::new("install").args(["-m", "755"]).args([from, to]).status().unwrap().success());
+}
+
+/// A stage as a script: it leaves a mark when it is started, waits for `go` where that is asked for, describes itself, or makes its output.
+const SCRIPT: &str = r#"#!/bin/sh
+cd "$(dirname "$0")"
+echo "$1" >> started
+if [ "$1" = describe ]; then
+    while [ -e wait ]; do sleep 0.05; done
+    echo '{"name":"mine","version":"1","code":"1","summary":"","parameters":{"type":"object"},"inputs":{},"output":{"kind":"k"}}'
+    exit
+fi
+while [ "$1" != --output ]; do shift; done
+mkdir "$2" && echo 1 > "$2/x"
+"#;
+
+fn with_script() -> Project {
+    let project = Project::new("default: [mine]\nstages:\n  mine: {run: ./mine.sh}\n  other: {run: ./other.sh}\n");
+    project.write("script", SCRIPT);
+    install(&project.path("script"), &project.path("mine.sh"));
+    project
+}
+
+/// Looking at somebody's pipeline starts nothing of theirs: only `run` does, and then the others know what it said, until it changes.
+#[test]
+fn only_run_starts_a_foreign_program() {
+    let project = with_script();
+    let started = || std::fs::read_to_string(project.path("started")).unwrap_or_default();
+    let looks: [&[&str]; 6] = [&["plan"], &["why", "mine"], &["status"], &["graph"], &["log", "mine"], &["gc", "--dry-run"]];
+    for look in looks {
+        let finished = project.run(look);
+        if !["log", "gc"].contains(&look[0]) {
+            finished.fails(2, &["pipeline.yaml:3: stage mine", "mine.sh", "`nerf-sr run` starts it; read it first"]);
+        }
+        assert_eq!(started(), "", "{look:?}");
+    }
+    project.ok(&["run"]);
+    assert_eq!(started(), "describe\n--params\n", "and other.sh, which isn't there, isn't needed");
+    for look in looks {
+        project.ok(look);
+    }
+    assert!(project.ok(&["plan"]).contains("cached"));
+    assert_eq!(started(), "describe\n--params\n");
+    // Other bytes are another program, whatever its size and time say.
+    let metadata = std::fs::metadata(project.path("mine.sh")).unwrap();
+    project.write("script", &SCRIPT.replace("echo 1", "echo 2"));
+    install(&project.path("script"), &project.path("mine.sh"));
+    let changed = std::fs::File::options().write(true).open(project.path("mine.sh")).unwrap();
+    changed.set_modified(metadata.modified().unwrap()).unwrap();
+    drop(changed);
+    assert_eq!(std::fs::metadata(project.path("mine.sh")).unwrap().len(), metadata.len());
+    project.run(&["plan"]).fails(2, &["read it first"]);
+    assert_eq!(started(), "describe\n--params\n");
+    project.ok(&["run"]);
+    project.ok(&["plan"]);
+    // One that isn't needed isn't started by a run either.
+    project.write("pipeline.yaml", "default: [demo-scene]\nstages:\n  demo-scene: {}\n  mine: {run: ./new.sh}\n");
+    install(&project.path("script"), &project.path("new.sh"));
+    let before = started();
+    project.ok(&["run", "-p", "size=4", "-p", "train=1", "-p", "test=1", "-p", "samples=1"]);
+    assert_eq!(started(), before);
+}
+
+/// Asking that takes its time is said, and ends at once when it is no longer wanted.
+#[test]
+fn asking_can_be_watched_and_interrupted() {
+    let project = with_script();
+    project.write("wait", "");
+    let mut child = project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut stderr = BufReader::new(child.stderr.take().unwrap());
+    let mut line = String::new();
+    stderr.read_line(&mut line).unwrap();
+    assert!(line.contains("asking the stages what they are"), "{line}");
+    wait_until(|| project.path("started").exists());
+    signal(&child, "-TERM");
+    line.clear();
+    stderr.read_to_string(&mut line).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{line}");
+    assert!(line.contains("interrupted") && !line.contains("failed") && !line.contains("stage mine"), "{line}");
+    // What was begun goes on when it may.
+    let child = project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    std::fs::remove_file(project.path("wait")).unwrap();
+    let finished = Finished::of(child.wait_with_output().unwrap());
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+}
+
+/// A program that isn't there is no matter to targets that don't use it; to others the one command that builds it is said.
+#[test]
+fn a_missing_program_is_missed_where_it_is_needed() {
+    let project = Project::tiny();
+    let own = |name: &str| -> PathBuf { project.path("bin").join(name) };
+    ["nerf-sr", "demo-scene", "prep"].into_iter().for_each(|name| install(&bin(name), &own(name)));
+    let run = |arguments: &[&str]| {
+        Finished::of(Command::new(own("nerf-sr")).args(arguments).current_dir(project.path("")).output().unwrap())
+    };
+    for arguments in [&["plan", "prep"][..], &["run", "demo-scene"], &["plan", "prep", "-p", "kernel=box"]] {
+        let finished = run(arguments);
+        assert_eq!(finished.code, 0, "{arguments:?}: {}", finished.stderr);
+    }
+    run(&["plan"]).fails(2, &["pipeline.yaml:9: stage train-ss", "No such file", "cargo build --release -p train-ss"]);
+    run(&["plan", "prep", "-p", "rays=1"]).fails(2, &["no stage has such a parameter", "couldn't be asked"]);
+    project.replace("  demo-scene:\n", "  demo-secne:\n");
+    project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
+    run(&["plan"]).fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
+    // The rest of the file is checked, needed or not.
+    project.replace("lr: 24", "ir: 24");
+    run(&["plan", "demo-secne"]).fails(2, &["pipeline.yaml:8: stage prep: parameter ir: unknown; did you mean hr?"]);
+}
+
+/// What can't go well is refused before anything runs, in the plan as in the run.
+#[test]
+fn what_stages_would_refuse_is_refused_in_the_plan() {
+    let upsample = "  upsample:\n    inputs: {views: prep/train, cameras: prep/train-cameras}\n    parameters: {method: imdn}\n";
+    let project = Project::new(&format!("{TINY}{upsample}"));
+    for (arguments, words) in [
+        (&["upsample"][..], "stage upsample: input weights is missing: methods imdn, liif and swinir"),
+        (&["upsample", "-p", "method=bicubic,liif"], "stage upsample [method=liif]: input weights is missing"),
+        (&["-p", "prep.scale=2.7", "-p", "kernel=average"], "stage prep: parameter kernel: average needs a whole scale"),
+        (&["-p", "prep.scale=2.7", "-p", "degrade=average"], "stage prep: parameter degrade: average needs a whole scale"),
+        (&["-p", "hull=alpha", "-p", "space=ndc"], "stage prep: parameter hull: alpha carves a box"),
+        (
+            &["-p", "background=alpha", "-p", "supervision=kernel"],
+            "stage train-ss: parameter supervision: kernel needs a background",
+        ),
+        (&["-p", "background=white,alpha", "-p", "exposure=true"], "stage train-ss [background=alpha]: parameter exposure"),
+        (
+            &["-p", "background=alpha", "-p", "pose_refinement=true"],
+            "parameter pose_refinement: photographs with an open background",
+        ),
+        (&["--device", "gpu"], "--device gpu: no such device; cpu, cuda or cuda:N is expected"),
+        (&["--device", "cuda:"], "--device cuda:: no such device"),
+    ] {
+        for verb in ["plan", "run"] {
+            project.run(&[&[verb], arguments].concat()).fails(2, &[words]);
+        }
+    }
+    assert_eq!(project.store_listing(), Vec::<String>::new());
+    project.ok(&["plan", "upsample", "-i", "weights=."]);
+    // A stage by itself checks the same.
+    let (views, none) = (project.path("views"), project.path("none"));
+    let inputs = [("views", views.as_path()), ("cameras", &views)];
+    common::stage("upsample", r#"{"method": "imdn"}"#, &inputs, &none, &[])
+        .fails(2, &["input weights is missing", "convert-weights.py"]);
+    let inputs = [("dataset", views.as_path())];
+    common::stage("prep", r#"{"kernel": "average", "scale": 1.5}"#, &inputs, &none, &[])
+        .fails(2, &["average needs a whole scale"]);
+}
+
+/// Sinks are drawn and explained.
+#[test]
+fn sinks_are_part_of_the_picture() {
+    let project = Project::new(&format!("{}  report:\n    inputs: {{run: eval}}\n", TINY.replace("[eval]", "[report]")));
+    for (arguments, words) in [
+        (&["why", "report"][..], &["report: shows eval; a run writes it anew where they change", "\n  eval: waits for"][..]),
+        (&["plan"], &["shows eval"]),
+        (&["graph"], &["report (shows the run)  ← eval\n"]),
+        (&["graph", "--format", "dot"], &["[label=\"report\", shape=note]", "n4 -> n5"]),
+        (&["graph", "--format", "svg"], &[">report</text>"]),
+    ] {
+        let said = project.ok(arguments);
+        assert!(words.iter().all(|w| said.contains(w)), "{arguments:?}: {said}");
+    }
+    project.run(&["why", "reprot"]).fails(2, &["no stage \"reprot\" in this plan"]);
+    project.run(&["why", "evla"]).fails(2, &["no stage \"evla\" in this plan; did you mean eval? known: demo-scene, eval"]);
+}
+
+/// The plan says what a run then does: what will run runs, what is cached doesn't, and what waits may do either. Equal values are one key.
+#[test]
+fn a_run_does_what_the_plan_says() {
+    let project = Project::tiny();
+    project.replace("{lr: 24, scale: 2}", "{lr: 24, scale: 2, kernel: box}");
+    let actions = || project.store_listing().iter().filter(|name| name.ends_with(".json")).count();
+    for (arguments, runs) in [
+        (&[][..], 2),
+        (&[], 0),
+        // Said otherwise, or said where it is so by default.
+        (&["-p", "prep.scale=2.0", "-p", "lr=24.0", "-p", "demo-scene.size=48e0", "-p", "demo-scene.seed=0"], 0),
+        (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
+        // Equal output ends what waits.
+        (&["-p", "hr=48"], 1),
+        (&["-p", "demo-scene.train=11", "-p", "demo-scene.train=12"], 0),
+        (&["-p", "kernel=box,bicubic"], 1),
+        (&["-p", "demo-scene.samples=1", "-p", "kernel=box,bicubic"], 3),
+        (&["-p", "demo-scene.samples=1,2", "-p", "kernel=box,bicubic"], 0),
+    ] {
+        let arguments = [&["prep"], arguments].concat();
+        let plan = project.ok(&[&["plan"], &arguments[..]].concat());
+        let count = |words: &str| plan.lines().filter(|line| line.contains(words)).count();
+        let (will_run, waits, before) = (count("will run"), count("waits for"), actions());
+        project.ok(&[&["run"], &arguments[..]].concat());
+        let ran = actions() - before;
+        assert!((will_run..=will_run + waits).contains(&ran) && ran == runs, "{arguments:?}: {ran} ran of\n{plan}");
+        let after = project.ok(&[&["plan"], &arguments[..]].concat());
+        assert!(after.lines().all(|line| line.contains("cached")), "{after}");
+    }
+    for verb in ["plan", "run"] {
+        let said = project.run(&[verb, "prep", "-p", "kernel=lanczos", "-p", "prep.kernel=box"]);
+        assert!(said.code == 0 && said.stderr.contains("-p kernel=lanczos: overridden by -p prep.kernel=box"), "{}", said.stderr);
+    }
+}
+
+#[test]
+fn a_file_in_another_encoding_is_refused_with_the_cure() {
+    let project = Project::new("");
+    let utf16: Vec<u8> = std::iter::once(0xfeff).chain(TINY.encode_utf16()).flat_map(u16::to_le_bytes).collect();
+    std::fs::write(project.path("pipeline.yaml"), utf16).unwrap();
+    project.run(&["plan"]).fails(2, &["pipeline.yaml: the text is UTF-16; save it as UTF-8"]);
+    project.write("pipeline.yaml", &format!("\u{feff}{}", TINY.replace('\n', "\r\n")));
+    project.ok(&["plan"]);
+    project.write("pipeline.yaml", "default: [../x]\nstages:\n  ../x: {run: report}\n");
+    project.run(&["plan"]).fails(2, &["pipeline.yaml:3: stage \"../x\": a stage's name"]);
+}
