@@ -45,9 +45,9 @@ fn datasets_that_cannot_be_used() {
     refused(|_, d| std::fs::remove_dir_all(d).unwrap(), &[], 3, &["input dataset", "data", "name a folder that is there"]);
     refused(
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
-        &[],
-        3,
-        &["transforms_test.json", "is not there; a Blender data set has"],
+        &["-p", "split=given"],
+        2,
+        &["parameter split", "choose holdout or paper"],
     );
     refused(
         |_, d| std::fs::remove_file(d.join("train/r_2.png")).unwrap(),
@@ -78,10 +78,10 @@ fn datasets_that_cannot_be_used() {
     );
     refused(|_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"), &[], 3, &["camera_angle_x is 3.2", "focal length"]);
     refused(
-        |_, d| std::fs::write(d.join("transforms_test.json"), r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap(),
+        |_, d| std::fs::write(d.join("transforms_train.json"), r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap(),
         &[],
         3,
-        &["transforms_test.json", "`frames` is empty"],
+        &["transforms_train.json", "`frames` is empty"],
     );
 }
 

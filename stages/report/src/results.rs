@@ -82,3 +82,32 @@ pub(crate) fn results(run: &RunRecord) -> anyhow::Result<Vec<ResultRow>> {
     });
     rows.collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn warnings_stand_in_summaries() {
+        let folder = tempfile::tempdir().unwrap();
+        let node = |stage: &str, point: &str, summary: Option<&str>| {
+            let folder = folder.path().join(stage);
+            std::fs::create_dir(&folder).unwrap();
+            summary.iter().for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
+            let node = serde_json::json!({
+                "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "", "folder": folder, "parameters": {},
+                "inputs": {}, "started_unix": 0, "seconds": 0.0, "threads": 1
+            });
+            serde_json::from_value(node).unwrap()
+        };
+        let nodes = vec![
+            node("locate", "seed=1", Some("2 of 2 cameras located\nwarning: cameras have turned far\n")),
+            node("prep", "", Some("8 training views\n")),
+            node("train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
+            node("script", "", None),
+        ];
+        let found = warnings_by_node(&RunRecord { nodes });
+        let expected = [("locate [seed=1]", "cameras have turned far"), ("train-ss", "one"), ("train-ss", "two")];
+        assert_eq!(found, expected.map(|(node, warning)| (node.to_owned(), warning.to_owned())));
+    }
+}

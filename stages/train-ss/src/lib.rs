@@ -27,7 +27,7 @@ use anyhow::Context as _;
 use artifact::{
     Context, Failure, FailureExt as _, GivenInput, Input, Output, Progress, Rule, Stage, WARNING, amount, with_warnings,
 };
-use pixels::{DEGRADATION_FILE, Degradation, Filter};
+use pixels::{DEGRADATION_FILE, Degradation, Kernel};
 use radiance::{FIELD_FILE, FieldFile, FieldModel};
 use scene::{Intrinsics, Photograph, Space, Views};
 use schemars::JsonSchema;
@@ -349,12 +349,12 @@ pub fn supervision(
         return Err(Failure::Usage(open_background(parameter)).into());
     }
     let rays = params.rays(epoch(&photographs.views, params));
-    let filter = made.map_or(Filter::Lanczos, |d| d.kernel.filter());
-    let references = references.map(|references| references::checked(references, &photographs, filter, say));
+    let kernel = made.map_or(Kernel::Lanczos, |d| d.kernel);
+    let references = references.map(|references| references::checked(references, &photographs, kernel, say));
     let options = SupersamplingOptions {
         supervision,
         scale: [params.supersample; 2],
-        filter,
+        filter: kernel.filter(),
         coarse: params.coarse(),
         order: params.order(),
         crop_groups: params.crop_groups(rays),

@@ -1,4 +1,4 @@
-use pixels::{Exposure, Filter, Picture, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
+use pixels::{Exposure, Kernel, Picture, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
 use scene::Camera;
 
 use crate::Photographs;
@@ -6,29 +6,32 @@ use crate::Photographs;
 /// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else where it differs by more than this, in dB.
 const ALIKE: f64 = 25.0;
 
+/// Alpha of an LR pixel that is made of opaque ones alone, up to rounding.
+const OPAQUE: f32 = 1.0 - 1e-4;
+
 /// References as they should join a training: of one with an LR photograph of its own the exposure is that photograph's, and it is left out where it
-/// shows something else. What was done is said. `filter` made the LR photographs.
+/// shows something else. What was done is said. `kernel` made the LR photographs.
 ///
 /// Pictures with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the border of a thing
 /// would look like another exposure, since stored pictures have none of that.
 pub(crate) fn checked(
     mut references: Photographs,
     photographs: &Photographs,
-    filter: Filter,
+    kernel: Kernel,
     say: &dyn Fn(String),
 ) -> Photographs {
     let pairs = references.views.views.into_iter().zip(references.pictures);
     let kept = pairs.filter_map(|(view, mut photograph)| {
         let Some(own) = own_photograph(photographs, &view.camera) else { return Some((view, photograph)) };
         let (name, reference) = (&view.camera.name, &mut photograph.picture);
-        let mut shrunk = shrunk_as_stored(reference, own, filter);
-        if let Some(exposure) = Exposure::between(own, &shrunk, 1).filter(|exposure| !exposure.is_none()) {
+        let [mut shrunk, own] = compared(reference, own, kernel);
+        if let Some(exposure) = Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none()) {
             let [r, g, b] = exposure.gain;
             say(format!("reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"));
             exposure.take_back(reference);
             exposure.take_back(&mut shrunk);
         }
-        let alike = alikeness(&shrunk, own);
+        let alike = alikeness(&shrunk, &own);
         if alike < ALIKE {
             say(format!("reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and is left out: another view, or something that moved?"));
         }
@@ -45,12 +48,20 @@ fn own_photograph<'a>(photographs: &'a Photographs, camera: &Camera) -> Option<&
     Some(&photographs.pictures[place].picture)
 }
 
-/// A picture at the size of another. With alpha it is made as `prep` makes it, from 8 bits to 8 bits.
-fn shrunk_as_stored(picture: &Picture, to: &Picture, filter: Filter) -> Picture {
-    if is_transparent(picture) {
-        return Picture::premultiplied(&resize_pillow(&as_stored(picture), to.width, to.height, filter));
+/// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as `prep` does it, from 8 bits to 8 bits.
+fn compared(reference: &Picture, own: &Picture, kernel: Kernel) -> [Picture; 2] {
+    if is_transparent(reference) && kernel != Kernel::Average {
+        let shrunk = resize_pillow(&as_stored(reference), own.width, own.height, kernel.filter());
+        return [Picture::premultiplied(&shrunk), own.clone()];
     }
-    Resampling::new(filter, (picture.width, picture.height), (to.width, to.height)).apply(picture)
+    let sizes = [reference, own].map(|picture| (picture.width, picture.height));
+    let mut pair = [Resampling::new(kernel.filter(), sizes[0], sizes[1]).apply(reference), own.clone()];
+    if is_transparent(reference) {
+        // That kernel averages straight colours, those of what is transparent, too: only alpha is known there.
+        let hidden: Vec<usize> = (0..own.width * own.height).filter(|i| own.data[4 * i + 3] < OPAQUE).collect();
+        pair.iter_mut().for_each(|picture| hidden.iter().for_each(|i| picture.data[4 * i..4 * i + 3].fill(0.0)));
+    }
+    pair
 }
 
 /// A picture with premultiplied alpha as its PNG has it: 8 bits, alpha straight.
@@ -79,6 +90,7 @@ fn alikeness(one: &Picture, other: &Picture) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use pixels::Filter;
     use scene::{Background, Bounds, Camera, Intrinsics, View, Views};
 
     use super::*;
@@ -108,7 +120,7 @@ mod tests {
             let said = std::cell::RefCell::new(String::new());
             let mut picture = fine();
             picture.data.iter_mut().for_each(|v| *v = change(*v));
-            let kept = checked(photographs(name, picture), &low(), Filter::Lanczos, &|text| said.borrow_mut().push_str(&text));
+            let kept = checked(photographs(name, picture), &low(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
             (kept.pictures.into_iter().next().map(|p| p.picture), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);
@@ -133,16 +145,23 @@ mod tests {
                 if away < 0.3 * size as f32 { [250, 240, 90 + (x * 2.0) as u8 / 4, 255] } else { [0; 4] }
             };
             let hr = pixels::Rgba8::new(size, size, (0..size * size).flat_map(pixel).collect());
-            for filter in [Filter::Lanczos, Filter::Bicubic, Filter::Box] {
-                let lr = pixels::resize_pillow(&hr, size / 2, size / 2, filter);
-                let [hr, lr] = [&hr, &lr].map(Picture::premultiplied);
+            for kernel in [Kernel::Lanczos, Kernel::Bicubic, Kernel::Box, Kernel::Average] {
+                let lr = match kernel {
+                    Kernel::Average => {
+                        let mut lr = pixels::average_pool(&hr, 2, 2).unwrap();
+                        lr.data.chunks_exact_mut(4).for_each(|p| (0..3).for_each(|c| p[c] *= p[3]));
+                        lr
+                    }
+                    _ => Picture::premultiplied(&resize_pillow(&hr, size / 2, size / 2, kernel.filter())),
+                };
+                let hr = Picture::premultiplied(&hr);
                 let said = std::cell::RefCell::new(String::new());
                 let low = photographs("a", lr.clone());
-                let kept = checked(photographs("a", hr.clone()), &low, filter, &|text| said.borrow_mut().push_str(&text));
-                assert_eq!(said.into_inner(), "", "{size} {filter:?}");
+                let kept = checked(photographs("a", hr.clone()), &low, kernel, &|text| said.borrow_mut().push_str(&text));
+                assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
                 assert_eq!(kept.pictures[0].picture, hr);
-                let alike = alikeness(&shrunk_as_stored(&hr, &lr, filter), &lr);
-                assert_eq!(alike, 100.0, "{size} {filter:?}");
+                let [shrunk, own] = compared(&hr, &lr, kernel);
+                assert_eq!(alikeness(&shrunk, &own), 100.0, "{size} {kernel:?}");
             }
         }
     }
