@@ -246,8 +246,13 @@ pub fn signal(child: &Child, name: &str) {
 
 /// When the last of a work folder's checkpoints was written.
 pub fn last_checkpoint(work: &Path) -> Option<SystemTime> {
-    let files = walkdir::WalkDir::new(work).into_iter().flatten().filter(|f| f.file_name() == "checkpoint.safetensors");
-    files.filter_map(|f| f.metadata().ok()?.modified().ok()).max()
+    checkpoints(work).iter().filter_map(|file| file.metadata().ok()?.modified().ok()).max()
+}
+
+/// A work folder's checkpoints.
+pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
+    let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
+    files.filter(|file| file.file_name() == "checkpoint.safetensors").map(walkdir::DirEntry::into_path).collect()
 }
 
 /// Waits for what comes sooner or later, however slow the machine is just now.
