@@ -68,6 +68,10 @@ fn every_command_plans() {
                 continue;
             };
             let mut words: Vec<&str> = rest.split_whitespace().collect();
+            // What isn't made yet can't be pinned.
+            if words[0] == "pin" {
+                words.splice(..2, ["plan"]);
+            }
             // `run` would train for minutes; the plan is the same code up to running. It has no use for run's own options.
             if words[0] == "run" {
                 words[0] = "plan";
