@@ -7,8 +7,8 @@ use artifact::{Description, Input, known_names};
 use crate::pipeline::{Part, Pipeline, PipelineError, Source, StageBlock};
 use crate::stages::{Programs, StageProgram};
 
-/// Checks what the file says of itself; returns an order in which every stage comes after those it needs.
-pub(crate) fn structure(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
+/// Checks that every stage which the file names is there.
+pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
     let known = |name: &str| known_names(name, pipeline.stages.keys().map(String::as_str));
     for name in &pipeline.default {
         if !pipeline.stages.contains_key(name) {
@@ -25,7 +25,7 @@ pub(crate) fn structure(pipeline: &Pipeline) -> Result<Vec<String>, PipelineErro
             }
         }
     }
-    order(pipeline)
+    Ok(())
 }
 
 /// Checks what a block says of being like another.
@@ -123,8 +123,8 @@ pub(crate) fn closure(targets: &[String], sources: impl Fn(&str) -> Vec<String>)
     found
 }
 
-/// Kahn's order, by name where there is a choice; what is left over is a cycle.
-fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
+/// An order in which every stage comes after those it needs: Kahn's, by name where there is a choice; what is left over is a cycle.
+pub(crate) fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
     let mut left: BTreeSet<&str> = pipeline.stages.keys().map(String::as_str).collect();
     let mut order: Vec<String> = Vec::new();
     while !left.is_empty() {

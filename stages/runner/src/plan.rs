@@ -160,31 +160,30 @@ impl Plan {
     }
 }
 
-/// What is to be made of a file that holds together.
+/// What is to be made.
 struct Goal<'a> {
     targets: &'a [String],
-    /// All stages, in an order in which each comes after those that it needs.
-    order: Vec<String>,
     /// The stages that the targets come to by the file alone.
     needed: BTreeSet<String>,
 }
 
 impl<'a> Goal<'a> {
     fn new(pipeline: &'a Pipeline, request: &'a Request) -> Result<Self, PlanError> {
-        let order = check::structure(pipeline)?;
+        check::names(pipeline)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
         if let Some(target) = targets.iter().find(|target| !pipeline.stages.contains_key(*target)) {
             let known = known_names(target, pipeline.stages.keys().map(String::as_str));
             return Err(PlanError::Usage(format!("no stage {target:?}; {known}")));
         }
         let needed = closure(targets, |stage| needs(pipeline, stage).map(str::to_owned).collect());
-        Ok(Self { targets, order, needed })
+        Ok(Self { targets, needed })
     }
 
     fn plan(&self, pipeline: &Pipeline, programs: &Programs, request: &Request) -> Result<Plan, PlanError> {
         check::blocks(pipeline, programs)?;
+        let order = check::order(pipeline)?;
         let (axes, notes) = Scope { pipeline, programs, needed: &self.needed }.axes(request)?;
-        let plan = Expansion::new(pipeline, programs, &axes).expand(&self.order, self.targets)?;
+        let plan = Expansion::new(pipeline, programs, &axes).expand(&order, self.targets)?;
         Ok(Plan { notes, ..plan })
     }
 }

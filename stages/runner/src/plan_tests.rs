@@ -42,7 +42,7 @@ fn descriptions() -> BTreeMap<String, Description> {
          "rules": [{"when": {"kernel": {"const": "average"}}, "must": {"scale": {"multipleOf": 1}}, "message": "average needs a whole scale"}]},
         {"name": "train", "output": {"kind": "field"},
          "inputs": {"scene": {"kinds": ["scene/train"], "summary": "scene"},
-                    "weights": {"kinds": ["weights"], "optional": true, "summary": "weights"}},
+                    "weights": {"kinds": ["weights", "field"], "optional": true, "summary": "weights"}},
          "parameters": {"properties": {
             "rays": {"type": ["integer", "null"], "format": "uint64", "minimum": 1, "default": null},
             "supersample": {"type": "number", "minimum": 1, "default": 2.0},
@@ -294,7 +294,12 @@ fn files_that_cannot_be_used() {
         ),
         ("{run: score}", "{run: score, more: ./x}", 18, "input more: a sink shows stages, and ./x is a folder"),
         ("{run: score}", "{}", 17, "input run is missing"),
-        ("  make: {}", "  make: {inputs: {x: score}}", 4, "its inputs lead back to it"),
+        (
+            "    inputs: {scene: prep/train}",
+            "    inputs: {scene: prep/train, weights: again}",
+            10,
+            "stage again: its inputs lead back to it",
+        ),
         ("  make: {}", "  ../make: {}", 3, "stage \"../make\": a stage's name begins with a letter"),
         ("  make: {}", "  a/b: {}", 3, "stage \"a/b\": a stage's name has no `/`"),
         ("  make: {}", "  a..b: {}", 3, "no `..`"),
