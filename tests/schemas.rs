@@ -32,7 +32,7 @@ fn schemas_are_current() {
     parameters::<refine::Refine>(&mut all);
     parameters::<upsample::Upsample>(&mut all);
     for (name, schema) in [
-        ("pipeline", of::<runner::Pipeline>()),
+        ("pipeline", of::<runner::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<artifact::Record>()),
