@@ -43,7 +43,7 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
-	cargo clippy --release -p train-ss -p render-depth -p locate -p eval --no-default-features --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p register -p eval --no-default-features --all-targets -- -D warnings
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	$(IN_FUZZ) cargo clippy --release -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
@@ -98,7 +98,7 @@ refine-table: build ## Rendered and refined views: make refine-table SCENES=fern
 	@python3 scripts/refine-table.py --data $(DATA) --scenes $(call given,SCENES,fern) --protocols $(call given,PROTOCOLS,252x2 252x4) --references $(REFERENCES) \
 	  $(if $(SPLIT),--split $(SPLIT)) --set $(SET) --out $(or $(OUT),out/refine-table.json)
 
-refine-ablation: build ## What each part of refinement brings, on views that its rehearsal leaves out
+refine-ablation: build ## What each part of refinement brings, on downscaled views that its training leaves out
 	@python3 scripts/refine-ablation.py --data $(DATA) --scenes $(call given,SCENES,fern) $(if $(SPLIT),--split $(SPLIT)) \
 	  $(if $(VARIANTS),--variants $(VARIANTS)) $(if $(PAPER_STEPS),--paper-steps $(PAPER_STEPS)) --set $(SET) --out $(or $(OUT),out/refine-ablation.json)
 

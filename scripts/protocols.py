@@ -8,9 +8,9 @@ BUDGET |= PHOTOGRAPHS
 OTHER_BUDGET = (60_000_000, 1)
 # `kernel` takes about a twelfth more time for a ray than `average`, which therefore gets as many more rays: equal times.
 AVERAGE_RAYS = 13 / 12
-# The field that a refiner rehearses with gets as many rays for an LR pixel, and no fewer than these. Of photographs it gets half as many: shrunk once
+# The downscaled field, which a refiner learns from, gets as many rays for an LR pixel, and no fewer than these. Of photographs it gets half as many: shrunk once
 # more they are easier to fit, and what fits them better lacks less, so that too little is learnt (docs/design/016-data-consistency.md).
-REHEARSAL_RAYS = 2_000_000
+DOWNSCALED_RAYS = 2_000_000
 
 
 def settings(protocol: str, supervision: str, refined: bool) -> dict:
@@ -24,5 +24,5 @@ def settings(protocol: str, supervision: str, refined: bool) -> dict:
     chosen["sub_rays"] = sub_rays
     if refined:
         as_many = round(rays / float(scale) ** 2)
-        chosen["rehearsal-field.rays"] = as_many // 2 if protocol in PHOTOGRAPHS else max(REHEARSAL_RAYS, as_many)
+        chosen["downscaled-field.rays"] = as_many // 2 if protocol in PHOTOGRAPHS else max(DOWNSCALED_RAYS, as_many)
     return chosen

@@ -30,7 +30,7 @@ options = parser.parse_args()
 ROWS = [
     ("report", "", {"refined": False, "enlarged": False}),
     ("refined", ", refined", {"refined": True, "enlarged": False}),
-    ("enlarged", ", refined, with enlarged photographs", {"refined": True, "enlarged": True}),
+    ("sisr-fuse", ", refined, with enlarged photographs", {"refined": True, "enlarged": True}),
 ][: 3 if options.enlarged else 2 if options.refined else 1]
 TARGET = ROWS[-1][0]
 

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """What each part of refinement brings: `make refine-ablation`.
 
-A refiner is trained for each row, and scored as its training ends, by views of the rehearsal that it left out: at LR size, where LR pictures are the
-truth, so that choices made by this table look at no HR picture and at no test view. References are other views of the rehearsal.
+A refiner is trained for each row, and scored as its training ends, by views of the downscaled field that it left out: at LR size, where LR pictures are the
+truth, so that choices made by this table look at no HR picture and at no test view. References are other views of that field.
 
 Rows of the paper's network follow, whose parts ours doesn't have: perceptual loss, several reference patches, patches that overlap. They are scored at HR on
 the test views, by a network of a quarter of the published width and by few steps: what a part brings there, not what the published training reaches.
@@ -26,7 +26,7 @@ PARTS = [
     ("no reference", ["train-refine.references=0"]),
     ("one reference, no occlusion test", [ONE, "train-refine.occlusion=false"]),
     ("one reference, aligned", [ONE, "train-refine.alignment=true"]),
-    ("one reference, expected depth", [ONE, "rehearsal-views.depth=expected"]),
+    ("one reference, expected depth", [ONE, "downscaled-views.depth=expected"]),
     ("one reference, lens ignored", [ONE, "prep.lens=ignore"]),
     ("two references", ["train-refine.references=2"]),
     ("four references", ["train-refine.references=4"]),
@@ -73,17 +73,17 @@ def trained(scene: str, settings: list[str]) -> dict:
     return json.loads((folder / "refiner.json").read_text())
 
 
-def published(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, dict]:
+def paper_refined(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, dict]:
     """Figures of the test views as rendered, and as the paper's network redraws them."""
     chosen = protocols.settings(options.protocol, "kernel", refined=False) | PAPER_SIZE
     chosen |= {"prep.references": 1, "train-paper.steps": options.paper_steps}
     chosen |= {"split": options.split} if options.split else {}
     chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
-    settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("rehearsal")]
+    settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("downscaled")]
     weights = options.data / "weights"
     inputs = {"train-paper.weights": weights} if perceptual and weights.is_dir() else {}
     page = options.out.parent / "refine-ablation" / scene
-    rendered, redrawn = cells.run_target("published", options.nerf_sr, page, cells.dataset(options.data, scene), settings, weights, inputs)
+    rendered, redrawn = cells.run_target("paper-refine", options.nerf_sr, page, cells.dataset(options.data, scene), settings, weights, inputs)
     return rendered, redrawn
 
 
@@ -96,7 +96,7 @@ for name, settings in PARTS[: options.variants]:
         cells.write(options.out, rows)
 
 if rows:
-    print(f"Views of the rehearsal left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")
+    print(f"Downscaled views left out, {', '.join(options.scenes)}, {options.protocol}, {options.steps} steps, means:\n")
     print("| variant | rendered | refined | gain | against the first |")
     print("| --- | --- | --- | --- | --- |")
     of = lambda name: [row for row in rows if row["variant"] == name]
@@ -110,7 +110,7 @@ if options.paper_steps:
     for name, settings, perceptual in PAPER_PARTS:
         for scene in options.scenes:
             print("==", scene, name, flush=True)
-            for variant, row in zip(("rendered", name), published(scene, settings, perceptual)):
+            for variant, row in zip(("rendered", name), paper_refined(scene, settings, perceptual)):
                 scores = {key: row[key] for key in ("psnr", "ssim", "lpips")}
                 paper += [kept] if (kept := {"variant": variant, "scene": scene, **scores}) not in paper else []
             cells.write(options.out, rows + paper)

@@ -32,20 +32,20 @@ def cell(scene: str, protocol: str, references: int) -> list[dict]:
     page = options.out.parent / "refine-table" / f"{scene}-{protocol}-{references}"
     chosen = protocols.settings(protocol, "kernel", refined=True)
     chosen |= {"prep.references": max(options.references)}
-    chosen |= {f"{stage}.references": references for stage in ("train-joined", "train-referenced", "refine-referenced")}
+    chosen |= {f"{stage}.references": references for stage in ("finetuned-field", "train-reference", "refine-reference")}
     chosen |= {"split": options.split} if options.split else {}
     given = dict(setting.split("=", 1) for setting in options.set)
     # Half of what the field has, so that all that references need takes less time than the field.
-    chosen |= {"train-joined.rays": int(given.get("rays", chosen["rays"])) // 2} | given
+    chosen |= {"finetuned-field.rays": int(given.get("rays", chosen["rays"])) // 2} | given
     settings = [f"{name}={value}" for name, value in chosen.items()]
     folder = cells.dataset(options.data, scene)
-    results = cells.results("referenced", options.nerf_sr, page, folder, settings, options.data / "weights")
-    results = [next(row for row in results if row["stage"] == stage) for stage in ("eval", "eval-refined", "eval-referenced")]
+    results = cells.results("reference-refine", options.nerf_sr, page, folder, settings, options.data / "weights")
+    results = [next(row for row in results if row["stage"] == stage) for stage in ("eval", "eval-refined", "eval-reference")]
     rendered = cells.view_psnr(results[0])
     near = views_near_references(pathlib.Path(results[0]["stages"]["prep"]["folder"]))
     kinds = [("ss", 0, "render_s"), ("refine", 0, "refine_s"), ("refine", references, "refine_s")]
     # What rendering both fields takes more than one counts as refining, where references ask for it.
-    second = max(0, cells.seconds(results[-1], "joined-views") - cells.seconds(results[0], "render-depth"))
+    second = max(0, cells.seconds(results[-1], "finetuned-views") - cells.seconds(results[0], "render-depth"))
     rows = []
     for (method, count, spent), result in zip(kinds, results):
         row, views = cells.figures(result), cells.view_psnr(result)

@@ -84,20 +84,20 @@ sub_rays = math.ceil(float(further.get("supersample", 2))) ** 2
 
 
 def blocks(method: str, protocol: str, rays: int) -> dict:
-    """The pipeline's blocks that a method needs besides those of pipeline.yaml; eval-METHOD scores it."""
+    """The pipeline's blocks that a method needs besides those of the shipped files; eval-METHOD scores it."""
     lr, scale = protocol.split("x")
     average = {"supervision": "average", "rays": round(rays * protocols.AVERAGE_RAYS)}
     plain = average | {"supersample": 1}
     # By the kernel, ours are pipeline.yaml's own.
     views = {"kernel": "render-depth", "refine": "refine"}.get(method, f"views-{method}")
-    score = {f"eval-{method}": {"like": "eval", "inputs": {"views": views, "truth": "prep/truth"}}}
+    score = {f"eval-{method}": {"extends": "eval", "inputs": {"views": views, "truth": "prep/truth"}}}
 
     def field(name: str, parameters: dict, scene: str = "prep/train") -> dict:
         # Plain NeRF has a ray a pixel in training and in rendering.
         rendering = {"sub_rays": 1} if name.startswith("nerf") else {}
         return {
-            f"field-{name}": {"like": "train-ss", "inputs": {"scene": scene}, "parameters": parameters},
-            f"views-{name}": {"like": "render-depth", "inputs": {"field": f"field-{name}", "cameras": "prep/cameras"}, "parameters": rendering},
+            f"field-{name}": {"extends": "train-ss", "inputs": {"scene": scene}, "parameters": parameters},
+            f"views-{name}": {"extends": "render-depth", "inputs": {"field": f"field-{name}", "cameras": "prep/cameras"}, "parameters": rendering},
         }
 
     if method == "nerf":
@@ -107,13 +107,13 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
     if method == "ss":
         return score | field(method, average)
     if method == "hr":
-        prep = {"like": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr": round(int(lr) * float(scale)), "scale": 1}}
+        prep = {"extends": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr": round(int(lr) * float(scale)), "scale": 1}}
         return score | {"prep-hr": prep} | field(method, plain, "prep-hr/train")
     if method in ("mlp", "mlp-nerf"):
         paper = {"field": "mlp", "rays": options.mlp_rays, "members": 1, "supervision": "average"}
         return score | field(method, paper | {"supersample": 1 if method == "mlp-nerf" else 2})
     if method in ("bicubic", *NETWORKS):
-        low = {"like": "render-depth", "inputs": {"field": "field-nerf", "cameras": "prep/cameras"}}
+        low = {"extends": "render-depth", "inputs": {"field": "field-nerf", "cameras": "prep/cameras"}}
         low["parameters"] = {"size": int(lr), "sub_rays": 1}
         enlarged = {"run": "upsample", "inputs": {"views": "views-low", "cameras": "prep/cameras"}, "parameters": {"method": method}}
         if method in NETWORKS:
@@ -122,7 +122,7 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
     return score
 
 
-# Blocks that others are like, which therefore may be meant without being run themselves.
+# Blocks that others extend, which therefore may be meant without being run themselves.
 OF = {"supervision": "train-ss", "rays": "train-ss", "members": "train-ss", "sub_rays": "render-depth"}
 
 
@@ -137,7 +137,7 @@ def missing(method: str, protocol: str) -> str | None:
 
 def seconds(stages: dict) -> tuple[float, float]:
     """Of training and of rendering; what is rendered on the way to a refiner belongs to its training."""
-    trains = lambda name: name.startswith(("field-", "train-", "rehearsal-"))
+    trains = lambda name: name.startswith(("field-", "train-", "downscaled-"))
     renders = lambda name: name.startswith(("views-", "render-", "refine"))
     return tuple(sum(stages[s]["seconds"] for s in stages if of(s)) for of in (trains, renders))
 
@@ -150,10 +150,10 @@ def cell(scene: str, protocol: str) -> list[dict]:
     chosen = protocols.settings(protocol, "kernel", True) | {"kernel": options.kernel}
     if options.rays:
         chosen["rays"] = options.rays
-        chosen["rehearsal-field.rays"] = min(chosen["rehearsal-field.rays"], options.rays)
+        chosen["downscaled-field.rays"] = min(chosen["downscaled-field.rays"], options.rays)
     chosen |= {"split": options.split} if options.split else {}
     if "refine" not in options.methods:
-        del chosen["rehearsal-field.rays"]
+        del chosen["downscaled-field.rays"]
     chosen |= further
     run = [method for method in options.methods if not missing(method, protocol)]
     made: dict = {}
@@ -165,7 +165,9 @@ def cell(scene: str, protocol: str) -> list[dict]:
     made["table"] = {"run": "report", "inputs": inputs, "parameters": shown}
     page = options.out.parent / "table" / f"{scene}-{protocol}"
     page.mkdir(parents=True, exist_ok=True)
-    text = options.pipeline.read_text().rstrip() + "\n\n  # Added by scripts/table.py.\n"
+    extended = options.pipeline.resolve()
+    extended = extended.parent / "pipelines/refined.yaml" if "refine" in run else extended
+    text = f"# Written by scripts/table.py.\nextends: {json.dumps(str(extended))}\ndefault: [table]\nstages:\n"
     text += "".join(f"  {name}: {json.dumps(block)}\n" for name, block in made.items())
     (page / "pipeline.yaml").write_text(text)
     store = options.pipeline.resolve().parent / ".nerf-sr"

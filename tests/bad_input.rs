@@ -179,7 +179,7 @@ fn pipelines_that_cannot_be_used() {
             "prep/train}",
             "prep/test}",
             10,
-            "no folder \"test\"; known: cameras, references, rehearsal, train, train-cameras, truth",
+            "no folder \"test\"; known: cameras, downscaled, references, train, train-cameras, truth",
         ),
         ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
         ("{dataset: demo-scene}", "{dataset: render-depth}", 7, "takes dataset, but render-depth is views"),

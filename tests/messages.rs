@@ -11,7 +11,7 @@ use common::{Finished, Project, bin, demo_train, last_checkpoint, signal, stage_
 /// A pipeline of two stages that are one shell script; `run` is what it does, with `$out` its output.
 fn talking(run: &str) -> Project {
     let project =
-        Project::new("default: [talk]\nstages:\n  talk: {run: ./talk}\n  other: {like: talk, parameters: {word: other}}\n");
+        Project::new("default: [talk]\nstages:\n  talk: {run: ./talk}\n  other: {extends: talk, parameters: {word: other}}\n");
     let description = r#"{"name": "talk", "version": "1", "code": "1", "summary": "Talks.", "inputs": {},
       "parameters": {"type": "object", "properties": {"word": {"type": "string", "default": "hello"}}}, "output": {"kind": "text"}}"#;
     let script = format!(

@@ -52,6 +52,7 @@ fn every_command_plans() {
         std::fs::write(target.join("x"), "").unwrap();
     }
     std::fs::rename(project.path("pipeline.yaml"), project.path("project/pipeline.yaml")).unwrap();
+    project.copy_pipelines("project");
     let mut planned = 0;
     for block in blocks(&documents(), "sh") {
         let joined = block.replace("\\\n", " ");

@@ -1,4 +1,4 @@
-//! `nerf-sr run refined`: a network that rehearsed one size down gives views the detail they lack.
+//! `nerf-sr run refined`: a network that has learnt one size down gives views the detail they lack.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -9,78 +9,24 @@ use std::time::SystemTime;
 
 use common::{Finished, Project, data, kill_again_and_again, manifest, signal, stage, stage_command, wait_until};
 
+/// The shipped targets at tiny sizes.
 const REFINED: &str = "
-  rehearsal-field:
-    like: train-ss
-    inputs: {scene: prep/rehearsal}
+  downscaled-field:
     parameters: {rays: 40000}
-  rehearsal-views:
-    like: render-depth
-    inputs: {field: rehearsal-field, cameras: prep/train}
   train-refine:
-    inputs: {views: rehearsal-views, truth: prep/train, photographs: prep/rehearsal, cameras: prep/cameras}
     parameters: {steps: 60, batch: 4, square: 16, channels: 8, blocks: 1}
-  refine:
-    inputs: {views: render-depth, refiner: train-refine, photographs: prep/train}
-  eval-refined:
-    like: eval
-    inputs: {views: refine, truth: prep/truth}
-  refined:
-    run: report
-    inputs: {run: eval, refined: eval-refined}
   upsample:
-    inputs: {views: prep/train, cameras: prep/train-cameras}
-  refine-enlarged:
-    like: refine
-    inputs: {views: render-depth, refiner: train-refine, photographs: prep/train, enlarged: upsample}
-  eval-enlarged:
-    like: eval
-    inputs: {views: refine-enlarged, truth: prep/truth}
-  enlarged:
-    run: report
-    inputs: {run: eval, refined: eval-refined, enlarged: eval-enlarged}
-  train-joined:
-    like: train-ss
-    inputs: {scene: prep/train, references: prep/references, field: train-ss}
-  joined-views:
-    like: render-depth
-    inputs: {field: train-joined, cameras: prep/cameras}
-  reference-views:
-    like: render-depth
-    inputs: {field: train-ss, cameras: prep/references}
-  train-referenced:
-    like: train-refine
-    inputs: {views: rehearsal-views, truth: prep/train}
+    parameters: {method: bicubic}
+  finetuned-field:
+    parameters: {rays: 60000}
+  train-reference:
     parameters: {references: 2}
-  refine-referenced:
-    like: refine
-    inputs: {views: joined-views, refiner: train-referenced, references: prep/references, reference-views: reference-views}
-  eval-referenced:
-    like: eval
-    inputs: {views: refine-referenced, truth: prep/truth}
-  referenced:
-    run: report
-    inputs: {run: eval, refined: eval-refined, anything: eval-referenced}
   train-paper:
-    like: train-refine
-    inputs: {views: reference-views, truth: prep/references}
-    parameters: {net: paper, steps: 3, batch: 2, square: 16, channels: 4}
-  refine-paper:
-    like: refine
-    inputs: {views: render-depth, refiner: train-paper, references: prep/references, reference-views: reference-views}
-  eval-paper:
-    like: eval
-    inputs: {views: refine-paper, truth: prep/truth}
-  published:
-    run: report
-    inputs: {run: eval, paper: eval-paper}
+    parameters: {steps: 3, batch: 2, square: 16, channels: 4}
 ";
 
 fn project() -> Project {
-    let project = Project::tiny();
-    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
-    project.write("pipeline.yaml", &(text + REFINED));
-    project
+    Project::shipped(&["sisr-fuse", "paper-refine"], REFINED)
 }
 
 #[test]
@@ -119,9 +65,9 @@ fn refined_views_stand_beside_rendered_ones() {
     stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[]).fails(3, &["refiner.json"]);
 }
 
-/// What a block is like reaches it from the file and from the command line, save what it says itself.
+/// What a block extends reaches it from the file and from the command line, save what it says itself.
 #[test]
-fn a_block_like_another_follows_it() {
+fn a_block_follows_the_one_it_extends() {
     let project = project();
     let parameters = |stage: &str, name: &str, more: &[&str]| -> Vec<String> {
         project.ok(&[&["run", "refined"], more].concat());
@@ -130,20 +76,23 @@ fn a_block_like_another_follows_it() {
         let nodes = run["nodes"].as_array().unwrap().iter().filter(|n| n["stage"] == stage);
         nodes.map(|n| n["parameters"][name].to_string()).collect()
     };
-    assert_eq!(parameters("rehearsal-field", "levels", &[]), ["4"]);
+    assert_eq!(parameters("downscaled-field", "levels", &[]), ["4"]);
     let both = ["-p", "supersample=1,2", "-p", "rays=50000"];
-    assert_eq!(parameters("rehearsal-field", "supersample", &both), ["1.0", "2.0"]);
+    assert_eq!(parameters("downscaled-field", "supersample", &both), ["1.0", "2.0"]);
     assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
-    assert_eq!(parameters("rehearsal-field", "rays", &both), ["40000", "40000"]);
-    assert_eq!(parameters("rehearsal-field", "rays", &["-p", "rehearsal-field.rays=30000"]), ["30000"]);
-    for (from, to, words) in [
-        ("like: train-ss", "like: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
-        ("like: render-depth", "like: rehearsal-field", &["itself like another"]),
-        ("like: eval", "like: eval\n    run: eval", &["give one of them"]),
+    assert_eq!(parameters("downscaled-field", "rays", &both), ["40000", "40000"]);
+    assert_eq!(parameters("downscaled-field", "rays", &["-p", "downscaled-field.rays=30000"]), ["30000"]);
+    let own = "parameters: {rays: 40000}";
+    for (more, words) in [
+        ("extends: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
+        ("extends: downscaled-views", &["itself extends another"]),
+        ("extends: train-ss\n    run: train-ss", &["give one of them"]),
+        ("like: train-ss", &["pipeline.yaml:", "`like` is called `extends` now"]),
     ] {
-        project.replace(from, to);
+        let changed = format!("{own}\n    {more}");
+        project.replace(own, &changed);
         project.run(&["plan", "refined"]).fails(2, words);
-        project.replace(to, from);
+        project.replace(&changed, own);
     }
 }
 
@@ -186,10 +135,10 @@ fn views_agree_with_their_own_photographs() {
 #[test]
 fn views_are_means_with_their_enlarged_photographs() {
     let project = project();
-    let split = ["enlarged", "-p", "split=paper"];
+    let split = ["sisr-fuse", "-p", "split=paper"];
     project.ok(&[&["run"], &split[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &split);
-    let summary = std::fs::read_to_string(folder("refine-enlarged").join("summary.txt")).unwrap();
+    let summary = std::fs::read_to_string(folder("refine-sisr").join("summary.txt")).unwrap();
     assert!(summary.contains("14 are means") && summary.contains("14 of them agree"), "{summary}");
 
     let (views, refiner, enlarged) = (folder("render-depth"), folder("train-refine"), project.path("enlarged"));
@@ -236,8 +185,8 @@ fn references_are_used_by_a_network_that_knows_how() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
-    let (views, refiner) = (folder("joined-views"), folder("train-referenced"));
-    let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-referenced"));
+    let (views, refiner) = (folder("finetuned-views"), folder("train-reference"));
+    let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-reference"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
         let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
         let output = project.path(name);
@@ -274,7 +223,7 @@ fn seen_from_the_front() -> (Project, Vec<&'static str>) {
     project.replace("rays: 40000", "rays: 200000");
     project.replace("parameters: {references: 2}", "parameters: {references: 2, steps: 600, channels: 16, blocks: 2}");
     let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
-    (project, [&["refine-referenced", "-p", "prep.references=2"], &from_the_front[..]].concat())
+    (project, [&["refine-reference", "-p", "prep.references=2"], &from_the_front[..]].concat())
 }
 
 /// A copy of a folder with its files of a kind changed.
@@ -320,8 +269,8 @@ fn bad_references_do_no_harm() {
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner, prep, reference_views) =
-        (folder("joined-views"), folder("train-referenced"), folder("prep"), folder("reference-views"));
-    println!("{}", project.json("train-referenced", "refiner.json", &target));
+        (folder("finetuned-views"), folder("train-reference"), folder("prep"), folder("reference-views"));
+    println!("{}", project.json("train-reference", "refiner.json", &target));
     let references = prep.join("references");
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
         changed(&project, name, of, "exr", &|path| change_depth(path, change))
@@ -378,11 +327,11 @@ fn tables_have_rendered_and_refined_rows() {
         std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
     }
     let table = ["--scenes", "demo", "--protocols", "24x2", "--references", "1", "2", "--out", "out/table.json"];
-    let more = ["--set", "rays=60000", "rehearsal-field.rays=30000"];
+    let more = ["--set", "rays=60000", "downscaled-field.rays=30000"];
     let made = project.script("refine-table.py", &[&table[..], &more].concat());
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| 24x2 | demo | refine | 2 |"), "{}", made.stdout);
-    assert!(made.stdout.contains("train-joined.rays=30000"), "half of what is set: {}", made.stdout);
+    assert!(made.stdout.contains("finetuned-field.rays=30000"), "half of what is set: {}", made.stdout);
     let read =
         |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
     let rows: Vec<(String, u64)> = read("out/table.json")
@@ -409,7 +358,7 @@ fn tables_have_rendered_and_refined_rows() {
     assert_eq!(kinds, [(false, false), (true, false), (true, true)]);
 
     let ours = ["--protocol", "24x2", "--variants", "4", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
-    let parts = [&["--scenes", "demo"], &ours[..], &["--set", "rehearsal-field.rays=30000"]].concat();
+    let parts = [&["--scenes", "demo"], &ours[..], &["--set", "downscaled-field.rays=30000"]].concat();
     let made = project.script("refine-ablation.py", &parts);
     assert_eq!(made.code, 0, "{}", made.stderr);
     for part in ["no occlusion test", "aligned"] {
@@ -426,28 +375,19 @@ fn tables_have_rendered_and_refined_rows() {
 /// HR references that join the training: what they show is learnt.
 #[test]
 fn references_join_a_training() {
-    let project = Project::tiny();
-    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
-    let joined = "  train-joined:
-    like: train-ss
+    // A field of its own that learns from both, beside the shipped one, which goes on from the field of LR pictures.
+    let joined = "
+  joined-field:
+    extends: train-ss
     inputs: {scene: prep/train, references: prep/references}
   joined-views:
-    like: render-depth
-    inputs: {field: train-joined, cameras: prep/cameras}
+    extends: render-depth
+    inputs: {field: joined-field, cameras: prep/cameras}
   eval-joined:
-    like: eval
+    extends: eval
     inputs: {views: joined-views, truth: prep/truth}
-  train-on:
-    like: train-ss
-    inputs: {scene: prep/train, references: prep/references, field: train-ss}
-  on-views:
-    like: render-depth
-    inputs: {field: train-on, cameras: prep/cameras}
-  eval-on:
-    like: eval
-    inputs: {views: on-views, truth: prep/truth}
 ";
-    project.write("pipeline.yaml", &(text + joined));
+    let project = Project::shipped(&["hr-finetune"], joined);
     let arguments = ["eval", "eval-joined", "-p", "prep.references=6", "-p", "train-ss.rays=200000"];
     project.ok(&[&["run"], &arguments[..]].concat());
     let psnr = |stage: &str| {
@@ -462,14 +402,14 @@ fn references_join_a_training() {
     for begun in ["beside", "averaged"] {
         let on = |rays: &str, references: &str| {
             let given = [("rays", rays), ("references", references), ("begun", begun)]
-                .map(|(name, value)| format!("train-on.{name}={value}"));
+                .map(|(name, value)| format!("finetuned-field.{name}={value}"));
             let more =
                 ["-p", "prep.references=6", "-p", "train-ss.rays=200000", "-p", &given[0], "-p", &given[1], "-p", &given[2]];
-            let arguments = [&["eval-on"], &more[..]].concat();
+            let arguments = [&["eval-finetuned"], &more[..]].concat();
             project.ok(&[&["run"], &arguments[..]].concat());
-            let on = project.json("eval-on", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
+            let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
             println!("{on:.2} dB, {given:?}");
-            let field = project.artifact("train-on", &arguments);
+            let field = project.artifact("finetuned-field", &arguments);
             let weights = |field: &Path, member: u32| std::fs::read(field.join(format!("field-{member}.safetensors"))).ok();
             assert_eq!(weights(&field, 1).is_some(), begun == "beside");
             assert_eq!(weights(&field, 0) == weights(&first, 0), begun == "beside", "the field begun from is the first member");
@@ -480,10 +420,10 @@ fn references_join_a_training() {
         assert!(on("100000", "1") > psnr("eval") - 0.02);
     }
     // None of them, and all is as without.
-    let none = [&arguments[..], &["-p", "train-joined.references=0"]].concat();
+    let none = [&arguments[..], &["-p", "joined-field.references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
     let weights = |stage: &str| std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap();
-    assert!(weights("train-joined") == weights("train-ss"));
+    assert!(weights("joined-field") == weights("train-ss"));
 }
 
 /// Only a field that the same parameters give of the same scene can be gone on from.
@@ -516,12 +456,12 @@ fn other_fields_are_not_gone_on_from() {
         .fails(2, &["parameter members: members = 17 is not in 1..=16 with those of input field beside", "begun averaged"]);
 }
 
-/// Rendered views of the rehearsal and their truth, and parameters of a training of a few seconds.
+/// Rendered downscaled views and their truth, and parameters of a training of a few seconds.
 fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'static str) {
-    project.ok(&["run", "rehearsal-views"]);
-    let folder = |stage: &str| project.artifact(stage, &["rehearsal-views"]);
+    project.ok(&["run", "downscaled-views"]);
+    let folder = |stage: &str| project.artifact(stage, &["downscaled-views"]);
     (
-        folder("rehearsal-views"),
+        folder("downscaled-views"),
         folder("prep").join("train"),
         r#"{"steps": 600, "batch": 8, "square": 24, "channels": 32, "blocks": 2}"#,
     )
@@ -554,10 +494,10 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
 #[test]
 fn views_that_were_finished_are_kept() {
     let project = project();
-    project.ok(&["run", "refine-referenced", "-p", "prep.references=2"]);
-    let folder = |stage: &str| project.artifact(stage, &["refine-referenced", "-p", "prep.references=2"]);
+    project.ok(&["run", "refine-reference", "-p", "prep.references=2"]);
+    let folder = |stage: &str| project.artifact(stage, &["refine-reference", "-p", "prep.references=2"]);
     let (prep, field, rendered) = (folder("prep"), folder("train-ss"), folder("reference-views"));
-    let (cameras, references, refiner) = (prep.join("train"), prep.join("references"), folder("train-referenced"));
+    let (cameras, references, refiner) = (prep.join("train"), prep.join("references"), folder("train-reference"));
     let views = project.path("render-depth-whole");
     let render = [("field", field.as_path()), ("cameras", &cameras)];
     let refine = [("views", views.as_path()), ("refiner", &refiner), ("references", &references), ("reference-views", &rendered)];
@@ -625,7 +565,7 @@ fn wrong_views_are_refused_in_a_line() {
         stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
     };
     train(r#"{"square": 15}"#, &views, &truth).fails(2, &["parameter square: 15 is odd"]);
-    train("{}", &views, &truth.with_file_name("rehearsal")).fails(3, &["24×24 pixels where its picture has 12×12"]);
+    train("{}", &views, &truth.with_file_name("downscaled")).fails(3, &["24×24 pixels where its picture has 12×12"]);
     train("{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has a picture, by name and pose, in input truth"]);
 }
@@ -649,14 +589,12 @@ fn the_paper_s_network_refines_by_references() {
     if let Some(data) = data() {
         std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
     }
-    let parts =
-        ["--scenes", "demo", "--protocol", "36x2", "--variants", "0", "--paper-steps", "2", "--out", "out/published.json"];
+    let parts = ["--scenes", "demo", "--protocol", "36x2", "--variants", "0", "--paper-steps", "2", "--out", "out/paper.json"];
     let small = ["--set", "rays=60000", "train-paper.channels=4", "train-paper.batch=2"];
     let made = project.script("refine-ablation.py", &[&parts[..], &small].concat());
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| patches side by side |"), "{}", made.stdout);
-    let rows: Vec<serde_json::Value> =
-        serde_json::from_slice(&std::fs::read(project.path("out/published.json")).unwrap()).unwrap();
+    let rows: Vec<serde_json::Value> = serde_json::from_slice(&std::fs::read(project.path("out/paper.json")).unwrap()).unwrap();
     let psnr: Vec<f64> = rows.iter().map(|r| r["psnr"].as_f64().unwrap()).collect();
     assert!(psnr.len() == 5 && psnr.iter().all(|p| p.is_finite()), "{psnr:?}");
     assert!(psnr[1] != psnr[3], "fewer reference patches change nothing: {psnr:?}");

@@ -27,12 +27,12 @@ fn schemas_are_current() {
     parameters::<report::Report>(&mut all);
     parameters::<camera_path::CameraPath>(&mut all);
     parameters::<video::Video>(&mut all);
-    parameters::<locate::Locate>(&mut all);
+    parameters::<register::Register>(&mut all);
     parameters::<train_refine::TrainRefine>(&mut all);
     parameters::<refine::Refine>(&mut all);
     parameters::<upsample::Upsample>(&mut all);
     for (name, schema) in [
-        ("pipeline", of::<runner::Pipeline>()),
+        ("pipeline", of::<runner::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<artifact::Record>()),

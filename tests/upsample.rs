@@ -13,13 +13,13 @@ fn project() -> Project {
     let project = Project::tiny();
     let blocks = "
   views-low:
-    like: render-depth
+    extends: render-depth
     inputs: {field: train-ss, cameras: prep/cameras}
     parameters: {size: 24}
   upsample:
     inputs: {views: views-low, cameras: prep/cameras}
   eval-upsampled:
-    like: eval
+    extends: eval
     inputs: {views: upsample, truth: prep/truth}
 ";
     let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();

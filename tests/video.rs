@@ -5,28 +5,14 @@ mod common;
 
 use common::Project;
 
-const FLIGHT: &str = "
-  camera-path:
-    inputs: {cameras: prep/train}
-    parameters: {frames: 6}
-  path-views:
-    like: render-depth
-    inputs: {field: train-ss, cameras: camera-path}
-  video:
-    inputs: {run: path-views}
-";
-
 fn project() -> Project {
-    let project = Project::tiny();
-    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
-    project.write("pipeline.yaml", &(text + FLIGHT));
-    project
+    Project::shipped(&["video"], "  camera-path:\n    parameters: {frames: 6}\n")
 }
 
 #[test]
 fn a_flight_is_rendered_and_filmed() {
     let project = project();
-    // `sub_rays` is a parameter of two blocks; the film's are like the other's.
+    // `sub_rays` is a parameter of two blocks; the film's extends the other.
     let first = project.run(&["run", "video", "-p", "sub_rays=1"]);
     assert_eq!(first.code, 0, "{}", first.stderr);
     for i in 0..6 {

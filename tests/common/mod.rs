@@ -80,6 +80,26 @@ impl Project {
         Self::new(FAST)
     }
 
+    /// The tiny pipeline with shipped targets; `blocks` are changes of their blocks, and further ones.
+    pub fn shipped(targets: &[&str], blocks: &str) -> Self {
+        let project = Self { dir: tempfile::tempdir().unwrap() };
+        project.write("base/pipeline.yaml", TINY);
+        project.copy_pipelines("base");
+        let files: Vec<String> = targets.iter().map(|target| format!("base/pipelines/{target}.yaml")).collect();
+        let stages = if blocks.is_empty() { String::new() } else { format!("stages:\n{blocks}") };
+        project.write("pipeline.yaml", &format!("extends: [{}]\ndefault: [eval]\n{stages}", files.join(", ")));
+        project
+    }
+
+    /// Copies the shipped `pipelines/` into a folder.
+    pub fn copy_pipelines(&self, folder: &str) {
+        for entry in std::fs::read_dir(root().join("pipelines")).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_name().unwrap().to_str().unwrap().to_owned();
+            self.write(&format!("{folder}/pipelines/{name}"), &std::fs::read_to_string(&path).unwrap());
+        }
+    }
+
     pub fn path(&self, file: &str) -> PathBuf {
         self.dir.path().join(file)
     }
@@ -90,12 +110,15 @@ impl Project {
         std::fs::write(path, text).unwrap();
     }
 
-    /// Changes the pipeline's text.
+    /// Changes the text of the pipeline, and of the tiny one that it extends.
     #[track_caller]
     pub fn replace(&self, from: &str, to: &str) {
-        let text = std::fs::read_to_string(self.path("pipeline.yaml")).unwrap();
-        assert!(text.contains(from), "the pipeline has no {from:?}");
-        self.write("pipeline.yaml", &text.replace(from, to));
+        let files = ["pipeline.yaml", "base/pipeline.yaml"];
+        let texts = files.map(|file| (file, std::fs::read_to_string(self.path(file)).unwrap_or_default()));
+        assert!(texts.iter().any(|(_, text)| text.contains(from)), "the pipeline has no {from:?}");
+        for (file, text) in texts.iter().filter(|(_, text)| text.contains(from)) {
+            self.write(file, &text.replace(from, to));
+        }
     }
 
     pub fn command(&self, arguments: &[&str]) -> Command {

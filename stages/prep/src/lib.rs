@@ -7,7 +7,7 @@
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
 //!
-//! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `rehearsal/` (the
+//! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `downscaled/` (the
 //! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `train-cameras/` and `cameras/` (the training
 //! and the test cameras at HR size, no pictures), `truth/` (HR test images, depth), `references/` (HR training images).
 
@@ -213,7 +213,7 @@ impl Stage for Prep {
     fn output() -> Output {
         Output::kind("scene")
             .with_subtree("train", "scene/train")
-            .with_subtree("rehearsal", "scene/train")
+            .with_subtree("downscaled", "scene/train")
             .with_subtree("train-cameras", "scene/cameras")
             .with_subtree("cameras", "scene/cameras")
             .with_subtree("truth", "scene/truth")
@@ -484,7 +484,7 @@ impl Job<'_> {
             views.hull = Some("hull.safetensors".to_owned());
         }
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
-        self.write_rehearsal(&views, &train_pictures)?;
+        self.write_downscaled(&views, &train_pictures)?;
         drop(train_pictures);
         let degradation = Degradation { kernel: self.making.kernel, hr: self.sizes.hr.into() };
         for subtree in ["train", "truth"] {
@@ -547,7 +547,7 @@ impl Job<'_> {
     }
 
     /// The same task one size down, where its solution is known: LR pictures shrunk as HR ones were to make them.
-    fn write_rehearsal(&self, train: &Views, pictures: &[TrainingPicture]) -> anyhow::Result<()> {
+    fn write_downscaled(&self, train: &Views, pictures: &[TrainingPicture]) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
         let kernel = self.making.kernel;
@@ -556,16 +556,16 @@ impl Job<'_> {
             let k = &view.camera.intrinsics;
             let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
             let small = picture.shrunk((width as usize, height as usize), kernel);
-            self.write_low("rehearsal/images", &view.camera.name, &small)?;
+            self.write_low("downscaled/images", &view.camera.name, &small)?;
             let mask = mask.as_ref().map(|mask| self.low_mask(mask, &small));
-            mask.iter().try_for_each(|mask| self.write_mask("rehearsal", &view.camera.name, mask))?;
+            mask.iter().try_for_each(|mask| self.write_mask("downscaled", &view.camera.name, mask))?;
             Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
         };
         let views = train.views.par_iter().zip(pictures).map(make).collect::<anyhow::Result<Vec<_>>>()?;
-        self.context.write_json(&format!("rehearsal/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
+        self.context.write_json(&format!("downscaled/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
         // LR pictures that weren't rounded are shrunk by the box: the same, and for any size.
         let kernel = if kernel == Kernel::Average { Kernel::Box } else { kernel };
-        self.context.write_json(&format!("rehearsal/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
+        self.context.write_json(&format!("downscaled/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
     }
 
     /// LR and HR size of a view: other shapes are shrunk as much as the first view is.

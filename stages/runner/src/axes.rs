@@ -9,6 +9,7 @@ use serde_json::Value;
 use crate::arguments;
 use crate::pipeline::Pipeline;
 use crate::plan::{PlanError, Request};
+use crate::renames::known_blocks;
 use crate::stages::{Programs, StageProgram};
 
 /// A value that is set, or several that are swept.
@@ -127,7 +128,7 @@ impl Scope<'_> {
     }
 
     /// The stage that a name belongs to, and the name without it. Where several stages have the name, that one is meant that the targets need; a
-    /// block that is like another follows that one.
+    /// block that extends another follows that one.
     fn owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
         // A stage's own name may have a point.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
@@ -139,7 +140,7 @@ impl Scope<'_> {
         let follows = |stage: &str| {
             let block = &self.pipeline.stages[stage];
             let own = block.gives(kind == Kind::Parameter, name);
-            block.like.as_ref().is_some_and(|other| self.needed.contains(other) || !own)
+            block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !own)
         };
         let with_name: Vec<&String> = self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
         let meant: Vec<&String> = with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
@@ -158,7 +159,7 @@ impl Scope<'_> {
     fn stated_owner(&self, kind: Kind, stage: &str, own: &str) -> Result<(String, String), PlanError> {
         let usage = |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
         if !self.pipeline.stages.contains_key(stage) {
-            let known = known_names(stage, self.pipeline.stages.keys().map(String::as_str));
+            let known = known_blocks(stage, self.pipeline.stages.keys().map(String::as_str));
             return Err(usage(format!("no stage {stage:?}; {known}")));
         }
         let names = kind.names(self.programs.require(stage)?);

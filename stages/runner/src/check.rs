@@ -4,12 +4,14 @@ use std::collections::BTreeSet;
 
 use artifact::{Description, Input, known_names};
 
-use crate::pipeline::{Part, Pipeline, PipelineError, Source, StageBlock};
+use crate::file::StageBlock;
+use crate::pipeline::{Part, Pipeline, PipelineError, Source};
+use crate::renames::{known_blocks, known_subtrees};
 use crate::stages::{Programs, StageProgram};
 
 /// Checks that every stage which the file names is there.
 pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
-    let known = |name: &str| known_names(name, pipeline.stages.keys().map(String::as_str));
+    let known = |name: &str| known_blocks(name, pipeline.stages.keys().map(String::as_str));
     for name in &pipeline.default {
         if !pipeline.stages.contains_key(name) {
             let problem = format!("stage {name}: named in `default`, but there is no such stage; {}", known(name));
@@ -17,7 +19,7 @@ pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
         }
     }
     for (name, block) in &pipeline.stages {
-        likeness(pipeline, name, block)?;
+        extension(pipeline, name, block)?;
         for (input, source) in &block.inputs {
             if let Some(other) = Source::of(source).stage().filter(|other| !pipeline.stages.contains_key(*other)) {
                 let problem = format!("input {input}: no stage {other:?}; a folder begins with ./ or /; {}", known(other));
@@ -28,19 +30,21 @@ pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
     Ok(())
 }
 
-/// Checks what a block says of being like another.
-fn likeness(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), PipelineError> {
-    let Some(other) = &block.like else { return Ok(()) };
+/// Checks that a block extends another as it may.
+fn extension(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), PipelineError> {
+    let Some(other) = &block.extends else { return Ok(()) };
     let problem = match pipeline.stages.get(other) {
         None => {
-            let known = known_names(other, pipeline.stages.keys().map(String::as_str));
-            format!("like: there is no stage {other:?}; {known}")
+            let known = known_blocks(other, pipeline.stages.keys().map(String::as_str));
+            format!("extends: there is no stage {other:?}; {known}")
         }
-        Some(other_block) if other_block.like.is_some() => format!("like: {other:?} is itself like another; name that one"),
-        Some(_) if block.run.is_some() => "run: what it runs follows from `like`; give one of them".to_owned(),
+        Some(other_block) if other_block.extends.is_some() => {
+            format!("extends: {other:?} itself extends another; name that one")
+        }
+        Some(_) if block.run.is_some() => "run: what it runs follows from `extends`; give one of them".to_owned(),
         Some(_) => return Ok(()),
     };
-    Err(pipeline.error(name, Part::Field("like"), problem))
+    Err(pipeline.error(name, Part::Field("extends"), problem))
 }
 
 /// Checks every block whose stage is known against its description, and every input against what it names.
@@ -96,7 +100,7 @@ fn check_kind(
     let kind = match subtree {
         None => &output.kind,
         Some(folder) => output.subtrees.get(folder).ok_or_else(|| {
-            let known = known_names(folder, output.subtrees.keys().map(String::as_str));
+            let known = known_subtrees(&made_by.description.name, folder, output.subtrees.keys().map(String::as_str));
             format!("input {input}: {other} has no folder {folder:?}; {known}")
         })?,
     };

@@ -39,7 +39,7 @@ struct Cli {
 
 #[derive(Args, Default)]
 struct What {
-    /// Stages to make [default: the pipeline's `default`]
+    /// Targets: stages of the pipeline, or files of pipelines/ beside it [default: the pipeline's `default`]
     targets: Vec<String>,
     /// Sets a parameter; several values run all combinations, sharing what they share. A value is a JSON number, true, false or null, else a word;
     /// nothing at all is null. The last of several for the same parameter counts
@@ -188,7 +188,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
             let (jobs, threads) = at_once(jobs, threads)?;
             let options = Options { jobs, threads, device: session.device.clone(), keep_going };
-            let out = out.unwrap_or_else(|| session.pipeline.folder().join("out"));
+            let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
             verbs::run(&session, &what.into(), &options, &out, &remedy)
         }
         Verb::Plan { what } => verbs::plan(&session, &what.into()),

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use crate::axes::{Axis, Kind};
 use crate::check::{closure, needs};
-use crate::pipeline::{Pipeline, Source};
+use crate::pipeline::{Part, Pipeline, Source};
 use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
 use crate::stages::{Programs, StageProgram};
 
@@ -62,11 +62,11 @@ impl<'a> Expansion<'a> {
         inputs.filter(move |(name, _)| !replaced.contains(name))
     }
 
-    /// Whether a value from the command line reaches a stage itself: given for it, or for the one it is like where it doesn't say otherwise.
+    /// Whether a value from the command line reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.
     fn sets(&self, axis: &Axis, stage: &str) -> bool {
         let block = &self.pipeline.stages[stage];
         let is_own = block.gives(axis.kind == Kind::Parameter, &axis.name);
-        axis.stage == stage || (block.like.as_deref() == Some(&axis.stage) && !is_own)
+        axis.stage == stage || (block.extends.as_deref() == Some(&axis.stage) && !is_own)
     }
 
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
@@ -108,7 +108,7 @@ impl<'a> Expansion<'a> {
     fn node_inputs(&self, stage: &str, point: &Point) -> Vec<NodeInput> {
         let of_block = self.block_inputs(stage).map(|(name, source)| {
             let from = match source {
-                Source::Folder(path) => Origin::Folder(self.pipeline.folder().join(path)),
+                Source::Folder(path) => Origin::Folder(self.pipeline.resolve(stage, Part::Input(name), path)),
                 Source::Stage { name, subtree } => {
                     Origin::Node { index: self.parent(name, point), subtree: subtree.map(str::to_owned) }
                 }
@@ -145,7 +145,7 @@ impl<'a> Expansion<'a> {
         values.map(|(axis, value)| format!("{}={}", axis.name, axis.values[value].text)).collect::<Vec<_>>().join(", ")
     }
 
-    /// A stage's parameters at a point: the command line's over the file's, those over what it is like, and that over the defaults.
+    /// A stage's parameters at a point: the command line's over the file's, those over what it extends, and that over the defaults.
     fn resolve(&self, stage: &str, program: &StageProgram, point: &Point) -> Result<Value, PlanError> {
         let mut given = Map::new();
         for layer in self.pipeline.layers(stage) {

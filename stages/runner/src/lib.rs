@@ -1,6 +1,7 @@
 //! `nerf-sr`, the runner: pipeline.yaml → plan → run. It knows stages by their `describe` alone and artifacts by their hashes.
 //!
-//! * [`Pipeline`]: the file as written, checked whole before anything runs.
+//! * [`PipelineFile`]: a file as written. [`Pipeline`]: its blocks with those of the files that it extends, checked whole
+//!   before anything runs. `targets` finds what pipeline.yaml doesn't have in `pipelines/`.
 //! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
 //! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
@@ -19,6 +20,8 @@ mod counts;
 mod describing;
 mod execute;
 mod expand;
+mod extend;
+mod file;
 mod gc;
 mod graph;
 mod key;
@@ -28,11 +31,13 @@ mod plan;
 mod process;
 mod publish;
 mod remedy;
+mod renames;
 mod session;
 mod sink;
 mod sources;
 mod stage_log;
 mod stages;
+mod targets;
 mod verbs;
 mod verdict;
 mod waiting;
@@ -40,6 +45,7 @@ mod words;
 mod yaml;
 
 pub use cli::main;
+pub use file::{PipelineFile, StageBlock};
 pub use key::explain;
-pub use pipeline::{Part, Pipeline, PipelineError, StageBlock};
+pub use pipeline::{Part, Pipeline, PipelineError};
 pub use plan::{Node, Plan, PlanError, Request};

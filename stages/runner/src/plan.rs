@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use artifact::{Description, Record, Store, Waiting, known_names};
+use artifact::{Description, Record, Store, Waiting};
 use serde_json::{Map, Value};
 
 use crate::axes::Scope;
@@ -10,6 +10,7 @@ use crate::check::{self, closure, needs};
 use crate::expand::Expansion;
 use crate::key;
 use crate::pipeline::{Pipeline, PipelineError};
+use crate::renames::known_blocks;
 use crate::stages::{Asking, Interrupted, Programs, StageProgram};
 
 /// Stages × swept values, in an order in which every node comes after what it needs.
@@ -185,7 +186,7 @@ impl<'a> Goal<'a> {
         check::names(pipeline)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
         if let Some(target) = targets.iter().find(|target| !pipeline.stages.contains_key(*target)) {
-            let known = known_names(target, pipeline.stages.keys().map(String::as_str));
+            let known = known_blocks(target, pipeline.stages.keys().map(String::as_str));
             return Err(PlanError::Usage(format!("no stage {target:?}; {known}")));
         }
         let needed = closure(targets, |stage| needs(pipeline, stage).map(str::to_owned).collect());

@@ -16,7 +16,7 @@ stages:
     inputs:
       scene: prep/train
   again:
-    like: train
+    extends: train
     inputs: {scene: prep/train}
     parameters:
       rays: 7
@@ -121,7 +121,7 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
 }
 
 #[test]
-fn a_block_like_another_follows_it_save_in_what_it_says() {
+fn a_block_follows_the_one_it_extends_save_in_what_it_says() {
     let plan = plan_of(PIPELINE, &["again", "train", "-p", "train.rays=9", "-p", "supersample=3"]).unwrap();
     let of = |stage: &str| &plan.nodes.iter().find(|n| n.stage == stage).unwrap().parameters;
     assert_eq!((&of("train")["rays"], &of("train")["supersample"]), (&json!(9), &json!(3.0)));
@@ -271,8 +271,9 @@ fn files_that_cannot_be_used() {
         ),
         ("{data: make}", "{data: maek}", 5, "no stage \"maek\"; a folder begins with ./ or /; did you mean make?"),
         ("{data: make}", "{date: make}", 5, "it has no input \"date\"; did you mean data?"),
-        ("like: train", "like: trian", 11, "like: there is no stage \"trian\"; did you mean train?"),
-        ("like: train", "like: train\n    run: x", 11, "give one of them"),
+        ("extends: train", "extends: trian", 11, "extends: there is no stage \"trian\"; did you mean train?"),
+        ("extends: train", "extends: train\n    run: x", 11, "give one of them"),
+        ("extends: train", "like: train", 11, "stage again: `like` is called `extends` now; write `extends:`"),
         ("rays: 7", "rays: 0", 14, "parameter rays: 0 is less than the minimum"),
         ("rays: 7", "rayz: 7", 14, "parameter rayz: unknown; did you mean rays?"),
         ("rays: 7", "rays: .nan", 14, "stages.again.parameters.rays: a number is neither NaN nor infinite"),
@@ -334,7 +335,7 @@ fn files_as_editors_write_them() {
         .replace("      scene: prep/train", "      <<: &scene {scene: prep/train}")
         .replace("{scene: prep/train}\n    p", "*scene\n    p");
     assert_eq!(plan_of(&merged, &["again"]).unwrap().nodes.len(), 3);
-    let merged = merged.replace("rays: 7", "rays: {x: 7}").replace("like: train", "like: [train]");
+    let merged = merged.replace("rays: 7", "rays: {x: 7}").replace("extends: train", "extends: [train]");
     let problem = refused(&merged, &["again"]).to_string();
-    assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.like"), "{problem}");
+    assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.extends"), "{problem}");
 }

@@ -3,11 +3,13 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Store, check_device, known_names, report_text};
+use artifact::{Store, check_device, report_text};
 
 use crate::pipeline::Pipeline;
 use crate::plan::{Plan, PlanError, Request, State};
+use crate::renames::known_blocks;
 use crate::stages::Asking;
+use crate::targets;
 
 /// What every verb works with.
 pub(crate) struct Session {
@@ -20,7 +22,7 @@ impl Session {
     pub(crate) fn open(pipeline: &Path, store: Option<&Path>, device: &str) -> anyhow::Result<Self> {
         check_device(device).map_err(PlanError::Usage)?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
-        let root = store.map_or_else(|| pipeline.folder().join(".nerf-sr"), Path::to_path_buf);
+        let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
         std::fs::create_dir_all(&root)
             .with_context(|| format!("cannot open the store {}; name another with --store", root.display()))?;
         // Stages get absolute paths, whatever folder they run in.
@@ -40,7 +42,8 @@ impl Session {
     }
 
     fn plan_asking(&self, what: &Request, asking: Asking) -> anyhow::Result<Plan> {
-        let plan = Plan::new(&self.pipeline, &self.store, what, asking)?;
+        let (pipeline, targets) = targets::find(&self.pipeline, &what.targets)?;
+        let plan = Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, asking)?;
         plan.notes.iter().for_each(|note| report_text(note));
         Ok(plan)
     }
@@ -58,7 +61,7 @@ pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError
             return Err(PlanError::Usage(format!("{stage} is a sink: each run shows by it what it made; nothing of it is kept")));
         }
         let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
-        return Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {}", known_names(stage, known))));
+        return Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {}", known_blocks(stage, known))));
     }
     Ok(found)
 }

@@ -167,14 +167,19 @@ fn id(path: &Path) -> String {
 
 /// What a stage runs: a path, or the name of a program beside the runner.
 fn program_name<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
-    let origin = pipeline.stages[stage].like.as_deref().unwrap_or(stage);
+    let origin = origin(pipeline, stage);
     pipeline.stages[origin].run.as_deref().unwrap_or(origin)
+}
+
+/// The block that says what a stage runs.
+fn origin<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
+    pipeline.stages[stage].extends.as_deref().unwrap_or(stage)
 }
 
 pub(crate) fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     let name = program_name(pipeline, stage);
     if name.contains('/') {
-        let path = pipeline.folder().join(name);
+        let path = pipeline.resolve(origin(pipeline, stage), Part::Field("run"), name);
         return path.canonicalize().unwrap_or(path);
     }
     own_folder().join(name)

@@ -28,7 +28,7 @@ pub struct Params {
     /// taken with several exposures or white balances. Views come out in the mean exposure.
     pub exposure: bool,
     /// Whether to move cameras, while training, to where the field's renderings meet their photographs best, for poses that aren't exact. What all
-    /// cameras share stays; with several `members` each finds its own. Test views are then better rendered from where `nerf-sr run located` finds
+    /// cameras share stays; with several `members` each finds its own. Test views are then better rendered from where `nerf-sr run registered` finds
     /// them to be taken from.
     pub pose_refinement: bool,
     /// In which order pixels are drawn. Without it: `random` for `grid`, `epochs` for `mlp`.

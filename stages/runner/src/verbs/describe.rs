@@ -4,15 +4,18 @@ use anyhow::Context as _;
 
 use crate::pipeline::Pipeline;
 use crate::plan::PlanError;
+use crate::renames::known_blocks;
 use crate::stages::executable;
+use crate::targets;
 
 /// Prints the help of a stage's program: what it makes, its inputs and its parameters.
 pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {
+    let (pipeline, _) = targets::find(pipeline, &[stage.to_owned()])?;
     if !pipeline.stages.contains_key(stage) {
-        let known = pipeline.stages.keys().cloned().collect::<Vec<_>>().join(", ");
-        return Err(PlanError::Usage(format!("no stage {stage:?}; known: {known}")).into());
+        let known = known_blocks(stage, pipeline.stages.keys().map(String::as_str));
+        return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());
     }
-    let program = executable(pipeline, stage);
+    let program = executable(&pipeline, stage);
     let status = Command::new(&program).arg("--help").status();
     let status = status.with_context(|| format!("{}; build it (make build)", program.display()))?;
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })

@@ -1,0 +1,242 @@
+//! Files that extend others, targets of `pipelines/`, and the pipelines that are shipped.
+
+use std::collections::BTreeSet;
+
+use tempfile::TempDir;
+
+use super::*;
+use crate::pipeline::Part;
+use crate::{renames, targets};
+
+/// A folder with files.
+fn folder(files: &[(&str, &str)]) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, text) in files {
+        let path = folder.path().join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, text).unwrap();
+    }
+    folder
+}
+
+const BASE: &str = "default: [b]
+stages:
+  a: {inputs: {x: ./data, y: ./more}, parameters: {one: 1, two: 2}}
+  b:
+    run: ./b.sh
+    inputs: {x: a}
+";
+
+const UPPER: &str = "extends: ../pipeline.yaml
+stages:
+  a:
+    inputs:
+      y: ./data
+      z: /z
+    parameters: {two: 3}
+  b: {extends: a}
+  c: {inputs: {x: b}}
+";
+
+fn base_and(more: &[(&str, &str)]) -> TempDir {
+    folder(&[&[("pipeline.yaml", BASE)], more].concat())
+}
+
+#[test]
+fn a_file_changes_part_by_part_what_it_extends() {
+    let folder = base_and(&[("pipelines/c.yaml", UPPER)]);
+    let home = folder.path().canonicalize().unwrap();
+    let pipeline = Pipeline::read(&home.join("pipelines/c.yaml")).unwrap();
+    assert_eq!(pipeline.default, ["b"]);
+    assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), ["a", "b", "c"]);
+    let (a, b) = (&pipeline.stages["a"], &pipeline.stages["b"]);
+    assert_eq!(serde_json::to_value(&a.parameters).unwrap(), serde_json::json!({"one": 1, "two": 3}));
+    assert_eq!(a.inputs.keys().collect::<Vec<_>>(), ["x", "y", "z"]);
+    assert_eq!((b.run.as_deref(), b.extends.as_deref()), (None, Some("a")));
+    assert_eq!(b.inputs["x"], "a");
+    // Paths begin where they stand, and lines are those of the file that says it.
+    let (lower, upper) = (home.join("pipeline.yaml"), home.join("pipelines/c.yaml"));
+    for (stage, part, file, line) in [
+        ("a", Part::Input("x"), &lower, 3),
+        ("a", Part::Input("y"), &upper, 5),
+        ("a", Part::Parameter("one"), &lower, 3),
+        ("a", Part::Parameter("two"), &upper, 7),
+        ("a", Part::Block, &upper, 3),
+        ("b", Part::Field("extends"), &upper, 8),
+        ("b", Part::Input("x"), &lower, 6),
+        ("c", Part::Field("run"), &upper, 9),
+    ] {
+        let error = pipeline.error(stage, part, "wrong").to_string();
+        assert_eq!(error, format!("{}:{line}: stage {stage}: wrong", file.display()));
+        assert_eq!(pipeline.resolve(stage, part, "./it"), file.with_file_name("it"), "{stage} {part:?}");
+    }
+    let error = pipeline.error_in_default("wrong".to_owned()).to_string();
+    assert_eq!(error, format!("{}:1: wrong", lower.display()));
+}
+
+/// Each in one line, with the line of `extends`.
+#[test]
+fn files_that_cannot_be_extended() {
+    let deep: Vec<(String, String)> =
+        (0..10).map(|i| (format!("{i}.yaml"), format!("\nextends: {}.yaml", (i + 1).min(9)))).collect();
+    let deep: Vec<(&str, &str)> = deep.iter().map(|(name, text)| (name.as_str(), text.as_str())).collect();
+    for (files, place, words) in [
+        (&[("x.yaml", "\nextends: ../none.yaml\n")][..], "x.yaml:2: ", "a path is relative to the file in which it stands"),
+        (&[("x.yaml", "extends: x.yaml")], "x.yaml:1: ", "extends x.yaml: that file is this one or extends it"),
+        (
+            &[("x.yaml", "extends: y.yaml"), ("y.yaml", "extends: [./x.yaml]")],
+            "y.yaml:1: ",
+            "that file is this one or extends it",
+        ),
+        (&[("x.yaml", "extends: 0.yaml")], "6.yaml:2: ", "more than 8 files extend one another"),
+        (&[("x.yaml", "extends: .")], "x.yaml:1: ", "extends .: "),
+        (&[("x.yaml", "extends: {a: b}")], "x.yaml:1", "expected the path of a pipeline file, or a list of paths"),
+        (&[("x.yaml", "extends: y.yaml"), ("y.yaml", "default: [a]\nstages:\n  a: {like: b}")], "y.yaml:3: ", "`extends` now"),
+        (&[("x.yaml", "stages: {}")], "x.yaml: ", "missing field `default`"),
+        (&[("x.yaml", "default: []")], "x.yaml: ", "missing field `stages`"),
+        (
+            &[
+                ("x.yaml", "extends: [y.yaml, pipeline.yaml]"),
+                ("y.yaml", "extends: pipeline.yaml\nstages:\n  a: {parameters: {one: 2}}"),
+            ],
+            "x.yaml:1: ",
+            "isn't the same in",
+        ),
+        (&[("x.yaml", "extends: [y/y.yaml, pipeline.yaml]"), ("y/y.yaml", BASE)], "x.yaml:1: ", "block a isn't the same in"),
+    ] {
+        let folder = base_and(&[files, &deep].concat());
+        let home = folder.path().canonicalize().unwrap();
+        let error = Pipeline::read(&home.join("x.yaml")).unwrap_err().to_string();
+        assert!(error.starts_with(&home.join(place).display().to_string()) && error.contains(words), "{error}");
+        assert!(!error.contains('\n'), "{error}");
+    }
+    // Eight are fine, and so is one file by two ways.
+    for text in ["extends: 3.yaml", "extends: [y.yaml, pipeline.yaml, z.yaml]"] {
+        let shared = "extends: pipeline.yaml\nstages: {d: {}}";
+        let folder =
+            base_and(&[&deep[..9], &[("9.yaml", BASE), ("x.yaml", text), ("y.yaml", shared), ("z.yaml", shared)]].concat());
+        let pipeline = Pipeline::read(&folder.path().join("x.yaml")).unwrap();
+        assert_eq!(pipeline.default, ["b"]);
+    }
+}
+
+/// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the blocks of those.
+#[test]
+fn targets_are_found_beside_the_pipeline() {
+    let shelf = [
+        ("pipelines/c.yaml", "extends: ../pipeline.yaml\nstages: {c: {inputs: {x: b}}, inner: {}, b: {}}"),
+        ("pipelines/d.yaml", "extends: c.yaml\ndefault: [inner, a]\nstages: {other: {}}"),
+        ("pipelines/e.yaml", "extends: ../pipeline.yaml\nstages: {e: {}, a: {parameters: {one: 7}}}"),
+        ("pipelines/broken.yaml", "stages: ["),
+        ("pipelines/notes.txt", "c"),
+    ];
+    let folder = base_and(&shelf);
+    let home = folder.path().canonicalize().unwrap();
+    let find = |names: &[&str]| {
+        let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+        targets::find(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
+    };
+    for (names, blocks, stages) in [
+        (&[][..], &[][..], &["a", "b"][..]),
+        (&["a"], &["a"], &["a", "b"]),
+        (&["c"], &["c"], &["a", "b", "c", "inner"]),
+        (&["d"], &["inner", "a"], &["a", "b", "c", "inner", "other"]),
+        (&["inner"], &["inner"], &["a", "b", "c", "inner"]),
+        (&["b", "c", "other"], &["b", "c", "other"], &["a", "b", "c", "inner", "other"]),
+        (&["e"], &["e"], &["a", "b", "e"]),
+    ] {
+        let (pipeline, found) = find(names).unwrap();
+        assert_eq!(found, blocks, "{names:?}");
+        assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), stages, "{names:?}");
+    }
+    for (names, words) in [
+        (&["othre"][..], &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"][..]),
+        (&["../pipeline"], &["no stage \"../pipeline\""]),
+        (&["broken"], &["pipelines/broken.yaml"]),
+        (&["c", "e"], &["e can't be made together with c: block a isn't the same in", "make it by itself"]),
+        (&["joined"], &["no stage \"joined\"; it is called hr-finetune now"]),
+    ] {
+        let error = find(names).unwrap_err().to_string();
+        assert!(words.iter().all(|words| error.contains(words)), "{error}");
+    }
+}
+
+/// A file of `pipelines/` shares store and pages with pipeline.yaml; a pipeline of its own has its own, wherever it lies.
+#[test]
+fn the_store_lies_beside_the_pipeline() {
+    let more = [("pipelines/c.yaml", UPPER), ("pipelines/alone.yaml", BASE), ("other/x.yaml", "extends: ../pipelines/c.yaml")];
+    let folder = base_and(&more);
+    let home = |file: &str| {
+        let pipeline = Pipeline::read(&folder.path().join(file)).unwrap();
+        pipeline.home().canonicalize().unwrap().strip_prefix(folder.path().canonicalize().unwrap()).unwrap().to_owned()
+    };
+    for (file, expected) in [
+        ("pipeline.yaml", ""),
+        ("pipelines/c.yaml", ""),
+        ("pipelines/../pipelines/c.yaml", ""),
+        ("pipelines/alone.yaml", "pipelines"),
+        ("other/x.yaml", "other"),
+    ] {
+        assert_eq!(home(file), Path::new(expected), "{file}");
+    }
+}
+
+/// The repository's pipelines.
+fn shipped() -> (Pipeline, Vec<String>) {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let files = std::fs::read_dir(root.join("pipelines")).unwrap().map(|entry| entry.unwrap().path());
+    let mut names: Vec<String> = files.map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned()).collect();
+    names.sort();
+    (Pipeline::read(&root.join("pipeline.yaml")).unwrap(), names)
+}
+
+#[test]
+fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
+    let (pipeline, names) = shipped();
+    assert_eq!(pipeline.stages.len(), 6);
+    assert_eq!(names, ["hr-finetune", "paper-refine", "reference-refine", "refined", "registered", "sisr-fuse", "video"]);
+    let (all, blocks) = targets::find(&pipeline, &names).unwrap();
+    assert_eq!(blocks, names);
+    crate::check::structure(&all).unwrap();
+    for name in &names {
+        let (of_file, _) = targets::find(&pipeline, std::slice::from_ref(name)).unwrap();
+        assert_eq!(&of_file.default, std::slice::from_ref(name));
+        crate::check::structure(&of_file).unwrap();
+        // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say otherwise.
+        assert!(pipeline.stages.keys().all(|stage| pipeline.has_same(&of_file, stage)), "{name}");
+    }
+}
+
+/// Old names lead to new ones, which are there; and no old one is.
+#[test]
+fn old_names_are_told_the_new_ones() {
+    let (pipeline, names) = shipped();
+    let (all, _) = targets::find(&pipeline, &names).unwrap();
+    for (old, new) in renames::BLOCKS {
+        assert!(all.stages.contains_key(new) && !all.stages.contains_key(old), "{old} {new}");
+        let said = format!("{old:?}; it is called {new} now");
+        let error = targets::find(&pipeline, &[old.to_owned()]).unwrap_err().to_string();
+        assert!(error.contains(&said), "{error}");
+        for (text, line) in [
+            (format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    inputs: {{x: {old}/x}}"), 5),
+            (format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    extends: {old}"), 5),
+            (format!("default: [{old}]\nstages:\n  a: {{}}"), 1),
+        ] {
+            let pipeline = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap();
+            let error = crate::check::structure(&pipeline).unwrap_err().to_string();
+            assert!(error.starts_with(&format!("p.yaml:{line}: ")), "{error}");
+            assert!(error.contains(&format!("it is called {new} now")) || error.contains(&said), "{error}");
+        }
+    }
+    let uses: BTreeSet<&str> = all.stages.values().flat_map(|block| block.inputs.values().map(String::as_str)).collect();
+    for (program, old, new) in renames::SUBTREES {
+        assert!(uses.contains(format!("{program}/{new}").as_str()) && !uses.contains(format!("{program}/{old}").as_str()));
+        assert_eq!(renames::known_subtrees(program, old, [new]), format!("it is called {new} now"));
+        assert_eq!(renames::known_subtrees("other", old, [new]), format!("known: {new}"));
+    }
+    for (old, new) in renames::WORDS {
+        let text = format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    {old}: a\n");
+        let error = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap_err().to_string();
+        assert_eq!(error, format!("p.yaml:5: stage b: `{old}` is called `{new}` now; write `{new}:`"));
+    }
+}

@@ -1,0 +1,197 @@
+//! A pipeline file as written, with what is needed to name its lines.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::{Map, Value};
+
+use crate::pipeline::{Part, PipelineError};
+use crate::{renames, yaml};
+
+/// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.
+///
+/// A file that extends others has their blocks, too. For a block that both have, the file may give a part alone:
+/// an input or a parameter takes the place of the one of that name, `run` or `extends` the place of either.
+/// Paths are relative to the file in which they stand.
+#[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct PipelineFile {
+    /// Another pipeline file, or several, whose blocks this one has, too. Several may share blocks, but not change them.
+    #[serde(deserialize_with = "one_or_more")]
+    #[schemars(with = "OneOrMore")]
+    pub extends: Vec<String>,
+    /// What `nerf-sr run` makes when no target is named. Left out, it is that of the first extended file.
+    pub default: Vec<String>,
+    /// The stages by name.
+    pub stages: BTreeMap<String, StageBlock>,
+}
+
+/// A text, or a list of them.
+#[derive(Deserialize, JsonSchema)]
+#[serde(untagged, expecting = "expected the path of a pipeline file, or a list of paths")]
+enum OneOrMore {
+    /// One.
+    One(String),
+    /// Several.
+    More(Vec<String>),
+}
+
+fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>, D::Error> {
+    Ok(match OneOrMore::deserialize(deserializer)? {
+        OneOrMore::One(path) => vec![path],
+        OneOrMore::More(paths) => paths,
+    })
+}
+
+/// One stage's block.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct StageBlock {
+    /// What to run: a path from the file's folder, or the name of a binary beside `nerf-sr`; without it: the block's name.
+    pub run: Option<String>,
+    /// Another block: this one runs the same program, with the parameters that the file and the command line give the
+    /// other one, except those given here.
+    pub extends: Option<String>,
+    /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that begins with `.` or `/`.
+    pub inputs: BTreeMap<String, String>,
+    /// Parameters that differ from the stage's defaults.
+    pub parameters: Map<String, Value>,
+}
+
+impl StageBlock {
+    /// Whether the block itself has that parameter, or that input.
+    pub(crate) fn gives(&self, is_parameter: bool, name: &str) -> bool {
+        if is_parameter { self.parameters.contains_key(name) } else { self.inputs.contains_key(name) }
+    }
+
+    /// Whether the block itself says that.
+    fn says(&self, part: Part) -> bool {
+        match part {
+            Part::Block => true,
+            Part::Field("run") => self.run.is_some(),
+            Part::Field(_) => self.extends.is_some(),
+            Part::Input(name) => self.inputs.contains_key(name),
+            Part::Parameter(name) => self.parameters.contains_key(name),
+        }
+    }
+
+    /// Takes what a block of the same name says in a file that extends this one's.
+    pub(crate) fn change(&mut self, by: &Self) {
+        if by.run.is_some() || by.extends.is_some() {
+            (self.run, self.extends) = (by.run.clone(), by.extends.clone());
+        }
+        self.inputs.extend(by.inputs.clone());
+        self.parameters.extend(by.parameters.clone());
+    }
+}
+
+/// A file that was read.
+#[derive(Debug)]
+pub(crate) struct File {
+    /// As it is named in errors.
+    pub(crate) path: PathBuf,
+    /// By what it is known again, however it was named.
+    pub(crate) id: PathBuf,
+    pub(crate) written: PipelineFile,
+    text: String,
+}
+
+impl File {
+    /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their line.
+    pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
+        let fail = |line: Option<usize>, problem: String| PipelineError { place: place(path, line), problem };
+        let text = yaml::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
+        let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
+        // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.
+        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(|e| match yaml::line_of_duplicate(text) {
+            Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
+            None => located(e),
+        })?;
+        let mut document = serde_yaml::Value::Mapping(mapping);
+        let merged = yaml::merge(&mut document).map_err(located)?;
+        let line_of = |keys: &[String]| yaml::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>());
+        if let Some((keys, problem)) = problem_of(&document) {
+            return Err(fail(line_of(&keys), problem));
+        }
+        let written: PipelineFile = if merged {
+            serde_path_to_error::deserialize(document).map_err(|e| {
+                let keys: Vec<String> = e.path().iter().map(ToString::to_string).collect();
+                fail(line_of(&keys), format!("{}: {}", keys.join("."), e.inner()))
+            })?
+        } else {
+            serde_yaml::from_str(text).map_err(located)?
+        };
+        let id = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+        let file = Self { path: path.to_path_buf(), id, written, text: text.to_owned() };
+        let named = file.written.stages.keys().find_map(|name| Some((name, problem_of_name(name)?)));
+        named.map_or(Ok(()), |(name, problem)| Err(file.error(&["stages", name], format!("stage {name:?}: {problem}"))))?;
+        Ok(file)
+    }
+
+    /// The folder that its relative paths start from.
+    pub(crate) fn folder(&self) -> &Path {
+        self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
+    }
+
+    /// Whether it says that of a stage.
+    pub(crate) fn says(&self, stage: &str, part: Part) -> bool {
+        self.written.stages.get(stage).is_some_and(|block| block.says(part))
+    }
+
+    /// An error about a key, through nested mappings, with its line.
+    pub(crate) fn error(&self, keys: &[&str], problem: String) -> PipelineError {
+        PipelineError { place: place(&self.path, yaml::line_of(&self.text, keys)), problem }
+    }
+}
+
+/// What is wrong with a file before its types are looked at: the key, and what to do.
+fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
+    if let Some(keys) = yaml::not_finite(document) {
+        let problem = format!("{}: a number is neither NaN nor infinite", keys.join("."));
+        return Some((keys, problem));
+    }
+    let missing = |key: &&str| document.get(key).is_none() && document.get("extends").is_none();
+    if let Some(key) = ["default", "stages"].iter().find(|key| missing(key)) {
+        return Some((Vec::new(), format!("missing field `{key}`")));
+    }
+    let blocks = document.get("stages").and_then(serde_yaml::Value::as_mapping)?;
+    blocks.iter().find_map(|(name, block)| {
+        let (old, new) = renames::WORDS.iter().find(|(old, _)| block.get(old).is_some())?;
+        let keys = ["stages", name.as_str()?, old].map(str::to_owned).to_vec();
+        let problem = format!("stage {}: `{old}` is called `{new}` now; write `{new}:`", keys[1]);
+        Some((keys, problem))
+    })
+}
+
+/// Names longer than this make no folder's name.
+const LONGEST_NAME: usize = 100;
+
+/// What is wrong with a stage's name, which becomes a part of file names and of command lines.
+fn problem_of_name(name: &str) -> Option<&'static str> {
+    if name.is_empty() {
+        Some("a stage's name is empty")
+    } else if name.starts_with(['.', '-']) {
+        Some("a stage's name begins with a letter or a digit, not with `.` or `-`")
+    } else if name.contains(['/', '\\']) || name.contains("..") {
+        Some("a stage's name has no `/` and no `..`")
+    } else if name.chars().any(|c| c.is_control() || c.is_whitespace()) {
+        Some("a stage's name has no white space and no control characters")
+    } else if name.len() > LONGEST_NAME {
+        Some("a stage's name has at most 100 bytes")
+    } else {
+        None
+    }
+}
+
+/// What the parser says, less the line, which is named before it.
+fn without_line(error: &serde_yaml::Error) -> String {
+    let text = error.to_string();
+    text.rsplit_once(" at line ").map_or(text.clone(), |(problem, _)| problem.to_owned())
+}
+
+/// File and, where known, line.
+fn place(path: &Path, line: Option<usize>) -> String {
+    line.map_or_else(|| path.display().to_string(), |line| format!("{}:{line}", path.display()))
+}

@@ -1,0 +1,55 @@
+//! Targets by name: blocks of pipeline.yaml, or else of the files in `pipelines/` beside it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use crate::pipeline::{Part, Pipeline, SHELF};
+use crate::plan::PlanError;
+use crate::renames::known_blocks;
+
+/// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the target NAME: its block of
+/// that name, or its default. A block of such a file is a target, too.
+pub(crate) fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<String>), PlanError> {
+    let (mut all, mut blocks): (Option<Pipeline>, Vec<String>) = (None, Vec::new());
+    for target in targets {
+        let (found, named) = if pipeline.stages.contains_key(target) {
+            (pipeline.clone(), vec![target.clone()])
+        } else {
+            on_shelf(pipeline, target)?
+        };
+        let apart = |problem: String| {
+            PlanError::Usage(format!("{target} can't be made together with {}: {problem}; make it by itself", blocks.join(", ")))
+        };
+        all = Some(match all {
+            None => found,
+            Some(all) => all.joined(found).map_err(apart)?,
+        });
+        blocks.extend(named);
+    }
+    Ok((all.unwrap_or_else(|| pipeline.clone()), blocks))
+}
+
+/// The file of `pipelines/` that has a target, and its blocks that are meant.
+fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>), PlanError> {
+    let files = shelf(pipeline);
+    if let Some(path) = files.get(target) {
+        let found = Pipeline::read(path)?;
+        let blocks = if found.stages.contains_key(target) { vec![target.to_owned()] } else { found.default.clone() };
+        return Ok((found, blocks));
+    }
+    // A file that can't be used is reported when it is asked for.
+    let others: Vec<Pipeline> = files.values().filter_map(|path| Pipeline::read(path).ok()).collect();
+    if let Some(found) = others.iter().find(|other| other.files[0].says(target, Part::Block)) {
+        return Ok((found.clone(), vec![target.to_owned()]));
+    }
+    let blocks = others.iter().chain([pipeline]).flat_map(|other| other.stages.keys());
+    let known: BTreeSet<&str> = blocks.chain(files.keys()).map(String::as_str).collect();
+    Err(PlanError::Usage(format!("no stage {target:?}; {}", known_blocks(target, known))))
+}
+
+/// The files of `pipelines/`, by name.
+fn shelf(pipeline: &Pipeline) -> BTreeMap<String, PathBuf> {
+    let entries = std::fs::read_dir(pipeline.home().join(SHELF)).into_iter().flatten().flatten();
+    let paths = entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == "yaml"));
+    paths.filter_map(|path| Some((path.file_stem()?.to_str()?.to_owned(), path))).collect()
+}

@@ -1,0 +1,77 @@
+//! The shipped `pipelines/`: found by their names, sharing one store, and old names that lead to new ones. Nothing slow is run.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use common::Project;
+
+/// The fast pipeline with the shipped targets beside it.
+fn project() -> Project {
+    let project = Project::fast();
+    project.copy_pipelines(".");
+    project
+}
+
+#[test]
+fn every_verb_finds_a_target_of_its_own_file() {
+    let project = project();
+    for (arguments, words) in [
+        (&["plan", "refined"][..], &["downscaled-field", "eval-refined", "refined"][..]),
+        (&["plan", "eval-refined"], &["downscaled-field", "eval-refined"]),
+        (&["plan", "reference-refine", "-p", "prep.references=2"], &["finetuned-field", "refine-reference"]),
+        (&["plan", "hr-finetune"], &["finetuned-views"]),
+        (&["plan", "sisr-fuse", "-p", "upsample.method=bicubic"], &["refine-sisr"]),
+        (&["plan", "paper-refine"], &["train-paper"]),
+        (&["plan", "registered"], &["register ", "registered-views"]),
+        (&["plan", "report", "refined", "video"], &["report", "eval-refined", "path-views"]),
+        (&["why", "train-refine", "refined"], &["train-refine: "]),
+        (&["why", "video", "video"], &["path-views"]),
+        (&["status", "refined"], &["downscaled-views"]),
+        (&["graph", "video"], &["camera-path"]),
+        (&["log", "camera-path", "video"], &["has not run yet"]),
+        (&["gc", "refined", "--dry-run"], &["would stay"]),
+        (&["describe", "train-refine"], &["train-refine"]),
+    ] {
+        let said = project.ok(arguments);
+        assert!(words.iter().all(|word| said.contains(word)), "{arguments:?}: {said}");
+    }
+    project.run(&["pin", "kept", "video"]).fails(2, &["isn't cached"]);
+}
+
+/// What pipeline.yaml made is there for a file of `pipelines/`, however that is named; pages are, too.
+#[test]
+fn targets_share_one_store() {
+    let project = project();
+    project.ok(&["run", "prep"]);
+    project.ok(&["run", "camera-path"]);
+    let said = project.ok(&["plan", "camera-path", "--pipeline", "pipelines/video.yaml"]);
+    assert!(said.contains("cached") && !said.contains("will run"), "{said}");
+    assert!(!project.path("pipelines/.nerf-sr").exists());
+    let made = project.output_of("camera-path", &["camera-path"]);
+    assert_eq!(made, project.output_of("camera-path", &["video", "--pipeline", "pipelines/video.yaml"]));
+    // A folder is named from the file in which it stands.
+    let dataset = project.artifact("demo-scene", &[]);
+    std::os::unix::fs::symlink(dataset, project.path("scene")).unwrap();
+    project.write("pipelines/mine.yaml", "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ../scene}}\n");
+    let said = project.ok(&["plan", "mine"]);
+    assert!(!said.contains("demo-scene") && said.contains("report"), "{said}");
+    project.write("pipelines/mine.yaml", "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ./scene}}\n");
+    project.run(&["plan", "mine"]).fails(3, &["scene"]);
+}
+
+#[test]
+fn wrong_and_old_names_are_told_the_right_ones() {
+    let project = project();
+    for (arguments, words) in [
+        (&["run", "regsitered"][..], &["no stage \"regsitered\"", "did you mean registered?"][..]),
+        (&["plan", "referenced"], &["it is called reference-refine now"]),
+        (&["why", "rehearsal-field", "refined"], &["it is called downscaled-field now"]),
+        (&["log", "train-joined", "hr-finetune"], &["it is called finetuned-field now"]),
+        (&["describe", "locate"], &["it is called register now"]),
+        (&["plan", "refined", "-p", "rehearsal-field.rays=1"], &["it is called downscaled-field now"]),
+    ] {
+        project.run(arguments).fails(2, words);
+    }
+    project.replace("scene: prep/train", "scene: prep/rehearsal");
+    project.run(&["plan"]).fails(2, &["pipeline.yaml:", "prep has no folder \"rehearsal\"; it is called downscaled now"]);
+}
