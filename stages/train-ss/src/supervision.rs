@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Photographs;
 use crate::exposure::Exposures;
-use crate::memory::{Kernel, Memory};
+use crate::hr_cache::{HrCache, Kernel};
 use crate::moving_cameras::MovingCameras;
 use crate::order::{Focus, detailed, shuffled};
 
@@ -42,7 +42,7 @@ pub enum Order {
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
 /// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises the
 /// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
-/// rendered, those around it remembered ([`Memory`]), so that the whole footprint costs no more rays than the average. Each
+/// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
 /// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
 ///
 /// Of an HR reference a block of pixels is drawn at a time, one for each sub-ray to meet, and altogether four times as many blocks as an LR picture has
@@ -62,7 +62,7 @@ pub struct Supersampling {
     crop_groups: u64,
     focus: Focus,
     seed: u64,
-    memory: Option<Memory>,
+    cache: Option<HrCache>,
     exposures: Option<Exposures>,
     moving: Option<MovingCameras>,
 }
@@ -160,7 +160,7 @@ impl Supersampling {
         };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
-        let mut memory = None;
+        let mut cache = None;
         let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut with_detail = Vec::new();
@@ -181,7 +181,7 @@ impl Supersampling {
                         let (enlarge, shrink) = operator(&picture);
                         (enlarge, Arc::new(Kernel::new(shrink)))
                     });
-                    memory.get_or_insert_with(|| Memory::new(full)).add(&enlarge.apply(&picture), kernel.clone());
+                    cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&picture), kernel.clone());
                 }
             }
             let before = pixels;
@@ -221,7 +221,7 @@ impl Supersampling {
             crop_groups,
             focus,
             seed,
-            memory,
+            cache,
             exposures,
             moving,
         }
@@ -232,14 +232,14 @@ impl Supersampling {
         self.full
     }
 
-    /// The memory, where the kernel is what counts for a view by now.
-    fn kernel(&self, view: usize) -> Option<&Memory> {
-        self.memory.as_ref().filter(|_| self.side == self.full && view < self.low)
+    /// The cache, where the kernel is what counts for a view by now.
+    fn kernel(&self, view: usize) -> Option<&HrCache> {
+        self.cache.as_ref().filter(|_| self.side == self.full && view < self.low)
     }
 
     /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
     pub(crate) fn kept(&self) -> impl Iterator<Item = Cow<'_, [u8]>> {
-        let renders = self.memory.iter().flat_map(Memory::parts).map(Cow::Borrowed);
+        let renders = self.cache.iter().flat_map(HrCache::parts).map(Cow::Borrowed);
         let exposures = self.exposures.iter().map(|e| Cow::Owned(e.bytes()));
         renders.chain(exposures).chain(self.moving.iter().map(|m| Cow::Owned(m.bytes())))
     }
@@ -247,7 +247,7 @@ impl Supersampling {
     /// Bytes of each of the three.
     fn kept_lengths(&self) -> [usize; 3] {
         [
-            self.memory.as_ref().map_or(0, Memory::len),
+            self.cache.as_ref().map_or(0, HrCache::len),
             self.exposures.as_ref().map_or(0, Exposures::len),
             self.moving.as_ref().map_or(0, MovingCameras::len),
         ]
@@ -263,7 +263,7 @@ impl Supersampling {
         let [renders, sums, _] = self.kept_lengths();
         let (renders, rest) = kept.split_at(renders);
         let (sums, poses) = rest.split_at(sums);
-        self.memory.iter_mut().for_each(|memory| memory.restore(renders));
+        self.cache.iter_mut().for_each(|cache| cache.restore(renders));
         self.exposures.iter_mut().for_each(|exposures| exposures.restore(sums));
         self.moving.iter_mut().for_each(|moving| moving.restore(poses));
         self.place_views();
@@ -433,7 +433,7 @@ impl radiance::Supervision for Supersampling {
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
         // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.fine) {
-            (Some(memory), _) => memory.block_in_pixels(index, x, y),
+            (Some(cache), _) => cache.block_in_pixels(index, x, y),
             (None, Some(fine)) => {
                 let start = [block_start(x, self.full[0], fine.width), block_start(y, self.full[1], fine.height)];
                 (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
@@ -460,10 +460,10 @@ impl radiance::Supervision for Supersampling {
         let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
         let is_cropped = group < self.crop_groups;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
-        if let Some(memory) = self.kernel(index) {
+        if let Some(cache) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
             let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
-            let own = memory.pull(index, at, colours, picture, residual, gradients);
+            let own = cache.back_project(index, at, colours, picture, residual, gradients);
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
             return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
@@ -498,7 +498,7 @@ impl radiance::Supervision for Supersampling {
     }
 
     fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
-        if self.memory.is_none() && self.exposures.is_none() {
+        if self.cache.is_none() && self.exposures.is_none() {
             return;
         }
         let (index, pixel) = self.pixel(group);
@@ -510,9 +510,9 @@ impl radiance::Supervision for Supersampling {
             let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
-        let is_remembered = self.side == self.full && index < self.low;
-        if let Some(memory) = self.memory.as_mut().filter(|_| is_remembered) {
-            memory.remember(index, pixel % picture.width, pixel / picture.width, colours);
+        let is_cached = self.side == self.full && index < self.low;
+        if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {
+            cache.remember(index, pixel % picture.width, pixel / picture.width, colours);
         }
     }
 }
@@ -646,7 +646,7 @@ mod tests {
                 let mut gradients = [[0.0; 3]; 4];
                 let loss = supersampling.judge(group, &colours, &mut gradients);
                 supersampling.remember(group, &colours);
-                // Until then the memory isn't full of the truth.
+                // Until then the cache isn't full of the truth.
                 if group >= 400 {
                     let gradient = gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
                     worst = (worst.0.max(loss), worst.1.max(gradient));
