@@ -96,7 +96,7 @@ mod tests {
     fn fine() -> Picture {
         let sample = |i: usize| {
             let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
-            0.2 + 0.5 * radiance::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
+            0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
         };
         Picture::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
     }

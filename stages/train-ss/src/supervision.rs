@@ -2,9 +2,10 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use counter_rng::CounterRng;
 use pixels::{Filter, Picture, Resampling};
 use poses::Moved;
-use radiance::{Draws, Ray, RayField};
+use radiance::{Ray, RayField};
 use scene::{Background, Camera, Intrinsics, Photograph};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -311,14 +312,14 @@ impl Supersampling {
 
     /// The view and pixel that a group trains on.
     fn pixel(&self, group: u64) -> (usize, usize) {
-        let mut draws = Draws::new(self.seed, PIXEL, group);
+        let mut rng = CounterRng::new(self.seed, PIXEL, group);
         let (view, pixel) = match self.order {
             Order::Epochs if group >= self.crop_groups => {
                 let group = group - self.crop_groups;
                 self.place(shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels))
             }
             _ => {
-                let mut draw = || self.place(self.focus.draw(self.pixels, &mut draws));
+                let mut draw = || self.place(self.focus.draw(self.pixels, &mut rng));
                 let mut place = draw();
                 for _ in 1..REDRAWS {
                     if self.counts(place) {
@@ -331,7 +332,7 @@ impl Supersampling {
         };
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
         if group < self.crop_groups {
-            let mut middle = |length: u64| length / 4 + draws.below((length / 2).max(1));
+            let mut middle = |length: u64| length / 4 + rng.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
             return (view, (y * width + x) as usize);
         }
@@ -354,8 +355,8 @@ impl Supersampling {
     /// What lies behind a group's rays: with an open background, or none, another colour each time, so that opacity is learnt.
     fn behind(&self, group: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
-            let mut draws = Draws::new(self.seed, BACKGROUND, group);
-            [0, 1, 2].map(|_| draws.uniform())
+            let mut rng = CounterRng::new(self.seed, BACKGROUND, group);
+            [0, 1, 2].map(|_| rng.uniform())
         } else {
             [self.background.shown(); 3]
         }

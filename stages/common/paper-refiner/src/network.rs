@@ -1,7 +1,7 @@
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use nets::Weights;
-use radiance::Draws;
 use refinement::RefinementError;
 use tch::{TchError, Tensor};
 
@@ -78,10 +78,10 @@ impl PaperRefiner {
         let mut number = 0;
         Self::build(width, |_, shape, part| {
             number += 1;
-            let mut draws = Draws::new(seed, WEIGHTS, number);
+            let mut rng = CounterRng::new(seed, WEIGHTS, number);
             let mut normal = || {
                 // Box and Muller; a uniform of 0 would be infinitely far.
-                let (u, v) = (1.0 - f64::from(draws.uniform()), f64::from(draws.uniform()));
+                let (u, v) = (1.0 - f64::from(rng.uniform()), f64::from(rng.uniform()));
                 (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
             };
             let count = shape.iter().product::<i64>();

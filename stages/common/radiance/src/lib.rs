@@ -34,7 +34,6 @@ mod math;
 mod mlp;
 mod occupancy;
 mod passes;
-mod random;
 mod ray;
 #[cfg(test)]
 mod reference;
@@ -48,7 +47,6 @@ pub use field::{Architecture, Field, FieldError, Pixel, RayField};
 pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
 pub use occupancy::Occupancy;
 pub use passes::Passes;
-pub use random::{Draws, uniform};
 pub use ray::{Course, Ray, UnitRay, clip};
 pub use simd::{Family, set_family};
 pub use tally::Tally;

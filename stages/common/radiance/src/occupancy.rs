@@ -1,9 +1,9 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
+use counter_rng::CounterRng;
 use rayon::prelude::*;
 use scene::Bounds;
 
-use crate::random::Draws;
 use crate::ray::{Course, FASTEST, UnitRay};
 use crate::simd::kernel;
 
@@ -112,8 +112,8 @@ impl Occupancy {
 
     /// Where in a cell to look at that step, in the unit cube.
     pub fn place_in(cell: u32, seed: u64, step: u64) -> [f32; 3] {
-        let mut draws = Draws::new(seed, 3, step * CELLS as u64 + u64::from(cell));
-        corner(cell as usize).map(|c| (c as f32 + draws.uniform()) / GRID as f32)
+        let mut rng = CounterRng::new(seed, 3, step * CELLS as u64 + u64::from(cell));
+        corner(cell as usize).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
     /// Takes the densities that were found in cells, and decides anew which cells may hold something, for rays with samples so far apart in
@@ -253,7 +253,7 @@ kernel! {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Draws;
+    use counter_rng::CounterRng;
 
     #[test]
     fn skipping_loses_no_sample() {
@@ -261,8 +261,8 @@ mod tests {
         occupancy.set(|cell| (cell / 7) % 11 == 0 && cell % GRID > 40);
         let step = 3.0f32.sqrt() / 512.0;
         for seed in 0..200 {
-            let mut draws = Draws::new(1, 2, seed);
-            let mut unit = || draws.uniform();
+            let mut rng = CounterRng::new(1, 2, seed);
+            let mut unit = || rng.uniform();
             let origin = [unit(), unit(), unit()];
             let d = [unit() - 0.5, unit() - 0.5, if seed % 5 == 0 { 0.0 } else { unit() - 0.5 }];
             let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();

@@ -239,8 +239,8 @@ mod tests {
             };
             let mut met = [0; 2];
             for k in 0..200 {
-                let mut draws = crate::random::Draws::new(5, 0, k);
-                let mut draw = || f64::from(draws.uniform()) - 0.5;
+                let mut rng = counter_rng::CounterRng::new(5, 0, k);
+                let mut draw = || f64::from(rng.uniform()) - 0.5;
                 let from = centre + scale * DVec3::new(draw(), draw(), draw());
                 let direction = (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
                 let ray = ray(from.as_vec3().to_array(), direction.as_vec3().to_array());
@@ -276,8 +276,8 @@ mod tests {
     fn contracted_rays_move_at_most_twice_as_fast_as_t() {
         let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e4, space: Space::Contraction };
         for k in 0..300 {
-            let mut draws = crate::random::Draws::new(6, 0, k);
-            let mut draw = || 2.0 * draws.uniform() - 1.0;
+            let mut rng = counter_rng::CounterRng::new(6, 0, k);
+            let mut draw = || 2.0 * rng.uniform() - 1.0;
             let far = [0.5, 3.0, 40.0][k as usize % 3];
             let origin = [far * draw(), far * draw(), far * draw()];
             let direction = unit([draw(), draw(), draw()].map(f64::from)).as_vec3().to_array();

@@ -1,6 +1,7 @@
 use std::path::Path;
 use std::sync::Mutex;
 
+use counter_rng::uniform;
 use rayon::prelude::*;
 use safetensors::SafeTensors;
 
@@ -11,7 +12,6 @@ use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, wri
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
 use crate::occupancy::{CELLS, Occupancy};
-use crate::random::uniform;
 use crate::ray::{Ray, UnitRay, clip};
 use crate::simd::LANES;
 use crate::tally::Tally;
@@ -505,7 +505,7 @@ impl Shard {
 mod tests {
     use super::*;
     use crate::field::Architecture;
-    use crate::random::Draws;
+    use counter_rng::CounterRng;
     use scene::Bounds;
 
     /// Rays through the cube, before black or white, that should all be white.
@@ -519,8 +519,8 @@ mod tests {
         }
 
         fn cast(&self, group: u64, rays: &mut [Ray]) {
-            let mut draws = Draws::new(1, 2, group);
-            let [x, y] = [0, 1].map(|_| 1.6 * draws.uniform() - 0.8);
+            let mut rng = CounterRng::new(1, 2, group);
+            let [x, y] = [0, 1].map(|_| 1.6 * rng.uniform() - 0.8);
             rays[0] = Ray { origin: [x, y, 4.0], direction: [0.0, 0.0, -1.0], background: [self.background; 3] };
         }
 

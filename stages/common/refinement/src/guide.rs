@@ -216,7 +216,7 @@ const BAND: usize = 32;
 
 #[cfg(test)]
 mod tests {
-    use radiance::uniform;
+    use counter_rng::uniform;
     use scene::{Camera, Intrinsics};
 
     use super::*;

@@ -1,7 +1,7 @@
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use pixels::Picture;
-use radiance::Draws;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -95,14 +95,14 @@ const WEIGHTS: u64 = 300;
 impl Refiner {
     /// A network that hasn't learnt anything: it adds nothing.
     pub fn new(architecture: Architecture, seed: u64) -> Result<Self, RefinementError> {
-        let mut draws = Draws::new(seed, WEIGHTS, 0);
+        let mut rng = CounterRng::new(seed, WEIGHTS, 0);
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
         for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
             // As PyTorch draws them: blocks that begin by adding little. The last layer, and with it the prediction, starts at 0.
             let reach = if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
             let kernel: Vec<f32> =
-                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(draws.uniform()) - 1.0)) as f32).collect();
+                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32).collect();
             parameters.push(Tensor::f_from_slice(&kernel)?.f_reshape(kernel_shape(*inputs, *outputs))?.set_requires_grad(true));
             parameters.push(Tensor::f_from_slice(&vec![0.0f32; *outputs])?.set_requires_grad(true));
         }
@@ -262,16 +262,16 @@ mod tests {
     use super::*;
 
     fn picture(width: usize, height: usize) -> Picture {
-        let mut draws = Draws::new(1, 2, 3);
-        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| draws.uniform()).collect())
+        let mut rng = CounterRng::new(1, 2, 3);
+        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| rng.uniform()).collect())
     }
 
     /// A network whose every weight says something.
     fn random(architecture: Architecture) -> Refiner {
         let mut refiner = Refiner::new(architecture, 5).unwrap();
-        let mut draws = Draws::new(5, 6, 7);
+        let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
-            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (draws.uniform() - 0.5)).collect();
+            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (rng.uniform() - 0.5)).collect();
             *parameter = Tensor::from_slice(&values).reshape(parameter.size());
         }
         refiner

@@ -1,9 +1,9 @@
 use std::ops::Range;
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use nets::Adam;
 use pixels::{Picture, psnr_of};
-use radiance::Draws;
 use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
@@ -66,10 +66,10 @@ struct Pool {
 impl Pool {
     fn new(round: u64, options: &RefinerTraining, guidance: Guidance, examples: &[KnownView]) -> Self {
         let view = |i: u64| {
-            let mut draws = Draws::new(options.seed, POOLS, round * POOL + i);
-            let mut draw = || draws.below(examples.len() as u64) as usize;
+            let mut rng = CounterRng::new(options.seed, POOLS, round * POOL + i);
+            let mut draw = || rng.below(examples.len() as u64) as usize;
             let (chosen, drawn): (usize, Vec<usize>) = (draw(), (0..options.references).map(|_| draw()).collect());
-            let alone = draws.below(ALONE) == 0;
+            let alone = rng.below(ALONE) == 0;
             // A view is no reference for itself.
             let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
             (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
@@ -126,8 +126,8 @@ impl RefinerTrainer {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Picture {
             let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
-            let mut draws = Draws::new(self.options.seed, SCORES, i as u64);
-            let drawn = (0..self.options.references).map(|_| draws.below(references.len() as u64) as usize);
+            let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
+            let drawn = (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
             let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
             guided.uses.iter().for_each(|of_use| uses.add(of_use));
             guided.view
@@ -258,12 +258,12 @@ struct Drawn<'a> {
 impl<'a> Drawn<'a> {
     /// The square with that number.
     fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
-        let mut draws = Draws::new(options.seed, SQUARES, number);
+        let mut rng = CounterRng::new(options.seed, SQUARES, number);
         let mut place = || {
-            let subject = subjects[draws.below(subjects.len() as u64) as usize];
+            let subject = subjects[rng.below(subjects.len() as u64) as usize];
             // On even pixels, as the folds of whole views lie.
             let mut start =
-                |size: usize| (draws.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
+                |size: usize| (rng.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
             let (x, y) = (start(subject.view.width), start(subject.view.height));
             (subject, Square { x, y, size: (options.square, options.square) })
         };
@@ -275,11 +275,11 @@ impl<'a> Drawn<'a> {
             placed = place();
         }
         let (subject, square) = placed;
-        let turn = Turn::ALL[draws.below(Turn::ALL.len() as u64) as usize];
+        let turn = Turn::ALL[rng.below(Turn::ALL.len() as u64) as usize];
         let mut order = [0, 1, 2];
-        (1..OUTPUTS).for_each(|i| order.swap(i, draws.below(i as u64 + 1) as usize));
-        let (contrast, shift) = (0.5 + 0.7 * draws.uniform(), 0.4 * (draws.uniform() - 0.5));
-        let sign = if draws.below(2) == 1 { -1.0 } else { 1.0 };
+        (1..OUTPUTS).for_each(|i| order.swap(i, rng.below(i as u64 + 1) as usize));
+        let (contrast, shift) = (0.5 + 0.7 * rng.uniform(), 0.4 * (rng.uniform() - 0.5));
+        let sign = if rng.below(2) == 1 { -1.0 } else { 1.0 };
         // Around the middle of all colours.
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
         Self { subject, square, turn, order, gain, offset }

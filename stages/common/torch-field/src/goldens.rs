@@ -1,6 +1,7 @@
 //! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make goldens`).
 
-use radiance::{MlpArchitecture, uniform};
+use counter_rng::uniform;
+use radiance::MlpArchitecture;
 use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};

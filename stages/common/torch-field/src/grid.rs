@@ -322,14 +322,15 @@ impl RayField for TorchGrid {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{Draws, Passes};
+    use counter_rng::CounterRng;
+    use radiance::Passes;
 
     use super::*;
 
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
         let ray = |i| {
-            let mut draws = Draws::new(3, 1, i);
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
+            let mut rng = CounterRng::new(3, 1, i);
+            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             let (from, to) = (around(1.0), around(reach));
             let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
             let origin = from.map(|x| 4.0 * x / length(from));

@@ -302,7 +302,8 @@ fn haze(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{Architecture, Draws, Ray, Trainer};
+    use counter_rng::CounterRng;
+    use radiance::{Architecture, Ray, Trainer};
     use scene::{Bounds, Frustum, Space};
 
     use super::*;
@@ -318,10 +319,10 @@ mod tests {
         }
 
         fn cast(&self, group: u64, rays: &mut [Ray]) {
-            let mut draws = Draws::new(1, 2, group);
+            let mut rng = CounterRng::new(1, 2, group);
             // White, or like the fog before it.
             let background = [[1.0; 3], [0.5; 3]][group as usize % 2];
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
+            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             for ray in rays {
                 let (from, to) = (around(0.3), around(0.7));
                 let origin = [from[0], from[1], from[2] + 4.0];

@@ -1,6 +1,7 @@
 use std::path::Path;
 
-use radiance::{Draws, MlpArchitecture, Pixel, Ray, RayField};
+use counter_rng::CounterRng;
+use radiance::{MlpArchitecture, Pixel, Ray, RayField};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -62,22 +63,26 @@ impl SampleDraws {
     /// Those of the rays `first..first + n` of a training.
     pub(crate) fn new(field: &Mlp, seed: u64, first: u64, n: usize, noise: f64) -> Result<Self, TchError> {
         let (coarse, fine) = (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
-        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut Draws) -> f32| {
+        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut CounterRng) -> f32| {
             let row = |ray: u64| {
-                let mut draws = Draws::new(seed, purpose, ray);
-                (0..width).map(|_| draw(&mut draws)).collect::<Vec<_>>()
+                let mut rng = CounterRng::new(seed, purpose, ray);
+                (0..width).map(|_| draw(&mut rng)).collect::<Vec<_>>()
             };
             let values: Vec<f32> = (first..first + n as u64).flat_map(row).collect();
             Tensor::f_from_slice(&values)?.f_reshape([n as i64, width as i64])?.f_to_device(field.device)
         };
-        let scaled = |draws: &mut Draws| (noise * normal(draws)) as f32;
+        let scaled = |rng: &mut CounterRng| (noise * normal(rng)) as f32;
         let noise = if noise > 0.0 {
             let all = rows(NOISE, 2 * coarse + fine, &scaled)?;
             Some([all.f_narrow(1, 0, coarse as i64)?, all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?])
         } else {
             None
         };
-        Ok(Self { coarse: rows(STRATIFIED, coarse, &Draws::uniform)?, fine: rows(IMPORTANCE, fine, &Draws::uniform)?, noise })
+        Ok(Self {
+            coarse: rows(STRATIFIED, coarse, &CounterRng::uniform)?,
+            fine: rows(IMPORTANCE, fine, &CounterRng::uniform)?,
+            noise,
+        })
     }
 }
 

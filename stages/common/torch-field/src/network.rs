@@ -1,6 +1,7 @@
 use std::sync::LazyLock;
 
-use radiance::{Draws, MlpArchitecture};
+use counter_rng::CounterRng;
+use radiance::MlpArchitecture;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::TorchFieldError;
@@ -53,11 +54,11 @@ impl Network {
 
     /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells the networks of a seed apart.
     pub(crate) fn new(architecture: MlpArchitecture, seed: u64, index: u64, device: Device) -> Result<Self, TchError> {
-        let mut draws = Draws::new(seed, WEIGHTS, index);
+        let mut rng = CounterRng::new(seed, WEIGHTS, index);
         let mut parameters = Vec::new();
         for (_, inputs, outputs) in Self::layers(&architecture) {
             let deviation = (2.0 / inputs as f64).sqrt();
-            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut draws)) as f32).collect();
+            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut rng)) as f32).collect();
             parameters.push(Tensor::f_from_slice(&values)?.f_reshape([outputs, inputs])?);
             parameters.push(Tensor::f_zeros([outputs], (Kind::Float, Device::Cpu))?);
         }
@@ -126,7 +127,7 @@ fn by_onednn(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchEr
 const WEIGHTS: u64 = 200;
 
 /// A standard normal draw (Box and Muller 1958).
-pub(crate) fn normal(draws: &mut Draws) -> f64 {
-    let radius = (-2.0 * (1.0 - f64::from(draws.uniform())).ln()).sqrt();
-    radius * (std::f64::consts::TAU * f64::from(draws.uniform())).cos()
+pub(crate) fn normal(rng: &mut CounterRng) -> f64 {
+    let radius = (-2.0 * (1.0 - f64::from(rng.uniform())).ln()).sqrt();
+    radius * (std::f64::consts::TAU * f64::from(rng.uniform())).cos()
 }
