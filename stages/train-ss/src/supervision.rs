@@ -413,7 +413,7 @@ pub(crate) fn coarse_stages(side: u64) -> u32 {
 }
 
 impl radiance::Supervision for Supersampling {
-    fn begin(&mut self, done: f64) {
+    fn set_progress(&mut self, done: f64) {
         self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
         if done < self.coarse {
@@ -427,7 +427,7 @@ impl radiance::Supervision for Supersampling {
         self.side[0] * self.side[1]
     }
 
-    fn cast(&self, group: u64, rays: &mut [Ray]) {
+    fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
         let (index, pixel) = self.pixel(group);
         let view = &self.views[index];
         let background = self.behind(group);
@@ -452,7 +452,7 @@ impl radiance::Supervision for Supersampling {
         }
     }
 
-    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+    fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
         let (index, pixel) = self.pixel(group);
         let picture = &self.views[index].picture;
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
@@ -575,7 +575,7 @@ mod tests {
             let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
             let mut seen = vec![false; (size[0] * size[1]) as usize];
             for group in 0..200 {
-                supersampling.cast(group, &mut rays);
+                supersampling.sample_rays(group, &mut rays);
                 for ray in &rays {
                     let pixel = (0..seen.len()).find(|i| {
                         let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
@@ -598,7 +598,7 @@ mod tests {
             supersampling.background = background;
             let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
             let groups = (0..40).map(|group| {
-                supersampling.cast(group, &mut rays);
+                supersampling.sample_rays(group, &mut rays);
                 assert!(rays.iter().all(|r| r.background == rays[0].background));
                 rays[0].background
             });
@@ -616,15 +616,15 @@ mod tests {
             let (supersampling, _) = example(kind, [2.0, 2.0], None);
             let colours: Vec<[f32; 3]> = (0..4).map(|k| [0.1 * k as f32, 0.5, 0.9]).collect();
             let mut gradients = vec![[0.0; 3]; 4];
-            supersampling.judge(7, &colours, &mut gradients);
+            supersampling.loss_and_gradient(7, &colours, &mut gradients);
             for k in 0..4 {
                 for c in 0..3 {
                     let mut moved = colours.clone();
                     let mut scrap = vec![[0.0; 3]; 4];
                     moved[k][c] += 0.01;
-                    let up = supersampling.judge(7, &moved, &mut scrap);
+                    let up = supersampling.loss_and_gradient(7, &moved, &mut scrap);
                     moved[k][c] -= 0.02;
-                    let numeric = (up - supersampling.judge(7, &moved, &mut scrap)) / 0.02;
+                    let numeric = (up - supersampling.loss_and_gradient(7, &moved, &mut scrap)) / 0.02;
                     assert!((f64::from(gradients[k][c]) - numeric).abs() < 1e-5, "{kind:?}");
                 }
             }
@@ -645,7 +645,7 @@ mod tests {
                 let colours: Vec<[f32; 3]> =
                     (0..4).map(|k| std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])).collect();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = supersampling.judge(group, &colours, &mut gradients);
+                let loss = supersampling.loss_and_gradient(group, &colours, &mut gradients);
                 supersampling.remember(group, &colours);
                 // Until then the cache isn't full of the truth.
                 if group >= 400 {
@@ -671,8 +671,8 @@ mod tests {
         let white = Picture::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
         let mut gradients = [[0.0; 3]; 4];
-        assert!(supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
-        assert!(supersampling.judge(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
+        assert!(supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
+        assert!(supersampling.loss_and_gradient(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
@@ -682,7 +682,7 @@ mod tests {
         let rays_at = |scale: f64, done: f64| {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
             supersampling.coarse = 0.3;
-            supersampling.begin(done);
+            supersampling.set_progress(done);
             supersampling.rays_per_group()
         };
         for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
@@ -724,7 +724,7 @@ mod tests {
             let judged = |of: &Supersampling, pixel: usize| {
                 let group = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = of.judge(group, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+                let loss = of.loss_and_gradient(group, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
                 (loss, gradients)
             };
             assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
@@ -760,7 +760,7 @@ mod tests {
                 if joined.pixel(group).0 == 0 {
                     continue;
                 }
-                joined.cast(group, &mut rays);
+                joined.sample_rays(group, &mut rays);
                 let pixels = rays.map(|ray| {
                     let of =
                         |pixel: usize| camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3();
@@ -771,7 +771,7 @@ mod tests {
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
-                let loss = joined.judge(group, &colours, &mut gradients);
+                let loss = joined.loss_and_gradient(group, &colours, &mut gradients);
                 assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
                 let pulled = gradients[3][0];
                 assert!(
@@ -782,21 +782,21 @@ mod tests {
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-rays they meet the block's mean together.
             joined.coarse = 0.5;
-            joined.begin(0.0);
+            joined.set_progress(0.0);
             let group = (0..).find(|&group| joined.pixel(group) == (1, 4)).unwrap();
-            joined.cast(group, &mut rays[..1]);
+            joined.sample_rays(group, &mut rays[..1]);
             assert!(camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6, "{kind:?}");
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
-            assert!(joined.judge(group, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
-            joined.begin(1.0);
+            assert!(joined.loss_and_gradient(group, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
+            joined.set_progress(1.0);
             // LR pictures have what they had.
             let plain = Supersampling::new(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));
             let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
-            joined.judge(drawn(&joined), &colours, &mut gradients[0]);
-            plain.judge(drawn(&plain), &colours, &mut gradients[1]);
+            joined.loss_and_gradient(drawn(&joined), &colours, &mut gradients[0]);
+            plain.loss_and_gradient(drawn(&plain), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // Of a larger one no more is drawn.

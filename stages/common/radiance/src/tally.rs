@@ -35,7 +35,7 @@ impl Tally {
     }
 
     /// Counts groups of so many rays each.
-    pub fn cast(&mut self, groups: usize, group: usize) {
+    pub fn count(&mut self, groups: usize, group: usize) {
         self.groups += groups as u64;
         self.rays += (groups * group) as u64;
     }
@@ -69,9 +69,9 @@ mod tests {
         let mut tally = Tally::default();
         assert_eq!(tally.groups_of_step(100, 40, 9), Some(4));
         assert_eq!(tally.groups_of_step(100, 4, 9), Some(1));
-        tally.cast(10, 9);
+        tally.count(10, 9);
         assert_eq!((tally.groups_of_step(100, 40, 9), tally.done(100)), (Some(1), 0.9));
-        tally.cast(1, 9);
+        tally.count(1, 9);
         assert_eq!(tally.groups_of_step(100, 40, 9), None);
     }
 

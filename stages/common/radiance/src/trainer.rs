@@ -20,13 +20,13 @@ use crate::tally::Tally;
 /// sub-rays of an LR pixel.
 pub trait Supervision: Sync {
     /// Is told before every step which share of the training's rays is done, from which alone its groups may change.
-    fn begin(&mut self, _done: f64) {}
+    fn set_progress(&mut self, _done: f64) {}
     /// Rays in a group of this step.
     fn rays_per_group(&self) -> usize;
     /// Casts the rays of a group. `group` counts from 0 over the whole training: draw from it alone.
-    fn cast(&self, group: u64, rays: &mut [Ray]);
+    fn sample_rays(&self, group: u64, rays: &mut [Ray]);
     /// The group's loss, given its rays' colours; writes the loss's gradient by each colour.
-    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
+    fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
     /// Is given each group's colours again after a step that went well, in the order of the groups: for a supervision that keeps
     /// what was rendered.
     fn remember(&mut self, _group: u64, _colours: &[[f32; 3]]) {}
@@ -224,7 +224,7 @@ impl Trainer {
 
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
-        supervision.begin(self.tally.done(self.options.rays));
+        supervision.set_progress(self.tally.done(self.options.rays));
         let group = supervision.rays_per_group();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
         let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
@@ -250,7 +250,7 @@ impl Trainer {
                 *sum += g;
             }
         }
-        self.tally.cast(groups, group);
+        self.tally.count(groups, group);
         self.samples_per_ray = samples as f64 / (groups * group) as f64;
         let fault = self.fault(loss);
         if let Some(tensor) = fault {
@@ -465,7 +465,7 @@ impl Shard {
             worker.colours.resize(rays, [0.0; 3]);
             worker.gradients.resize(rays, [0.0; 3]);
             for (k, g) in here.clone().enumerate() {
-                supervision.cast(first_group + g as u64, &mut worker.rays[k * group..(k + 1) * group]);
+                supervision.sample_rays(first_group + g as u64, &mut worker.rays[k * group..(k + 1) * group]);
             }
             worker.clipped.clear();
             worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
@@ -481,8 +481,11 @@ impl Shard {
             }
             for (k, g) in here.clone().enumerate() {
                 let part = k * group..(k + 1) * group;
-                self.loss +=
-                    supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
+                self.loss += supervision.loss_and_gradient(
+                    first_group + g as u64,
+                    &worker.colours[part.clone()],
+                    &mut worker.gradients[part],
+                );
             }
             self.colours.extend_from_slice(&worker.colours);
             worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
@@ -518,13 +521,13 @@ mod tests {
             1
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
+        fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, group);
             let [x, y] = [0, 1].map(|_| 1.6 * rng.uniform() - 0.8);
             rays[0] = Ray { origin: [x, y, 4.0], direction: [0.0, 0.0, -1.0], background: [self.background; 3] };
         }
 
-        fn judge(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             gradients[0] = colours[0].map(|c| 2.0 * (c - 1.0));
             colours[0].iter().map(|c| f64::from((c - 1.0) * (c - 1.0))).sum()
         }
@@ -555,7 +558,7 @@ mod tests {
             let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
             while trainer.step(&mut white).unwrap().is_some() {}
             let mut rays = [Ray::default(); 64];
-            (0..).zip(&mut rays).for_each(|(group, ray)| white.cast(group, std::slice::from_mut(ray)));
+            (0..).zip(&mut rays).for_each(|(group, ray)| white.sample_rays(group, std::slice::from_mut(ray)));
             let field = trainer.finish();
             let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
             (field, opacity)

@@ -86,7 +86,7 @@ impl GridTrainer {
 
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
-        supervision.begin(self.tally.done(self.options.rays));
+        supervision.set_progress(self.tally.done(self.options.rays));
         let group = supervision.rays_per_group();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
         let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
@@ -96,7 +96,7 @@ impl GridTrainer {
         let rays = groups * group;
         let samples = pieces.iter().map(|p| p.samples).sum::<usize>();
         let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
-        self.tally.cast(groups, group);
+        self.tally.count(groups, group);
         self.samples_per_ray = samples as f64 / rays as f64;
         let (colours, gradients): (Vec<_>, Vec<_>) = pieces.into_iter().map(|p| (p.colours, p.gradients)).unzip();
         let mut gradients = gradients.into_iter();
@@ -122,14 +122,14 @@ impl GridTrainer {
 
     /// Some groups forward and back.
     fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
-        let rays = step.cast(supervision, &range);
+        let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let seen = self.grid.see(&rays, &Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?)?;
         let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
         let backgrounds = Tensor::f_from_slice(&backgrounds)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
         let colour = seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
-        let judged = step.judge(supervision, &range, &colour)?;
+        let judged = step.loss_and_gradient(supervision, &range, &colour)?;
         let mut towards = judged.towards;
         if self.options.distortion > 0.0 {
             let share = f64::from(self.options.distortion) / (step.groups * step.group) as f64;
@@ -318,7 +318,7 @@ mod tests {
             4
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
+        fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, group);
             // White, or like the fog before it.
             let background = [[1.0; 3], [0.5; 3]][group as usize % 2];
@@ -332,7 +332,7 @@ mod tests {
             }
         }
 
-        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             let share = 1.0 / colours.len() as f32;
             let mut loss = 0.0;
             for c in 0..3 {
@@ -427,7 +427,7 @@ mod tests {
                 let rays: Vec<Ray> = (0..50)
                     .flat_map(|g| {
                         let mut rays = [Ray::default(); 4];
-                        mine.cast(g, &mut rays);
+                        mine.sample_rays(g, &mut rays);
                         rays
                     })
                     .collect();

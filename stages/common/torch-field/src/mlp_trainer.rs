@@ -120,7 +120,7 @@ impl MlpTrainer {
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.tally.done(self.options.rays);
-        supervision.begin(done);
+        supervision.set_progress(done);
         let group = supervision.rays_per_group();
         let Some(groups) = self.tally.groups_of_step(self.options.rays, self.options.batch, group) else { return Ok(None) };
         let step = Step::new(&self.tally, groups, group);
@@ -128,7 +128,7 @@ impl MlpTrainer {
         let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
         let rays = groups * group;
         let stopped = [0, 1].map(|i| pieces.iter().map(|p| p.stopped[i]).fold(Stopped::default(), Stopped::add));
-        self.tally.cast(groups, group);
+        self.tally.count(groups, group);
         let mut gradients = Vec::new();
         let mut colours = Vec::with_capacity(pieces.len());
         for piece in pieces {
@@ -237,11 +237,11 @@ impl Plan {
 
     /// Some groups forward and back, at once.
     fn run(self, field: &Mlp, supervision: &impl Supervision, range: std::ops::Range<usize>) -> Result<Piece, TchError> {
-        let rays = self.step.cast(supervision, &range);
+        let rays = self.step.sample_rays(supervision, &range);
         let draws = SampleDraws::new(field, self.seed, self.step.first_ray(&range), rays.len(), self.noise)?;
         let seen = field.see(&Batch::new(&rays, field)?, Some(&draws))?;
-        let coarse = self.step.judge(supervision, &range, &seen.coarse.colour)?;
-        let fine = self.step.judge(supervision, &range, &seen.fine.colour)?;
+        let coarse = self.step.loss_and_gradient(supervision, &range, &seen.coarse.colour)?;
+        let fine = self.step.loss_and_gradient(supervision, &range, &seen.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(&[coarse.towards.f_add(&fine.towards)?], &parameters, false, false)?;
         let stopped = [Stopped::by(&seen.coarse.weights)?, Stopped::by(&seen.fine.weights)?];
@@ -265,12 +265,12 @@ mod tests {
             1
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
+        fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
             let across = 0.2 * (group % 4) as f32;
             rays[0] = Ray { origin: [across, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
         }
 
-        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             let off = colours[0].map(|x| x - (group % 2) as f32);
             gradients[0] = off.map(|x| 2.0 * x);
             off.iter().map(|&x| f64::from(x * x)).sum()

@@ -36,20 +36,25 @@ impl Step {
     }
 
     /// The rays of some of its groups.
-    pub(crate) fn cast(self, supervision: &impl Supervision, range: &Range<usize>) -> Vec<Ray> {
+    pub(crate) fn sample_rays(self, supervision: &impl Supervision, range: &Range<usize>) -> Vec<Ray> {
         let mut rays = vec![Ray::default(); range.len() * self.group];
         for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.group)) {
-            supervision.cast(self.first_group + g as u64, rays);
+            supervision.sample_rays(self.first_group + g as u64, rays);
         }
         rays
     }
 
     /// Judges their colours (n × 3).
-    pub(crate) fn judge(self, supervision: &impl Supervision, range: &Range<usize>, colour: &Tensor) -> Result<Judged, TchError> {
+    pub(crate) fn loss_and_gradient(
+        self,
+        supervision: &impl Supervision,
+        range: &Range<usize>,
+        colour: &Tensor,
+    ) -> Result<Judged, TchError> {
         let colours = host(colour)?.as_chunks::<3>().0.to_vec();
         let mut gradients = vec![[0.0f32; 3]; colours.len()];
         let pairs = colours.chunks_exact(self.group).zip(gradients.chunks_exact_mut(self.group));
-        let judge = |(g, (colours, gradients))| supervision.judge(self.first_group + g as u64, colours, gradients);
+        let judge = |(g, (colours, gradients))| supervision.loss_and_gradient(self.first_group + g as u64, colours, gradients);
         let loss = range.clone().zip(pairs).map(judge).sum();
         let scaled: Vec<f32> = gradients.as_flattened().iter().map(|g| g / self.groups as f32).collect();
         let gradients = Tensor::f_from_slice(&scaled)?.f_reshape([colours.len() as i64, 3])?.f_to_device(colour.device())?;
