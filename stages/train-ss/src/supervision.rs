@@ -69,7 +69,7 @@ pub struct Supersampling {
 }
 
 struct TrainingView {
-    /// What groups are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
+    /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
     picture: Picture,
     /// A reference's own pixels.
     fine: Option<Picture>,
@@ -310,13 +310,13 @@ impl Supersampling {
         self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.low])
     }
 
-    /// The view and pixel that a group trains on.
-    fn pixel(&self, group: u64) -> (usize, usize) {
-        let mut rng = CounterRng::new(self.seed, PIXEL, group);
+    /// The view and pixel that a bundle trains on.
+    fn pixel(&self, bundle: u64) -> (usize, usize) {
+        let mut rng = CounterRng::new(self.seed, PIXEL, bundle);
         let (view, pixel) = match self.order {
-            Order::Epochs if group >= self.crop_groups => {
-                let group = group - self.crop_groups;
-                self.place(shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels))
+            Order::Epochs if bundle >= self.crop_groups => {
+                let bundle = bundle - self.crop_groups;
+                self.place(shuffled(self.seed, bundle / self.pixels, bundle % self.pixels, self.pixels))
             }
             _ => {
                 let mut draw = || self.place(self.focus.draw(self.pixels, &mut rng));
@@ -331,7 +331,7 @@ impl Supersampling {
             }
         };
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
-        if group < self.crop_groups {
+        if bundle < self.crop_groups {
             let mut middle = |length: u64| length / 4 + rng.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
             return (view, (y * width + x) as usize);
@@ -352,10 +352,10 @@ impl Supersampling {
         !picture.data[pixel * picture.channels].is_nan()
     }
 
-    /// What lies behind a group's rays: with an open background, or none, another colour each time, so that opacity is learnt.
-    fn behind(&self, group: u64) -> [f32; 3] {
+    /// What lies behind a bundle's rays: with an open background, or none, another colour each time, so that opacity is learnt.
+    fn behind(&self, bundle: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
-            let mut rng = CounterRng::new(self.seed, BACKGROUND, group);
+            let mut rng = CounterRng::new(self.seed, BACKGROUND, bundle);
             [0, 1, 2].map(|_| rng.uniform())
         } else {
             [self.background.shown(); 3]
@@ -423,14 +423,14 @@ impl radiance::Supervision for Supersampling {
         }
     }
 
-    fn rays_per_group(&self) -> usize {
+    fn rays_per_bundle(&self) -> usize {
         self.side[0] * self.side[1]
     }
 
-    fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
-        let (index, pixel) = self.pixel(group);
+    fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+        let (index, pixel) = self.pixel(bundle);
         let view = &self.views[index];
-        let background = self.behind(group);
+        let background = self.behind(bundle);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
         // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.fine) {
@@ -452,14 +452,14 @@ impl radiance::Supervision for Supersampling {
         }
     }
 
-    fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
-        let (index, pixel) = self.pixel(group);
+    fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        let (index, pixel) = self.pixel(bundle);
         let picture = &self.views[index].picture;
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
         let share = 1.0 / colours.len() as f32;
         let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
-        let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
-        let is_cropped = group < self.crop_groups;
+        let behind = if picture.channels == 4 { self.behind(bundle) } else { [0.0; 3] };
+        let is_cropped = bundle < self.crop_groups;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(cache) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
@@ -498,11 +498,11 @@ impl radiance::Supervision for Supersampling {
         loss
     }
 
-    fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
+    fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
         if self.cache.is_none() && self.exposures.is_none() {
             return;
         }
-        let (index, pixel) = self.pixel(group);
+        let (index, pixel) = self.pixel(bundle);
         let picture = &self.views[index].picture;
         if let Some(exposures) = &mut self.exposures {
             let at = pixel * picture.channels;
@@ -572,10 +572,10 @@ mod tests {
             let (supersampling, camera) = example(kind, scale, None);
             let size = [(5.0 * scale[0]).round(), (4.0 * scale[1]).round()];
             let fine = camera.resized(size[0] as u32, size[1] as u32);
-            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
+            let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
             let mut seen = vec![false; (size[0] * size[1]) as usize];
-            for group in 0..200 {
-                supersampling.sample_rays(group, &mut rays);
+            for bundle in 0..200 {
+                supersampling.sample_rays(bundle, &mut rays);
                 for ray in &rays {
                     let pixel = (0..seen.len()).find(|i| {
                         let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
@@ -589,20 +589,20 @@ mod tests {
         }
     }
 
-    /// Behind an opaque scene lies another colour in every group, and what is asked for is the same: a field that is opaque alone
+    /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the same: a field that is opaque alone
     /// can give it.
     #[test]
     fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
         let behind = |background| -> Vec<[f32; 3]> {
             let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
             supersampling.background = background;
-            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
-            let groups = (0..40).map(|group| {
-                supersampling.sample_rays(group, &mut rays);
+            let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
+            let bundles = (0..40).map(|bundle| {
+                supersampling.sample_rays(bundle, &mut rays);
                 assert!(rays.iter().all(|r| r.background == rays[0].background));
                 rays[0].background
             });
-            groups.collect()
+            bundles.collect()
         };
         assert!(behind(Background::White).iter().all(|b| *b == [1.0; 3]));
         let colours = behind(Background::Opaque);
@@ -639,16 +639,16 @@ mod tests {
         let worst = |kind| {
             let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(low.clone()));
             let mut worst = (0.0f64, 0.0f32);
-            for group in 0..800 {
-                let pixel = supersampling.pixel(group).1;
+            for bundle in 0..800 {
+                let pixel = supersampling.pixel(bundle).1;
                 let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
                 let colours: Vec<[f32; 3]> =
                     (0..4).map(|k| std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])).collect();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = supersampling.loss_and_gradient(group, &colours, &mut gradients);
-                supersampling.remember(group, &colours);
+                let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
+                supersampling.remember(bundle, &colours);
                 // Until then the cache isn't full of the truth.
-                if group >= 400 {
+                if bundle >= 400 {
                     let gradient = gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
                     worst = (worst.0.max(loss), worst.1.max(gradient));
                 }
@@ -683,7 +683,7 @@ mod tests {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
             supersampling.coarse = 0.3;
             supersampling.set_progress(done);
-            supersampling.rays_per_group()
+            supersampling.rays_per_bundle()
         };
         for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
             assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
@@ -722,9 +722,9 @@ mod tests {
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
             // Far from the masked pixels all is as without them; beside them the kernel feels less.
             let judged = |of: &Supersampling, pixel: usize| {
-                let group = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
+                let bundle = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = of.loss_and_gradient(group, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+                let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
                 (loss, gradients)
             };
             assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
@@ -756,11 +756,11 @@ mod tests {
             assert_eq!(joined.pixels, 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut seen = [false; 72];
-            for group in 0..800 {
-                if joined.pixel(group).0 == 0 {
+            for bundle in 0..800 {
+                if joined.pixel(bundle).0 == 0 {
                     continue;
                 }
-                joined.sample_rays(group, &mut rays);
+                joined.sample_rays(bundle, &mut rays);
                 let pixels = rays.map(|ray| {
                     let of =
                         |pixel: usize| camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3();
@@ -771,24 +771,24 @@ mod tests {
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
-                let loss = joined.loss_and_gradient(group, &colours, &mut gradients);
+                let loss = joined.loss_and_gradient(bundle, &colours, &mut gradients);
                 assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
                 let pulled = gradients[3][0];
                 assert!(
                     (pulled - 0.2 / 12.0).abs() < 1e-6 && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
-                joined.remember(group, &colours);
+                joined.remember(bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-rays they meet the block's mean together.
             joined.coarse = 0.5;
             joined.set_progress(0.0);
-            let group = (0..).find(|&group| joined.pixel(group) == (1, 4)).unwrap();
-            joined.sample_rays(group, &mut rays[..1]);
+            let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
+            joined.sample_rays(bundle, &mut rays[..1]);
             assert!(camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6, "{kind:?}");
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
-            assert!(joined.loss_and_gradient(group, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
+            assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
             joined.set_progress(1.0);
             // LR pictures have what they had.
             let plain = Supersampling::new(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));

@@ -87,16 +87,16 @@ impl GridTrainer {
     /// Takes a step; `None` once all rays are spent.
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
         supervision.set_progress(self.tally.done(self.options.rays));
-        let group = supervision.rays_per_group();
+        let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
-        let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else { return Ok(None) };
         self.look()?;
-        let step = Step::new(&self.tally, groups, group);
+        let step = Step::new(&self.tally, bundles, bundle);
         let pieces = step.in_pieces(|range| self.run(&*supervision, step, range))?;
-        let rays = groups * group;
+        let rays = bundles * bundle;
         let samples = pieces.iter().map(|p| p.samples).sum::<usize>();
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
-        self.tally.count(groups, group);
+        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
+        self.tally.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / rays as f64;
         let (colours, gradients): (Vec<_>, Vec<_>) = pieces.into_iter().map(|p| (p.colours, p.gradients)).unzip();
         let mut gradients = gradients.into_iter();
@@ -120,7 +120,7 @@ impl GridTrainer {
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
-    /// Some groups forward and back.
+    /// Some bundles forward and back.
     fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
         let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
@@ -132,11 +132,11 @@ impl GridTrainer {
         let judged = step.loss_and_gradient(supervision, &range, &colour)?;
         let mut towards = judged.towards;
         if self.options.distortion > 0.0 {
-            let share = f64::from(self.options.distortion) / (step.groups * step.group) as f64;
+            let share = f64::from(self.options.distortion) / (step.bundles * step.bundle) as f64;
             towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
         }
         if self.options.haze > 0.0 {
-            let share = f64::from(self.options.haze) / (step.groups * step.group) as f64;
+            let share = f64::from(self.options.haze) / (step.bundles * step.bundle) as f64;
             towards = towards.f_add(&haze(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
         }
         let gradients = if towards.requires_grad() {
@@ -308,20 +308,20 @@ mod tests {
 
     use super::*;
 
-    /// Groups of four rays through the middle, of which each should have a colour of its own: in the mean.
+    /// Bundles of four rays through the middle, of which each should have a colour of its own: in the mean.
     struct Painted {
         seen: Vec<f32>,
     }
 
     impl Supervision for Painted {
-        fn rays_per_group(&self) -> usize {
+        fn rays_per_bundle(&self) -> usize {
             4
         }
 
-        fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
-            let mut rng = CounterRng::new(1, 2, group);
+        fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+            let mut rng = CounterRng::new(1, 2, bundle);
             // White, or like the fog before it.
-            let background = [[1.0; 3], [0.5; 3]][group as usize % 2];
+            let background = [[1.0; 3], [0.5; 3]][bundle as usize % 2];
             let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             for ray in rays {
                 let (from, to) = (around(0.3), around(0.7));
@@ -332,12 +332,12 @@ mod tests {
             }
         }
 
-        fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             let share = 1.0 / colours.len() as f32;
             let mut loss = 0.0;
             for c in 0..3 {
                 let mean = colours.iter().map(|x| x[c]).sum::<f32>() * share;
-                let off = mean - [0.2, 0.5, 0.8][(group as usize + c) % 3];
+                let off = mean - [0.2, 0.5, 0.8][(bundle as usize + c) % 3];
                 loss += f64::from(off * off);
                 gradients.iter_mut().for_each(|g| g[c] = 2.0 * off * share);
             }

@@ -121,14 +121,14 @@ impl MlpTrainer {
     pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.tally.done(self.options.rays);
         supervision.set_progress(done);
-        let group = supervision.rays_per_group();
-        let Some(groups) = self.tally.groups_of_step(self.options.rays, self.options.batch, group) else { return Ok(None) };
-        let step = Step::new(&self.tally, groups, group);
+        let bundle = supervision.rays_per_bundle();
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, self.options.batch, bundle) else { return Ok(None) };
+        let step = Step::new(&self.tally, bundles, bundle);
         let pieces = self.pieces(&*supervision, step)?;
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
-        let rays = groups * group;
+        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
+        let rays = bundles * bundle;
         let stopped = [0, 1].map(|i| pieces.iter().map(|p| p.stopped[i]).fold(Stopped::default(), Stopped::add));
-        self.tally.count(groups, group);
+        self.tally.count(bundles, bundle);
         let mut gradients = Vec::new();
         let mut colours = Vec::with_capacity(pieces.len());
         for piece in pieces {
@@ -164,9 +164,9 @@ impl MlpTrainer {
         if self.field.device != Device::Cpu {
             return step.in_pieces(|range| plan.run(&self.field, supervision, range));
         }
-        let (groups, count) = (step.groups, shards(step.groups * step.group));
+        let (bundles, count) = (step.bundles, shards(step.bundles * step.bundle));
         let shards: Vec<(Mlp, std::ops::Range<usize>)> =
-            (0..count).map(|i| (self.field.share(), groups * i / count..groups * (i + 1) / count)).collect();
+            (0..count).map(|i| (self.field.share(), bundles * i / count..bundles * (i + 1) / count)).collect();
         let pieces: Result<Vec<Option<Piece>>, TchError> =
             shards.into_par_iter().map(|(field, range)| plan.run_all(&field, supervision, range)).collect();
         Ok(pieces?.into_iter().flatten().collect())
@@ -180,8 +180,8 @@ impl MlpTrainer {
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let [steps, groups, rays, scale, fault] = self.tally.counters();
-        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, groups, rays, scale, fault, self.stuck_steps])?)
+        let [steps, bundles, rays, scale, fault] = self.tally.counters();
+        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, bundles, rays, scale, fault, self.stuck_steps])?)
     }
 
     /// The step a checkpoint was written at.
@@ -215,7 +215,7 @@ impl Plan {
         range: std::ops::Range<usize>,
     ) -> Result<Option<Piece>, TchError> {
         let samples = (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
-        let chunk = (CHUNK_SAMPLES / (samples * self.step.group)).max(1);
+        let chunk = (CHUNK_SAMPLES / (samples * self.step.bundle)).max(1);
         let mut whole: Option<Piece> = None;
         for start in range.clone().step_by(chunk) {
             let piece = self.run(field, supervision, start..(start + chunk).min(range.end))?;
@@ -235,7 +235,7 @@ impl Plan {
         Ok(whole)
     }
 
-    /// Some groups forward and back, at once.
+    /// Some bundles forward and back, at once.
     fn run(self, field: &Mlp, supervision: &impl Supervision, range: std::ops::Range<usize>) -> Result<Piece, TchError> {
         let rays = self.step.sample_rays(supervision, &range);
         let draws = SampleDraws::new(field, self.seed, self.step.first_ray(&range), rays.len(), self.noise)?;
@@ -261,17 +261,17 @@ mod tests {
     struct Stripes;
 
     impl Supervision for Stripes {
-        fn rays_per_group(&self) -> usize {
+        fn rays_per_bundle(&self) -> usize {
             1
         }
 
-        fn sample_rays(&self, group: u64, rays: &mut [Ray]) {
-            let across = 0.2 * (group % 4) as f32;
+        fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+            let across = 0.2 * (bundle % 4) as f32;
             rays[0] = Ray { origin: [across, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
         }
 
-        fn loss_and_gradient(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
-            let off = colours[0].map(|x| x - (group % 2) as f32);
+        fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+            let off = colours[0].map(|x| x - (bundle % 2) as f32);
             gradients[0] = off.map(|x| 2.0 * x);
             off.iter().map(|&x| f64::from(x * x)).sum()
         }
