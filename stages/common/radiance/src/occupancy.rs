@@ -4,7 +4,7 @@ use counter_rng::CounterRng;
 use rayon::prelude::*;
 use scene::Bounds;
 
-use crate::ray::{Course, FASTEST, UnitRay};
+use crate::ray::{FASTEST, NormalizedRay, RayMap};
 use crate::simd::kernel;
 
 /// Cells along each axis.
@@ -186,7 +186,7 @@ kernel! {
     /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends t and positions; `starts` gets
     /// the first sample of each active ray, and the end.
     pub(crate) fn march<L>(
-        occupancy: &Occupancy, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
+        occupancy: &Occupancy, rays: &[NormalizedRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
         t: &mut Vec<f32>, positions: &mut Vec<[f32; 3]>, starts: &mut Vec<usize>,
     ) {
         let last = GRID as f32 - 1.0;
@@ -224,7 +224,7 @@ kernel! {
                 };
                 // Where the ray leaves this empty cell or block; at least one step on.
                 let mut exit = f32::INFINITY;
-                if let Course::Straight { .. } = ray.course {
+                if let RayMap::Straight { .. } = ray.map {
                     for i in 0..3 {
                         let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
                         let until = (face - ray.origin[i]) * inverse[i];
@@ -271,7 +271,7 @@ mod tests {
                 .filter(|&i| direction[i] != 0.0)
                 .map(|i| (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i])
                 .fold(f32::INFINITY, f32::min);
-            let ray = UnitRay { origin, direction, leave, ..UnitRay::default() };
+            let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
             let mut found = Vec::new();
             // In parts, as the renderer does.
             let (mut next, mut positions) = ([0], Vec::new());

@@ -12,7 +12,7 @@ use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, wri
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
 use crate::occupancy::{CELLS, Occupancy};
-use crate::ray::{Ray, UnitRay, clip};
+use crate::ray::{NormalizedRay, Ray, clip};
 use crate::simd::LANES;
 use crate::tally::Tally;
 
@@ -165,7 +165,7 @@ struct Worker {
     chunk: Chunk,
     lanes: Vec<f32>,
     rays: Vec<Ray>,
-    clipped: Vec<UnitRay>,
+    clipped: Vec<NormalizedRay>,
     offsets: Vec<f32>,
     backgrounds: Vec<[f32; 3]>,
     colours: Vec<[f32; 3]>,

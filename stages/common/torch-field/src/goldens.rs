@@ -80,7 +80,7 @@ fn small() -> (Mlp, Batch, SampleDraws) {
     let _ = direction.narrow(1, 2, 1).fill_(-1.0);
     let noise = Some([draw(9, &[8, 8]) - 0.5, draw(10, &[8, 16]) - 0.5]);
     let draws = SampleDraws { coarse: draw(7, &[8, 8]), fine: draw(8, &[8, 8]), noise };
-    (field, Batch { origin, direction, background: draw(5, &[8, 3]), courses: None }, draws)
+    (field, Batch { origin, direction, background: draw(5, &[8, 3]), maps: None }, draws)
 }
 
 #[test]

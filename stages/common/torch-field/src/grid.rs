@@ -3,8 +3,8 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
-use crate::course::{Courses, fused};
 use crate::mlp::host;
+use crate::ray_maps::{RayMaps, fused};
 
 /// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same description and the same numbers, that
 /// judges the hand-written one, and its way to CUDA.
@@ -59,7 +59,7 @@ pub(crate) struct GridSeen {
     pub(crate) shaded_ray: Tensor,
     /// Samples where there may be something.
     pub(crate) samples: usize,
-    courses: Courses,
+    maps: RayMaps,
 }
 
 fn levels(architecture: &Architecture) -> Vec<Level> {
@@ -211,18 +211,18 @@ impl TorchGrid {
     /// What rays see, with samples `offsets` (n) of a step along.
     pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
-        let courses = Courses::new(&self.bounds, rays, self.device, false)?;
-        let longest = courses.leave.f_sub(&courses.enter)?.f_max()?.f_double_value(&[])?;
+        let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
+        let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
         let count = ((longest / self.step()).ceil() as i64).max(1);
         let k = Tensor::f_arange(count, (Kind::Float, self.device))?.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let t = fused(&k, &k.f_full_like(self.step())?, &courses.enter)?;
-        let positions = courses.positions(&t)?;
+        let t = fused(&k, &k.f_full_like(self.step())?, &maps.enter)?;
+        let positions = maps.positions(&t)?;
         let cell =
             positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?.f_clamp(0.0, CELLS as f64 - 1.0)?;
         let cell = cell.f_to_kind(Kind::Int64)?;
         let [x, y, z] = [0, 1, 2].map(|i| cell.i((.., .., i)));
         let cell = z.f_mul_scalar(CELLS)?.f_add(&y)?.f_mul_scalar(CELLS)?.f_add(&x)?;
-        let inside = t.f_lt_tensor(&courses.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
+        let inside = t.f_lt_tensor(&maps.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = positions.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
 
@@ -248,7 +248,7 @@ impl TorchGrid {
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
         let at = kept.f_index_select(0, &shaded)?;
         let ray = at.f_div_scalar_mode(count, "floor")?;
-        let basis = harmonics(&courses.view)?.f_index_select(0, &ray)?;
+        let basis = harmonics(&maps.view)?.f_index_select(0, &ray)?;
         let input = Tensor::f_cat(&[&raw.f_index_select(0, &shaded)?.f_narrow(1, 1, RAW - 1)?, &basis], -1)?;
         let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let colour = hidden.f_matmul(&self.layers[4])?.f_sigmoid()?;
@@ -266,7 +266,7 @@ impl TorchGrid {
             shaded_weight: weight,
             shaded_ray: ray,
             samples: kept.numel(),
-            courses,
+            maps,
         })
     }
 
@@ -289,16 +289,16 @@ impl TorchGrid {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
         let seen = self.see(rays, &offsets)?;
         let weights = seen.weights.f_mul(&seen.counted)?;
-        let distances = seen.courses.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
+        let distances = seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
         let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
         let (weight, distance) = (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
         let half = seen.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
         let before = half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
         let last = seen.t.size()[1] - 1;
         let is_half = host(&before.f_le(last)?)?;
-        let median = host(&seen.courses.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
+        let median = host(&seen.maps.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
         let (premultiplied, transmittance) = (host(&seen.premultiplied)?, host(&seen.transmittance)?);
-        let (hits, leave) = (host(&seen.courses.hits()?)?, host(&seen.courses.distances(&seen.courses.leave)?)?);
+        let (hits, leave) = (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
         let pixel = |(i, ray): (usize, &Ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
             let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };

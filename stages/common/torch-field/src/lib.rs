@@ -21,7 +21,6 @@
 //! ```
 
 mod composite;
-mod course;
 mod encoding;
 #[cfg(test)]
 mod goldens;
@@ -30,6 +29,7 @@ mod grid_trainer;
 mod mlp;
 mod mlp_trainer;
 mod network;
+mod ray_maps;
 mod sampling;
 mod schedule;
 mod step;

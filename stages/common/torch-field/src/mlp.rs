@@ -8,9 +8,9 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
 use crate::composite::{Composite, composite};
-use crate::course::Courses;
 use crate::encoding::encode;
 use crate::network::{Network, normal};
+use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};
 
 /// The paper's field: a coarse network that says where to look and a fine one that is looked at. In a box, positions are scene units, as
@@ -43,7 +43,7 @@ pub(crate) struct Batch {
     pub(crate) direction: Tensor,
     pub(crate) background: Tensor,
     /// How they run where the field's space isn't a box.
-    pub(crate) courses: Option<Courses>,
+    pub(crate) maps: Option<RayMaps>,
 }
 
 /// What both networks see, and where the fine one looked: distances in scene units.
@@ -98,7 +98,7 @@ impl Batch {
             origin: rows(&|r| r.origin)?,
             direction: rows(&|r| r.direction)?,
             background: rows(&|r| r.background)?,
-            courses: (bounds.space != Space::Box).then(|| Courses::new(&bounds, rays, device, ndc_directions)).transpose()?,
+            maps: (bounds.space != Space::Box).then(|| RayMaps::new(&bounds, rays, device, ndc_directions)).transpose()?,
         })
     }
 }
@@ -173,9 +173,9 @@ impl Mlp {
     pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
         let n = batch.origin.size()[0];
         let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
-        let (near, far) = match &batch.courses {
+        let (near, far) = match &batch.maps {
             None => (like(self.bounds.near)?, like(self.bounds.far)?),
-            Some(courses) => (courses.enter.shallow_clone(), courses.leave.shallow_clone()),
+            Some(maps) => (maps.enter.shallow_clone(), maps.leave.shallow_clone()),
         };
         let count = i64::from(self.architecture.coarse_samples);
         let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
@@ -194,9 +194,9 @@ impl Mlp {
         let finer = importance(&middles(&t)?, &inner, &shares)?;
         let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
         let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
-        let distances = match &batch.courses {
+        let distances = match &batch.maps {
             None => t,
-            Some(courses) => courses.distances(&t)?,
+            Some(maps) => maps.distances(&t)?,
         };
         Ok(Seen { coarse, fine, distances })
     }
@@ -211,9 +211,9 @@ impl Mlp {
         noise: Option<&Tensor>,
     ) -> Result<Composite, TchError> {
         let (n, m) = (t.size()[0], t.size()[1]);
-        let positions = match &batch.courses {
+        let positions = match &batch.maps {
             None => t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?.f_add(&batch.origin.f_unsqueeze(1)?)?,
-            Some(courses) => courses.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
+            Some(maps) => maps.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
         };
         let positions = positions.f_reshape([n * m, 3])?;
         let code = encode(&positions, self.architecture.position_octaves)?;
@@ -254,7 +254,7 @@ impl Mlp {
         let tame: Vec<Ray> =
             rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
         let batch = Batch::new(&tame, self)?;
-        let hits = batch.courses.as_ref().map(|c| host(&c.hits()?)).transpose()?;
+        let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
         let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
             let seen = self.see(&batch, None)?;
@@ -321,8 +321,8 @@ mod tests {
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
             let seen = no_grad(|| field.see(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
             for (i, distances) in host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
-                let course = clip(&bounds, &rays[i]);
-                let ends = [course.distance(course.enter), course.distance(course.leave)];
+                let ray = clip(&bounds, &rays[i]);
+                let ends = [ray.distance(ray.enter), ray.distance(ray.leave)];
                 let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
                 assert!(close(distances[0], ends[0]) && close(distances[23], ends[1]), "{distances:?} {ends:?}");
                 assert!(distances.is_sorted() && distances[12] < 0.5 * (ends[0] + ends[1]), "{distances:?}");
