@@ -95,7 +95,7 @@ impl Occupancy {
     }
 
     /// Cells to look at, at a step of a training: none at most of them.
-    pub fn looks(&self, step: u64) -> Vec<u32> {
+    pub fn cells_to_update(&self, step: u64) -> Vec<u32> {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
@@ -118,7 +118,7 @@ impl Occupancy {
 
     /// Takes the densities that were found in cells, and decides anew which cells may hold something, for rays with samples so far apart in
     /// the cube.
-    pub fn learn(&mut self, cells: &[u32], densities: &[f32], step: f32) {
+    pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
         if cells.is_empty() {
             return;
         }
@@ -307,8 +307,8 @@ mod tests {
         occupancy.limit_to_hull(&Bounds { max: [1.0; 3], ..Bounds::default() }, &hull);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        assert_eq!(occupancy.looks(EVERY).len(), 26 + 8);
-        occupancy.learn(&all, &vec![1e3; CELLS], 0.003);
+        assert_eq!(occupancy.cells_to_update(EVERY).len(), 26 + 8);
+        occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);
     }
 

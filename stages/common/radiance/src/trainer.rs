@@ -339,7 +339,7 @@ impl Trainer {
     /// Looks at the density of cells where it is time to.
     fn update_occupancy(&mut self) {
         let (field, seed, at) = (&self.field, self.options.seed, self.tally.steps);
-        let cells = field.occupancy.looks(at);
+        let cells = field.occupancy.cells_to_update(at);
         let found = cells.par_chunks(1024).map_init(
             || (Chunk::default(), vec![0.0; 3 * 1024]),
             |(chunk, positions), cells| {
@@ -353,7 +353,7 @@ impl Trainer {
         );
         let found: Vec<f32> = found.flatten_iter().collect();
         let step = field.step();
-        self.field.occupancy.learn(&cells, &found, step);
+        self.field.occupancy.update(&cells, &found, step);
     }
 
     /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.

@@ -131,12 +131,12 @@ impl TorchGrid {
             layers: layers.try_into().expect("five layers"),
             occupied: Tensor::new(),
         };
-        made.occupy(occupancy)?;
+        made.set_occupancy(occupancy)?;
         Ok(made)
     }
 
     /// Takes over where there may be something.
-    pub(crate) fn occupy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
+    pub(crate) fn set_occupancy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
         self.occupied = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?.f_ne(0)?;
         Ok(())
     }

@@ -58,7 +58,7 @@ impl GridTrainer {
     /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
     pub fn limit_to_hull(&mut self, hull: &[u8]) -> Result<(), TorchFieldError> {
         self.occupancy.limit_to_hull(&self.grid.bounds, hull);
-        Ok(self.grid.occupy(&self.occupancy)?)
+        Ok(self.grid.set_occupancy(&self.occupancy)?)
     }
 
     /// Steps taken.
@@ -184,7 +184,7 @@ impl GridTrainer {
     /// Looks at the density of cells where it is time to.
     fn look(&mut self) -> Result<(), TchError> {
         let (seed, at) = (self.options.seed, self.tally.steps);
-        let cells = self.occupancy.looks(at);
+        let cells = self.occupancy.cells_to_update(at);
         if cells.is_empty() {
             return Ok(());
         }
@@ -194,8 +194,8 @@ impl GridTrainer {
             let positions = Tensor::f_from_slice(&positions)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
             found.extend(host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.learn(&cells, &found, self.grid.step() as f32);
-        self.grid.occupy(&self.occupancy)
+        self.occupancy.update(&cells, &found, self.grid.step() as f32);
+        self.grid.set_occupancy(&self.occupancy)
     }
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
@@ -239,7 +239,7 @@ impl GridTrainer {
         let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
         no_grad(|| now.iter().zip(&parameters).try_for_each(|(to, from)| to.shallow_clone().f_copy_(from).map(drop)))?;
         self.occupancy.restore(density, &occupied);
-        self.grid.occupy(&self.occupancy)?;
+        self.grid.set_occupancy(&self.occupancy)?;
         (self.first, self.second, self.average) = (first, second, average);
         (self.tally, self.samples_per_ray) = (Tally::from_counters(tally), f64::from_bits(samples_per_ray));
         Ok(())
