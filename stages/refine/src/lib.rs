@@ -18,7 +18,7 @@ use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Sta
 use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
-    Guidance, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
 };
 use scene::{Background, Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -89,11 +89,12 @@ impl Stage for Refine {
         let mut views = Views::read(input)?;
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
-        let photographs = context.optional_input("photographs").map(OwnPhotographs::read).transpose()?;
+        let photographs = context.optional_input("photographs").map(LrObservations::read).transpose()?;
         // Those that the network learnt by agreed, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
-            let agreeing = |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.agreeing(rendered)?, truth });
-            references = references.into_iter().map(agreeing).collect::<Result<_, _>>()?;
+            let consistent =
+                |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.make_consistent(rendered)?, truth });
+            references = references.into_iter().map(consistent).collect::<Result<_, _>>()?;
         }
         let mut job = Job {
             context,
@@ -106,12 +107,12 @@ impl Stage for Refine {
             references,
             photographs,
             enlarged: context.optional_input("enlarged").map(Enlarged::read).transpose()?,
-            agreeing: file.agreeing,
+            takes_consistent: file.agreeing,
         };
         if let Some(guidance) = job.network.guidance().filter(|_| !job.references.is_empty()) {
             job.leave_out(&views, guidance, LITTLE * file.trusted.unwrap_or(1.0))?;
         }
-        let mut agreed = 0;
+        let mut consistent = 0;
         let mut uses = vec![Use::default(); job.references.len()];
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
@@ -119,18 +120,19 @@ impl Stage for Refine {
             let name = &view.camera.name;
             let [image, preview] = [format!("images/{name}.exr"), format!("previews/{name}.png")];
             let made: Made = context.part(name, &[&image, &preview], || job.refine(view, &image, &preview))?;
-            agreed += usize::from(made.agreed);
+            consistent += usize::from(made.is_consistent);
             uses.iter_mut().zip(&made.uses).for_each(|(sum, of_use)| sum.add(of_use));
             view.depth = view.depth.as_ref().map(|_| image.clone());
             view.image = Some(image);
             progress.add(1);
         }
-        if job.agreeing && agreed < views.views.len() {
+        if job.takes_consistent && consistent < views.views.len() {
             context.say("the network was trained on views that agree with LR photographs of their own, which some of these haven't: train one without");
         }
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
-        let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
+        let own =
+            if consistent == 0 { String::new() } else { format!("; {consistent} of them agree with their own photographs") };
         let is_mean =
             |view: &&View| job.enlarged.as_ref().is_some_and(|enlarged| enlarged.views.taken_by(&view.camera).is_some());
         let all = counted(views.views.len(), "view");
@@ -261,8 +263,9 @@ const JUDGES: usize = 8;
 /// How a view was refined.
 #[derive(Serialize, Deserialize)]
 struct Made {
-    /// Whether it was made to agree with its own photograph.
-    agreed: bool,
+    /// Whether it was made consistent with its own LR observation.
+    #[serde(rename = "agreed")]
+    is_consistent: bool,
     /// What each reference was of use for.
     uses: Vec<Use>,
 }
@@ -277,10 +280,10 @@ struct Job<'a> {
     turns: u32,
     overlap: usize,
     references: Vec<KnownView>,
-    photographs: Option<OwnPhotographs<'a>>,
+    photographs: Option<LrObservations<'a>>,
     enlarged: Option<Enlarged<'a>>,
-    /// Whether the network was trained on views that agree with their own photographs.
-    agreeing: bool,
+    /// Whether the network was trained on views that are consistent with their own LR observations.
+    takes_consistent: bool,
 }
 
 impl Job<'_> {
@@ -293,27 +296,27 @@ impl Job<'_> {
             Some(enlarged) => enlarged.mean(redrawn, &view.camera)?,
             None => redrawn,
         };
-        let refined = self.agree(mean, own.as_ref());
+        let refined = self.make_consistent(mean, own.as_ref());
         self.write(&self.context.output_path(image)?, &file, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(preview)?, &refined.to_rgba8())?;
-        Ok(Made { agreed: own.is_some(), uses })
+        Ok(Made { is_consistent: own.is_some(), uses })
     }
 
     /// A view as the network takes it, its file's channels, and its own photograph.
     fn shown(&self, view: &View) -> anyhow::Result<(Rendered, ExrImage, Option<Photograph>)> {
         let (rendered, image) = read(self.input, view, self.background)?;
         let own = self.photographs.as_ref().map(|photographs| photographs.of(&view.camera)).transpose()?.flatten();
-        if !self.agreeing {
+        if !self.takes_consistent {
             return Ok((rendered, image, own));
         }
-        let colours = self.agree(rendered.colours(), own.as_ref());
+        let colours = self.make_consistent(rendered.colours(), own.as_ref());
         Ok((rendered.with_colours(&colours), image, own))
     }
 
-    /// A picture of a view that agrees with its own photograph, where there is one.
-    fn agree(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
+    /// A picture of a view that is consistent with its own LR observation, where there is one.
+    fn make_consistent(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
         match self.photographs.as_ref().zip(own) {
-            Some((photographs, own)) => photographs.agree(&picture, own),
+            Some((photographs, own)) => photographs.project(&picture, own),
             None => picture,
         }
     }

@@ -9,7 +9,7 @@
 //!
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes, [`Guidance`] says how.
-//! * [`OwnPhotographs`]: LR pictures that views are made to agree with.
+//! * [`LrObservations`]: LR images that views are made consistent with (data consistency).
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
 //!
@@ -29,8 +29,8 @@
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
 
-mod agreement;
 mod align;
+mod consistency;
 mod folded;
 mod guide;
 mod refiner;
@@ -38,7 +38,7 @@ mod sums;
 mod trainer;
 mod view;
 
-pub use agreement::OwnPhotographs;
+pub use consistency::LrObservations;
 pub use guide::{Guidance, Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};

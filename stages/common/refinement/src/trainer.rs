@@ -134,20 +134,20 @@ impl RefinerTrainer {
         };
         let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
         let trusted = (uses.seen > 0).then(|| uses.trusted());
-        let (mut rendered, mut agreement, mut power) = (0.0, 0.0, 0.0);
+        let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
             let colours = view.data.chunks_exact(view.channels).flat_map(|p| &p[..OUTPUTS]);
             let mut error = 0.0;
             for ((r, v), t) in refined.data.iter().zip(colours).zip(&truth.data) {
                 let (added, lacks) = (f64::from(r - v), f64::from(t - v));
-                agreement += added * lacks;
+                inner_product += added * lacks;
                 power += added * added;
                 error += lacks * lacks;
             }
             rendered += psnr_of(error / truth.data.len() as f64);
         }
-        let strength = if power > 0.0 { (agreement / power).clamp(0.0, 1.0) } else { 0.0 };
+        let strength = if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let by = self.refiner.refine_by(view, strength as f32, 1)?;
