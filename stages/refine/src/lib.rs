@@ -18,7 +18,8 @@ use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Sta
 use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
-    Guidance, KnownView, LrObservations, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE,
+    with_references,
 };
 use scene::{Background, Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -144,7 +145,7 @@ impl Stage for Refine {
     }
 }
 
-/// The references that a guided network asks for; what another is given is said and left out.
+/// The references that a reference-based network asks for; what another is given is said and left out.
 fn references(context: &Context, wanted: bool, background: Background) -> anyhow::Result<Vec<KnownView>> {
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
     let Some((pictures, rendered)) = given else {
@@ -329,9 +330,9 @@ impl Job<'_> {
                 let Some(guidance) = self.network.guidance() else {
                     return Ok(network.refine_by(&rendered.view, self.strength, self.turns)?);
                 };
-                let guided = guided(rendered, &references, guidance);
-                uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
-                Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
+                let conditioned = with_references(rendered, &references, guidance);
+                uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
+                Ok(network.refine_by(&conditioned.view, self.strength, self.turns)?)
             }
             AnyRefiner::Paper(network, patches) => {
                 let mut drawn = network.refine(rendered, &references, *patches, self.overlap).bad_input("input views")?;
@@ -347,12 +348,12 @@ impl Job<'_> {
     /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
     /// far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
-        let trusted = self.trusted(&self.references, views, guidance, 1.0)?;
+        let confidence = self.confidence(&self.references, views, guidance, 1.0)?;
         let references = std::mem::take(&mut self.references);
-        for (reference, share) in references.into_iter().zip(trusted) {
+        for (reference, share) in references.into_iter().zip(confidence) {
             // At another depth a reference sees nothing by its own.
             let blind = Guidance { occlusion: false, ..guidance };
-            let through = |by: f32| anyhow::Ok(self.trusted(std::slice::from_ref(&reference), views, blind, by)?[0]);
+            let through = |by: f32| anyhow::Ok(self.confidence(std::slice::from_ref(&reference), views, blind, by)?[0]);
             let is_right = || -> anyhow::Result<bool> {
                 let elsewhere = f64::max(through(1.0 - ELSEWHERE)?, through(1.0 + ELSEWHERE)?);
                 Ok(through(1.0)? >= SENSITIVE * elsewhere)
@@ -372,17 +373,17 @@ impl Job<'_> {
     }
 
     /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
-    fn trusted(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
+    fn confidence(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
         for view in views.views.iter().step_by(every) {
             let mut shown = self.shown(view)?.0;
             shown.depth.iter_mut().for_each(|depth| *depth *= depths);
-            let guided = guided(&shown, &references, guidance);
-            uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
+            let conditioned = with_references(&shown, &references, guidance);
+            uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
-        Ok(uses.iter().map(Use::trusted).collect())
+        Ok(uses.iter().map(Use::confidence_share).collect())
     }
 
     /// Says which references were of no use; in a word or two, of what use all were.
@@ -404,7 +405,7 @@ impl Job<'_> {
         if all.seen == 0 {
             return format!(" by {references} that see nothing of them");
         }
-        format!(" by {references}, trusted by {:.0} %", 100.0 * all.trusted())
+        format!(" by {references}, trusted by {:.0} %", 100.0 * all.confidence_share())
     }
 
     /// A view's file with other colours.

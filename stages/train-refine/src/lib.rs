@@ -177,7 +177,7 @@ impl Stage for TrainRefine {
             strength: scores.strength,
             rendered_psnr: scores.rendered_psnr,
             refined_psnr: scores.refined_psnr,
-            trusted: scores.trusted,
+            trusted: scores.confidence,
             agreeing: own.is_some(),
         };
         context.write_json(REFINER_FILE, &file)?;

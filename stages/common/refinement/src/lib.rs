@@ -4,11 +4,12 @@
 //! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR pictures that
 //! were shrunk once more renders views of LR size, whose truth the LR pictures are.
 //!
-//! Where true pictures of some views are known at HR, references, a guided network sees what they show of each pixel, too. The field's depth
-//! says where they show it, and whether they see it at all.
+//! Where true pictures of some views are known at HR, references, a reference-based network sees what they show of each pixel,
+//! too. The field's depth says where they show it, and whether they see it at all.
 //!
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
-//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes, [`Guidance`] says how.
+//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
+//! * [`with_references`]: a view as a reference-based network takes it; [`Guidance`] says how references are looked at.
 //! * [`LrObservations`]: LR images that views are made consistent with (data consistency).
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
@@ -32,17 +33,17 @@
 mod align;
 mod consistency;
 mod folded;
-mod guide;
 mod refiner;
 mod sums;
 mod trainer;
 mod view;
+mod warped_reference;
 
 pub use consistency::LrObservations;
-pub use guide::{Guidance, Guided, Use, guided};
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
 pub use view::{KnownView, Rendered};
+pub use warped_reference::{ConditionedView, Guidance, Use, with_references};
 
 /// A refiner that can't be read, written, used or trained.
 #[derive(Debug, thiserror::Error)]

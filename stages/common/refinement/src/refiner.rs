@@ -9,7 +9,7 @@ use tch::{TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn, samples};
-use crate::guide::Guidance;
+use crate::warped_reference::Guidance;
 
 /// Size of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -26,7 +26,7 @@ pub struct Architecture {
 impl Architecture {
     /// Channels of what it takes.
     pub(crate) fn inputs(self) -> usize {
-        if self.guidance.is_some() { GUIDED_INPUTS } else { INPUTS }
+        if self.guidance.is_some() { REFERENCE_INPUTS } else { INPUTS }
     }
 }
 
@@ -82,7 +82,7 @@ pub struct Refiner {
 /// Channels of a rendered view: colour and opacity.
 pub(crate) const INPUTS: usize = 4;
 /// The same with the difference to references, their confidence, and what their own views lack.
-pub(crate) const GUIDED_INPUTS: usize = 11;
+pub(crate) const REFERENCE_INPUTS: usize = 11;
 /// Channels of a picture.
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
@@ -167,7 +167,8 @@ impl Refiner {
         layer(&x, 1 + 2 * self.architecture.blocks as usize)
     }
 
-    /// The view (for a guided network [`guided`](crate::guided)) with `strength` times what the network adds: a picture of three channels in
+    /// The view with `strength` times what the network adds; a reference-based network takes it from
+    /// [`with_references`](crate::with_references). A picture of three channels in
     /// 0..1. The network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another way, and the mean of its answers is
     /// added (Timofte et al. 2016).
     pub fn refine_by(&self, view: &Picture, strength: f32, turns: u32) -> Result<Picture, RefinementError> {
@@ -351,7 +352,10 @@ mod tests {
         for other in [Architecture { channels: 0, ..architecture }, Architecture { blocks: u32::MAX, ..architecture }] {
             assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
         }
-        assert!(matches!(again.refine(&picture(8, 8)), Err(RefinementError::Channels { channels: 4, expected: GUIDED_INPUTS })));
+        assert!(matches!(
+            again.refine(&picture(8, 8)),
+            Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })
+        ));
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

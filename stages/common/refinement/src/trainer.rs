@@ -9,9 +9,9 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
-use crate::guide::{Guidance, Use, guided};
-use crate::refiner::{GUIDED_INPUTS, OUTPUTS, Refiner};
+use crate::refiner::{OUTPUTS, REFERENCE_INPUTS, Refiner};
 use crate::view::KnownView;
+use crate::warped_reference::{Guidance, Use, with_references};
 
 /// A training, step by step, that can be interrupted.
 pub trait Training {
@@ -37,7 +37,7 @@ pub struct RefinerTraining {
     pub batch: usize,
     /// Pixels along a square's side; an even number.
     pub square: usize,
-    /// References that a guided network gets for a view.
+    /// References that a reference-based network gets for a view.
     pub references: usize,
     /// Highest learning rate; it rises over the first steps and falls to nothing, as a cosine.
     pub rate: f64,
@@ -51,7 +51,7 @@ pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
     adam: Adam,
-    /// What a guided network is shown now.
+    /// What a reference-based network is shown now.
     pool: Option<Pool>,
 }
 
@@ -72,7 +72,7 @@ impl Pool {
             let alone = rng.below(ALONE) == 0;
             // A view is no reference for itself.
             let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
-            (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
+            (chosen, with_references(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
         };
         Self { round, views: (0..POOL).map(view).collect() }
     }
@@ -85,7 +85,7 @@ const WARM_UP: u64 = 50;
 /// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach nothing.
 const CONTRAST: f32 = 0.08;
 const REDRAWS: usize = 8;
-/// A guided network gets no reference once in so many times, so that it can do without.
+/// A reference-based network gets no reference once in so many times, so that it can do without.
 const ALONE: u64 = 8;
 /// Views that squares are drawn from at a time where there are references, and steps until they are drawn anew.
 const POOL: u64 = 32;
@@ -104,8 +104,8 @@ pub struct Scores {
     pub refined_psnr: f64,
     /// Share of the prediction that has the least squared error, from 0 to 1.
     pub strength: f64,
-    /// Share of what references saw that they were trusted with, where there were any.
-    pub trusted: Option<f64>,
+    /// Confidence in references, a share of their visibility, where there were any.
+    pub confidence: Option<f64>,
 }
 
 impl RefinerTrainer {
@@ -128,12 +128,12 @@ impl RefinerTrainer {
             let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
             let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
             let drawn = (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
-            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
-            guided.uses.iter().for_each(|of_use| uses.add(of_use));
-            guided.view
+            let conditioned = with_references(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
+            conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
+            conditioned.view
         };
         let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
-        let trusted = (uses.seen > 0).then(|| uses.trusted());
+        let confidence = (uses.seen > 0).then(|| uses.confidence_share());
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
@@ -155,7 +155,7 @@ impl RefinerTrainer {
             refined += psnr_of(error / truth.data.len() as f64);
         }
         let count = examples.len().max(1) as f64;
-        Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, trusted })
+        Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, confidence })
     }
 }
 
@@ -294,11 +294,11 @@ impl<'a> Drawn<'a> {
             let pixel = around.of(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
-            if view.channels == GUIDED_INPUTS {
-                let [.., r, g, b, trust, x, y, z] = pixel else { unreachable!("a guided view has that many channels") };
+            if view.channels == REFERENCE_INPUTS {
+                let [.., r, g, b, confidence, x, y, z] = pixel else { unreachable!("a conditioned view has that many channels") };
                 let (differences, lacking) = ([r, g, b], [x, y, z]);
                 inputs.extend(self.order.map(|c| self.gain * differences[c]));
-                inputs.push(*trust);
+                inputs.push(*confidence);
                 inputs.extend(self.order.map(|c| self.gain * lacking[c]));
             }
         });
@@ -379,9 +379,9 @@ mod tests {
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
-        let pixels = guided(&view.rendered, &[&other], Guidance::default()).view;
+        let pixels = with_references(&view.rendered, &[&other], Guidance::default()).view;
         let (mut seen, mut worst) = (0, 0.0f32);
-        for (i, pixel) in pixels.data.chunks_exact(GUIDED_INPUTS).enumerate() {
+        for (i, pixel) in pixels.data.chunks_exact(REFERENCE_INPUTS).enumerate() {
             let column = i % 32;
             if pixel[7] == 0.0 {
                 // The other camera stands three pixels to the left: it doesn't see the last three columns.
@@ -395,7 +395,11 @@ mod tests {
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
         assert!(
-            guided(&view.rendered, &[], Guidance::default()).view.data.chunks_exact(GUIDED_INPUTS).all(|p| p[4..] == [0.0; 7])
+            with_references(&view.rendered, &[], Guidance::default())
+                .view
+                .data
+                .chunks_exact(REFERENCE_INPUTS)
+                .all(|p| p[4..] == [0.0; 7])
         );
     }
 }

@@ -34,4 +34,4 @@ pub use camera::{Camera, CameraError, Intrinsics, Ray, common_direction};
 pub use lens::Distortion;
 pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
-pub use warp::{Sight, Surface};
+pub use warp::{Surface, Visibility};
