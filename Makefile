@@ -43,7 +43,7 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
-	cargo clippy --release -p train-ss -p render-depth -p locate -p eval --no-default-features --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p register -p eval --no-default-features --all-targets -- -D warnings
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	$(IN_FUZZ) cargo clippy --release -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi

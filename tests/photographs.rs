@@ -304,11 +304,11 @@ fn poses_are_refined_and_test_views_located() {
     std::fs::write(&file, transforms.to_string()).unwrap();
     project.replace("    parameters: {lr: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 300000");
-    let located = "  locate:
+    let located = "  register:
     inputs: {field: train-ss, photographs: prep/truth}
   located-views:
     like: render-depth
-    inputs: {field: train-ss, cameras: locate}
+    inputs: {field: train-ss, cameras: register}
   eval-located:
     like: eval
     inputs: {views: located-views, truth: prep/truth}

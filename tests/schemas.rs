@@ -27,7 +27,7 @@ fn schemas_are_current() {
     parameters::<report::Report>(&mut all);
     parameters::<camera_path::CameraPath>(&mut all);
     parameters::<video::Video>(&mut all);
-    parameters::<locate::Locate>(&mut all);
+    parameters::<register::Register>(&mut all);
     parameters::<train_refine::TrainRefine>(&mut all);
     parameters::<refine::Refine>(&mut all);
     parameters::<upsample::Upsample>(&mut all);

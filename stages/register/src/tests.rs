@@ -41,29 +41,29 @@ fn photograph() -> Picture {
     Picture::new(48, 48, 3, pixels.iter().flat_map(|pixel| pixel.colour).collect())
 }
 
-fn located(field: &Wall, from: f64) -> Located {
-    Located::by(field, &camera(from), &photograph(), &Params::default(), 1.0).unwrap()
+fn registered(field: &Wall, from: f64) -> Registered {
+    Registered::by(field, &camera(from), &photograph(), &Params::default(), 1.0).unwrap()
 }
 
 #[test]
 fn a_camera_that_is_off_is_found_and_one_far_off_is_warned_of() {
-    let near = located(&Wall { whole: 0, shift: 0.0 }, 0.02);
+    let near = registered(&Wall { whole: 0, shift: 0.0 }, 0.02);
     assert!(near.to.centre().x.abs() < 2e-3 && near.errors.unwrap()[1] < 1e-6, "{:?}", near.to.centre());
     assert!((near.depth.unwrap() - 4.0).abs() < 0.1);
-    let far = located(&Wall { whole: 0, shift: 0.0 }, 0.4);
+    let far = registered(&Wall { whole: 0, shift: 0.0 }, 0.4);
     assert!(far.to.centre().x.abs() < 2e-3, "{:?}", far.to.centre());
     // A photograph is 48 pixels across 2.9 units: 0.02 of those are a third of a pixel, 0.4 are 6.6.
     let (text, warning) = summary(&[near]);
-    assert!(text.starts_with("1 of 1 camera located: ") && warning.is_none(), "{text} {warning:?}");
-    let (text, warning) = summary(&[far, Located::unknown(&camera(0.0)), located(&Wall { whole: 0, shift: 0.0 }, 0.4)]);
-    assert!(text.starts_with("2 of 3 cameras located: "), "{text}");
+    assert!(text.starts_with("1 of 1 camera registered: ") && warning.is_none(), "{text} {warning:?}");
+    let (text, warning) = summary(&[far, Registered::unknown(&camera(0.0)), registered(&Wall { whole: 0, shift: 0.0 }, 0.4)]);
+    assert!(text.starts_with("2 of 3 cameras registered: "), "{text}");
     assert!(warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) in the mean, which is far")), "{warning:?}");
 }
 
 /// Smaller pictures say that the wall lies elsewhere; in the whole one it is met best from where it was given.
 #[test]
 fn the_given_pose_stays_where_none_is_better() {
-    let misled = located(&Wall { whole: 2000, shift: 0.5 }, 0.0);
+    let misled = registered(&Wall { whole: 2000, shift: 0.5 }, 0.0);
     assert_eq!(misled.to, camera(0.0));
     let [before, after] = misled.errors.unwrap();
     assert!(before == after && before < 1e-9, "{before} {after}");

@@ -1,4 +1,4 @@
-//! `locate`: finds where photographs were taken from, by a field that knows the scene. Each camera moves until what the field renders meets its
+//! `register`: finds where photographs were taken from, by a field that knows the scene. Each camera moves until what the field renders meets its
 //! photograph ([`poses::refine`]), from coarse to fine.
 //!
 //! That is how test views are to be scored where poses aren't exact: the field lies where its own training views say, and a camera that is wrong
@@ -15,7 +15,7 @@ use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Parameters of `locate`.
+/// Parameters of `register`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
@@ -34,11 +34,11 @@ impl Default for Params {
 }
 
 /// The stage.
-pub struct Locate;
+pub struct Register;
 
-impl Stage for Locate {
+impl Stage for Register {
     type Params = Params;
-    const NAME: &'static str = "locate";
+    const NAME: &'static str = "register";
     const SUMMARY: &'static str = "Finds where photographs were taken from, by a field.";
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
@@ -65,27 +65,27 @@ impl Stage for Locate {
             context.check_interrupt()?;
             let place = || format!("view {}", view.camera.name);
             let photograph = read(view, input).bad_input(place())?;
-            let located = match photograph {
+            let registered = match photograph {
                 Some(photograph) => {
                     let picture = photograph.over(shown).known();
-                    Located::by(&members, &view.camera, &picture, params, shown)
+                    Registered::by(&members, &view.camera, &picture, params, shown)
                         .map_err(|e| anyhow::anyhow!("{}: {e}", place()))?
                 }
-                None => Located::unknown(&view.camera),
+                None => Registered::unknown(&view.camera),
             };
-            found.push(located);
+            found.push(registered);
             progress.add(1);
         }
         let (summary, warning) = summary(&found);
         warning.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
-        let views = found.into_iter().map(|located| View::camera_only(located.to)).collect();
+        let views = found.into_iter().map(|registered| View::camera_only(registered.to)).collect();
         context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(given.background, given.bounds, views) })?;
         context.write_summary(&with_warnings(&summary, warning.as_slice()))
     }
 }
 
 /// Where a photograph was taken from.
-struct Located {
+struct Registered {
     /// The given camera; its pixels are the photograph's.
     from: Camera,
     /// The camera that was found.
@@ -96,7 +96,7 @@ struct Located {
     errors: Option<[f64; 2]>,
 }
 
-impl Located {
+impl Registered {
     /// Of a view without a photograph nothing is known.
     fn unknown(camera: &Camera) -> Self {
         Self { from: camera.clone(), to: camera.clone(), depth: None, errors: None }
@@ -137,12 +137,12 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
 }
 
 /// How far cameras went, and what it was good for; a warning, where they went far.
-fn summary(found: &[Located]) -> (String, Option<String>) {
-    let moved = Moved::between(found.iter().map(|Located { from, to, depth, .. }| Step { from, to, depth: *depth }));
-    let errors: Vec<[f64; 2]> = found.iter().filter_map(|located| located.errors).collect();
+fn summary(found: &[Registered]) -> (String, Option<String>) {
+    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| Step { from, to, depth: *depth }));
+    let errors: Vec<[f64; 2]> = found.iter().filter_map(|registered| registered.errors).collect();
     let mean = |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
     let (count, all, before, after) = (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));
-    let summary = format!("{count} of {all} located: {moved}; error (Huber's) {before:.4} before, {after:.4} after");
+    let summary = format!("{count} of {all} registered: {moved}; error (Huber's) {before:.4} before, {after:.4} after");
     let warning = format!(
         "cameras have {moved}, which is far: unless the given poses are that far off, the field or the photographs are of something else"
     );

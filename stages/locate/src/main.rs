@@ -1,5 +1,0 @@
-//! The stage's binary; see the library.
-
-fn main() -> std::process::ExitCode {
-    artifact::run_stage::<locate::Locate>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
-}
