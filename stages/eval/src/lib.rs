@@ -179,7 +179,8 @@ impl Stage for Eval {
         let is_known = truth_in.path(DEGRADATION_FILE).exists();
         let made: Option<Degradation> = if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
         let filter = made.map_or(Filter::Box, |d| d.kernel.filter());
-        let job = Job { context, params, perceptual: &perceptual, filter, views: (views_in, &views), truth: (truth_in, &truth) };
+        let job =
+            ScoringJob { context, params, perceptual: &perceptual, filter, views: (views_in, &views), truth: (truth_in, &truth) };
         let progress = context.progress("scoring", truth.views.len() as u64);
         let score = |view: &View| -> anyhow::Result<ViewScores> {
             context.check_interrupt()?;
@@ -196,7 +197,7 @@ impl Stage for Eval {
 }
 
 /// What scoring a view needs.
-struct Job<'a> {
+struct ScoringJob<'a> {
     context: &'a Context,
     params: &'a Params,
     perceptual: &'a Perceptual,
@@ -206,7 +207,7 @@ struct Job<'a> {
     truth: (&'a GivenInput, &'a Views),
 }
 
-impl Job<'_> {
+impl ScoringJob<'_> {
     fn score(&self, true_view: &View) -> anyhow::Result<ViewScores> {
         let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
         let name = &true_view.camera.name;

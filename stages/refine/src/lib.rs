@@ -97,7 +97,7 @@ impl Stage for Refine {
                 |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.make_consistent(rendered)?, truth });
             references = references.into_iter().map(consistent).collect::<Result<_, _>>()?;
         }
-        let mut job = Job {
+        let mut job = RefineJob {
             context,
             input,
             background: views.background.shown(),
@@ -272,7 +272,7 @@ struct Made {
 }
 
 /// What all views share.
-struct Job<'a> {
+struct RefineJob<'a> {
     context: &'a Context,
     input: &'a GivenInput,
     background: f32,
@@ -287,7 +287,7 @@ struct Job<'a> {
     takes_consistent: bool,
 }
 
-impl Job<'_> {
+impl RefineJob<'_> {
     /// Refines one view and writes its files.
     fn refine(&self, view: &View, image: &str, preview: &str) -> anyhow::Result<Made> {
         let (rendered, file, own) = self.shown(view)?;

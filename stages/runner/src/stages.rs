@@ -91,7 +91,8 @@ impl Programs {
     ) -> Result<Self, Interrupted> {
         let file = store.root().join("cache/describe.json");
         // A cache that can't be read is an empty one.
-        let mut cache: Cache = std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+        let mut cache: DescriptionCache =
+            std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
         let mut answers: BTreeMap<PathBuf, Result<Arc<StageProgram>, String>> = BTreeMap::new();
         let mut unasked: BTreeMap<PathBuf, Identity> = BTreeMap::new();
         let paths: BTreeMap<&String, PathBuf> = pipeline.stages.keys().map(|s| (s, executable(pipeline, s))).collect();
@@ -147,7 +148,7 @@ impl Programs {
 
 /// Answers of `describe` by the program's path.
 #[derive(Default, Serialize, Deserialize)]
-struct Cache(BTreeMap<String, Answer>);
+struct DescriptionCache(BTreeMap<String, Answer>);
 
 #[derive(Serialize, Deserialize)]
 struct Answer {
@@ -166,7 +167,7 @@ struct Identity {
     blake3: Option<String>,
 }
 
-impl Cache {
+impl DescriptionCache {
     fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
         self.0.get(&id(path)).filter(|answer| answer.identity == *identity).map(|answer| answer.description.clone())
     }

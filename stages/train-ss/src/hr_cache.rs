@@ -20,18 +20,18 @@ struct CachedView {
     /// RGB of the LR pixels that the kernel makes of those, in levels of 1/[`ONE`]². It follows every change: whole numbers add up to the
     /// same whatever the order, so it is what the kernel makes of them anew, to the last bit.
     projected: Vec<[i64; 3]>,
-    kernel: Arc<Kernel>,
+    kernel: Arc<KernelOperator>,
 }
 
 /// What made LR pictures of a size, and what its residuals ask of HR pixels.
 #[derive(Debug)]
-pub(crate) struct Kernel {
+pub(crate) struct KernelOperator {
     operator: Resampling,
     /// Weights of the pseudo-inverse, transposed.
     inverse: Resampling,
 }
 
-impl Kernel {
+impl KernelOperator {
     pub(crate) fn new(operator: Resampling) -> Self {
         let inverse = operator.inverse(HrCache::REACH);
         Self { operator, inverse }
@@ -44,7 +44,7 @@ impl HrCache {
     }
 
     /// Adds the next view: an RGB picture at HR size to begin with, and what makes it an LR picture.
-    pub(crate) fn add(&mut self, picture: &Picture, kernel: Arc<Kernel>) {
+    pub(crate) fn add(&mut self, picture: &Picture, kernel: Arc<KernelOperator>) {
         let rendered = picture.data.iter().map(|&v| to_u8(v)).collect();
         let mut view = CachedView { width: picture.width, height: picture.height, rendered, projected: Vec::new(), kernel };
         view.project();
@@ -255,7 +255,7 @@ mod tests {
             let fine = picture(high.0, high.1);
             let targets = picture(low.0, low.1);
             let mut cache = HrCache::new(side);
-            cache.add(&fine, Arc::new(Kernel::new(operator.clone())));
+            cache.add(&fine, Arc::new(KernelOperator::new(operator.clone())));
             for y in 0..low.1 {
                 for x in 0..low.0 {
                     let [i, j] = cache.block(0, x, y);
@@ -283,13 +283,13 @@ mod tests {
     #[test]
     fn remembers_what_it_is_told() {
         let mut cache = HrCache::new([2, 2]);
-        cache.add(&picture(8, 6), Arc::new(Kernel::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
+        cache.add(&picture(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         cache.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
         let bytes: Vec<u8> = cache.parts().flatten().copied().collect();
         assert_eq!(cache.len(), bytes.len());
         assert_eq!(bytes[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
         let mut other = HrCache::new([2, 2]);
-        other.add(&picture(8, 6), Arc::new(Kernel::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
+        other.add(&picture(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         other.restore(&bytes);
         assert!(other.parts().eq(cache.parts()));
     }
@@ -302,7 +302,7 @@ mod tests {
             for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
                 let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
                 let mut cache = HrCache::new(side);
-                cache.add(&picture(high.0, high.1), Arc::new(Kernel::new(Resampling::new(filter, high, low))));
+                cache.add(&picture(high.0, high.1), Arc::new(KernelOperator::new(Resampling::new(filter, high, low))));
                 for k in 0..low.0 * low.1 {
                     let colours: Vec<[f32; 3]> = (0..side[0] * side[1]).map(|i| [(i * 7 + k) as f32 % 1.0, 0.3, 1.0]).collect();
                     cache.remember(0, k % low.0, k / low.0, &colours);
@@ -321,7 +321,7 @@ mod tests {
             let side = (high as f64 / low as f64).ceil() as usize;
             let mut cache = HrCache::new([side, side]);
             let operator = Resampling::new(Filter::Lanczos, (high, high), (low, low));
-            cache.add(&picture(high, high), Arc::new(Kernel::new(operator)));
+            cache.add(&picture(high, high), Arc::new(KernelOperator::new(operator)));
             let mut seen = vec![false; high];
             (0..low).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
             assert!(seen.iter().all(|s| *s), "{low} {high}");

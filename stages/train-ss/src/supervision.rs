@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Photographs;
 use crate::exposure::Exposures;
-use crate::hr_cache::{HrCache, Kernel};
+use crate::hr_cache::{HrCache, KernelOperator};
 use crate::moving_cameras::MovingCameras;
 use crate::order::{Focus, detailed, shuffled};
 
@@ -162,7 +162,7 @@ impl Supersampling {
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
         let mut cache = None;
-        let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
+        let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<KernelOperator>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut with_detail = Vec::new();
         let mut ready = Vec::new();
@@ -180,7 +180,7 @@ impl Supersampling {
                 Supervision::Kernel => {
                     let (enlarge, kernel) = kernels.entry((picture.width, picture.height)).or_insert_with(|| {
                         let (enlarge, shrink) = operator(&picture);
-                        (enlarge, Arc::new(Kernel::new(shrink)))
+                        (enlarge, Arc::new(KernelOperator::new(shrink)))
                     });
                     cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&picture), kernel.clone());
                 }

@@ -7,7 +7,7 @@ use tch::{Kind, TchError, Tensor};
 
 use crate::network::{COARSEST, COLOURS};
 use crate::perspective::Perspective;
-use crate::{PaperRefiner, Perceptual};
+use crate::{PaperRefiner, PerceptualLoss};
 
 /// How to train a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,7 +32,7 @@ pub struct PaperTraining {
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: PaperTraining,
-    perceptual: Option<Perceptual>,
+    perceptual: Option<PerceptualLoss>,
     adam: Adam,
 }
 
@@ -46,7 +46,11 @@ const PATCHES: u64 = 322;
 
 impl PaperTrainer {
     /// Starts from a network.
-    pub fn new(network: PaperRefiner, options: PaperTraining, perceptual: Option<Perceptual>) -> Result<Self, RefinementError> {
+    pub fn new(
+        network: PaperRefiner,
+        options: PaperTraining,
+        perceptual: Option<PerceptualLoss>,
+    ) -> Result<Self, RefinementError> {
         let adam = Adam::new(network.parameters())?;
         Ok(Self { network, options, perceptual, adam })
     }
@@ -71,7 +75,7 @@ impl Training for PaperTrainer {
         for i in 0..batch {
             let mut rng = CounterRng::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
             let number = rng.below(examples.len() as u64);
-            let drawn = Drawn::new(&examples[number as usize], number, &self.options, &mut rng);
+            let drawn = TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
             drawn.append(&mut rendered, &mut truth, &mut others);
         }
         let side = patch as i64;
@@ -101,14 +105,14 @@ impl Training for PaperTrainer {
 }
 
 /// L1 of pictures in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
-pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&Perceptual>) -> Result<(Tensor, f64), TchError> {
+pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&PerceptualLoss>) -> Result<(Tensor, f64), TchError> {
     let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
     let error = first.f_double_value(&[])?;
     Ok((perceptual.map_or_else(|| Ok(first.shallow_clone()), |p| p.distance(found, truth)?.f_add(&first))?, error))
 }
 
 /// A patch to learn from.
-struct Drawn<'a> {
+struct TrainingPatch<'a> {
     example: &'a KnownView,
     warp: Perspective,
     patch: usize,
@@ -117,7 +121,7 @@ struct Drawn<'a> {
     references: Vec<(usize, usize)>,
 }
 
-impl<'a> Drawn<'a> {
+impl<'a> TrainingPatch<'a> {
     fn new(example: &'a KnownView, number: u64, options: &PaperTraining, rng: &mut CounterRng) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
         let which = rng.below(PERSPECTIVES);

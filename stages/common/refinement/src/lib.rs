@@ -41,7 +41,7 @@ mod warped_reference;
 
 pub use consistency::LrObservations;
 pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
-pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
+pub use trainer::{RefinerScores, RefinerTrainer, RefinerTraining, Training};
 pub use view::{KnownView, Rendered};
 pub use warped_reference::{ConditionedView, Guidance, Use, with_references};
 

@@ -97,7 +97,7 @@ const POOLS: u64 = 303;
 
 /// How well views are rendered and refined.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Scores {
+pub struct RefinerScores {
     /// Mean PSNR as rendered, in dB.
     pub rendered_psnr: f64,
     /// Mean PSNR refined, with the best strength, in dB.
@@ -122,7 +122,7 @@ impl RefinerTrainer {
 
     /// Scores examples that training left out, with references drawn from those that it had, and finds the share of the prediction that
     /// serves them best.
-    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
+    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Picture {
             let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
@@ -155,7 +155,7 @@ impl RefinerTrainer {
             refined += psnr_of(error / truth.data.len() as f64);
         }
         let count = examples.len().max(1) as f64;
-        Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, confidence })
+        Ok(RefinerScores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, confidence })
     }
 }
 
@@ -225,7 +225,7 @@ fn shard(
     let around = Square { x: 0, y: 0, size }.grown(refiner.reach());
     let square = Square { x: 0, y: 0, size };
     for i in range {
-        let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, subjects);
+        let drawn = TrainingSquare::new(options, step * options.batch as u64 + i as u64, subjects);
         drawn.append(refiner, &mut inputs, &mut lacks);
     }
     let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
@@ -244,7 +244,7 @@ struct Subject<'a> {
 }
 
 /// A square of a view, as it is shown to the network.
-struct Drawn<'a> {
+struct TrainingSquare<'a> {
     subject: Subject<'a>,
     square: Square,
     turn: Turn,
@@ -255,7 +255,7 @@ struct Drawn<'a> {
     offset: f32,
 }
 
-impl<'a> Drawn<'a> {
+impl<'a> TrainingSquare<'a> {
     /// The square with that number.
     fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, SQUARES, number);

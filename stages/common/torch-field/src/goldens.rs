@@ -8,7 +8,7 @@ use tch::{Device, Kind, Tensor};
 
 use crate::encoding::encode;
 use crate::mlp::{Batch, Mlp, SampleDraws};
-use crate::network::Network;
+use crate::network::MlpNetwork;
 use crate::sampling::{importance, middles, stratified};
 use crate::{MlpTrainer, MlpTraining, Schedule};
 
@@ -38,9 +38,9 @@ fn close(name: &str, ours: &Tensor, tolerance: f64) {
 }
 
 /// A network with the script's weights.
-fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> Network {
+fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> MlpNetwork {
     let mut next = purpose;
-    let read = Network::read(architecture, |_, shape| {
+    let read = MlpNetwork::read(architecture, |_, shape| {
         let drawn = draw(next, shape);
         next += 1;
         Ok(if shape.len() == 2 { (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0) } else { 0.2 * drawn - 0.05 })

@@ -13,7 +13,7 @@ pub struct TorchGrid {
     pub(crate) architecture: Architecture,
     pub(crate) bounds: Bounds,
     pub(crate) device: Device,
-    pub(crate) levels: Vec<Level>,
+    pub(crate) levels: Vec<TorchLevel>,
     /// Entries × 4, of all levels.
     pub(crate) table: Tensor,
     /// Five layers, each inputs × outputs.
@@ -24,7 +24,7 @@ pub struct TorchGrid {
 
 /// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Level {
+pub(crate) struct TorchLevel {
     /// Cells along each axis.
     resolution: [i64; 3],
     pub(crate) first: i64,
@@ -62,7 +62,7 @@ pub(crate) struct GridSeen {
     maps: RayMaps,
 }
 
-fn levels(architecture: &Architecture) -> Vec<Level> {
+fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
     let (coarsest, finest) = (f64::from(architecture.coarsest), f64::from(architecture.finest));
     let ratio = (finest / coarsest).powf(1.0 / f64::from(architecture.levels.max(2) - 1));
     let mut first = 0;
@@ -74,7 +74,7 @@ fn levels(architecture: &Architecture) -> Vec<Level> {
         // Dense levels end with whole cache lines.
         let entries = if hashed { 1 << architecture.log2_entries } else { (vertices + 15) / 16 * 16 };
         first += entries;
-        Level { resolution, first: first - entries, entries, hashed }
+        TorchLevel { resolution, first: first - entries, entries, hashed }
     };
     (0..architecture.levels).map(level).collect()
 }

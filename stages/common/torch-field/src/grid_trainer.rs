@@ -30,7 +30,7 @@ const EPSILON: f64 = 1e-15;
 const LOOKS: usize = 1 << 18;
 
 /// What a piece of a step leaves.
-struct Piece {
+struct GridPiece {
     gradients: Vec<Tensor>,
     colours: Vec<[f32; 3]>,
     loss: f64,
@@ -121,7 +121,7 @@ impl GridTrainer {
     }
 
     /// Some bundles forward and back.
-    fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
+    fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<GridPiece, TchError> {
         let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
@@ -145,7 +145,7 @@ impl GridTrainer {
             // No sample was met: nothing is learnt.
             self.first.iter().map(Tensor::f_zeros_like).collect::<Result<_, _>>()?
         };
-        Ok(Piece { gradients, colours: judged.colours, loss: judged.loss, samples: seen.samples })
+        Ok(GridPiece { gradients, colours: judged.colours, loss: judged.loss, samples: seen.samples })
     }
 
     /// Moves the parameters, and late in the training their average.

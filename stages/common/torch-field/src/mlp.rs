@@ -9,7 +9,7 @@ use tch::{Device, Kind, TchError, Tensor, no_grad};
 use crate::TorchFieldError;
 use crate::composite::{Composite, composite};
 use crate::encoding::encode;
-use crate::network::{Network, normal};
+use crate::network::{MlpNetwork, normal};
 use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};
 
@@ -20,8 +20,8 @@ use crate::sampling::{importance, middles, stratified};
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
     pub(crate) bounds: Bounds,
-    pub(crate) coarse: Network,
-    pub(crate) fine: Network,
+    pub(crate) coarse: MlpNetwork,
+    pub(crate) fine: MlpNetwork,
     pub(crate) device: Device,
 }
 
@@ -106,7 +106,7 @@ impl Batch {
 impl Mlp {
     /// A field before training, drawn from a seed.
     pub fn new(architecture: MlpArchitecture, bounds: Bounds, seed: u64, device: Device) -> Result<Self, TorchFieldError> {
-        let network = |index| Network::new(architecture, seed, index, device);
+        let network = |index| MlpNetwork::new(architecture, seed, index, device);
         Ok(Self { architecture, bounds, coarse: network(0)?, fine: network(1)?, device })
     }
 
@@ -114,10 +114,10 @@ impl Mlp {
     pub fn read(path: &Path, architecture: MlpArchitecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
         architecture.check().map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
         let weights = nets::Weights::read(path)?;
-        let network = |prefix: &str| -> Result<Network, TorchFieldError> {
-            let read = Network::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
+        let network = |prefix: &str| -> Result<MlpNetwork, TorchFieldError> {
+            let read = MlpNetwork::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
             let finite = |t: &Tensor| -> Result<bool, TchError> { Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0) };
-            for (parameter, (name, _)) in read.parameters.iter().zip(Network::names(&architecture)) {
+            for (parameter, (name, _)) in read.parameters.iter().zip(MlpNetwork::names(&architecture)) {
                 if !finite(parameter)? {
                     let reason = format!("tensor {prefix}.{name} is not finite");
                     return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
@@ -136,8 +136,8 @@ impl Mlp {
 
     /// All parameters by name.
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        let names = || Network::names(&self.architecture).map(|(name, _)| name);
-        let named = |prefix: &'static str, network: &Network| {
+        let names = || MlpNetwork::names(&self.architecture).map(|(name, _)| name);
+        let named = |prefix: &'static str, network: &MlpNetwork| {
             names().zip(network.share().parameters).map(move |(name, t)| (format!("{prefix}.{name}"), t)).collect::<Vec<_>>()
         };
         named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
@@ -204,7 +204,7 @@ impl Mlp {
     /// What one network sees at t.
     fn look(
         &self,
-        network: &Network,
+        network: &MlpNetwork,
         batch: &Batch,
         direction: &Tensor,
         t: &Tensor,

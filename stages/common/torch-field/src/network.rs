@@ -8,9 +8,9 @@ use crate::TorchFieldError;
 use crate::encoding::encoded;
 
 /// One of the two networks: position → density and a feature, that and direction → colour. Parameters are weight and bias of
-/// each layer, in the order of [`Network::layers`].
+/// each layer, in the order of [`MlpNetwork::layers`].
 #[derive(Debug)]
-pub(crate) struct Network {
+pub(crate) struct MlpNetwork {
     architecture: MlpArchitecture,
     pub(crate) parameters: Vec<Tensor>,
 }
@@ -21,7 +21,7 @@ type Layer = (String, i64, i64);
 /// The encoded position joins in again at this layer, counted from 0.
 const SKIP: u32 = 4;
 
-impl Network {
+impl MlpNetwork {
     /// Layers from front to back.
     pub(crate) fn layers(architecture: &MlpArchitecture) -> Vec<Layer> {
         let width = i64::from(architecture.width);
