@@ -23,7 +23,7 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr};
 use refinement::{
-    Architecture, Guidance, KnownView, LrObservations, Network, REFINER_FILE, RefinementError, Refiner, RefinerFile,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, RefinementError, Refiner, RefinerArchitecture, RefinerFile,
     RefinerTrainer, RefinerTraining, Rendered, Training, WEIGHTS_FILE,
 };
 use scene::{View, Views};
@@ -155,7 +155,7 @@ impl Stage for TrainRefine {
         if params.references > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
-        let architecture = Architecture {
+        let architecture = RefinerArchitecture {
             channels: params.channels.unwrap_or(32),
             blocks: params.blocks,
             guidance: (params.references > 0).then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),

@@ -21,9 +21,9 @@
 //!
 //! ```
 //! use pixels::Picture;
-//! use refinement::{Architecture, Refiner};
+//! use refinement::{Refiner, RefinerArchitecture};
 //! nets::deterministic();
-//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance: None }, 7)?;
+//! let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance: None }, 7)?;
 //! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
@@ -40,7 +40,7 @@ mod view;
 mod warped_reference;
 
 pub use consistency::LrObservations;
-pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
+pub use refiner::{Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerScores, RefinerTrainer, RefinerTraining, Training};
 pub use view::{KnownView, Rendered};
 pub use warped_reference::{ConditionedView, Guidance, Use, with_references};

@@ -14,7 +14,7 @@ use crate::warped_reference::Guidance;
 /// Size of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Architecture {
+pub struct RefinerArchitecture {
     /// Features of the hidden layers.
     pub channels: u32,
     /// Residual blocks of two layers each.
@@ -23,7 +23,7 @@ pub struct Architecture {
     pub guidance: Option<Guidance>,
 }
 
-impl Architecture {
+impl RefinerArchitecture {
     /// Channels of what it takes.
     pub(crate) fn inputs(self) -> usize {
         if self.guidance.is_some() { REFERENCE_INPUTS } else { INPUTS }
@@ -35,7 +35,7 @@ impl Architecture {
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Network {
     /// Ours: [`Refiner`].
-    Compact(Architecture),
+    Compact(RefinerArchitecture),
     /// The paper's (crate `paper-refiner`).
     Paper {
         /// Features of its first layer; 128 are published.
@@ -74,7 +74,7 @@ pub struct RefinerFile {
 /// nothing: borders are gone on with before it, and what it predicts depends on nothing but what it sees.
 #[derive(Debug)]
 pub struct Refiner {
-    architecture: Architecture,
+    architecture: RefinerArchitecture,
     /// Kernel and bias of each layer.
     parameters: Vec<Tensor>,
 }
@@ -94,7 +94,7 @@ const WEIGHTS: u64 = 300;
 
 impl Refiner {
     /// A network that hasn't learnt anything: it adds nothing.
-    pub fn new(architecture: Architecture, seed: u64) -> Result<Self, RefinementError> {
+    pub fn new(architecture: RefinerArchitecture, seed: u64) -> Result<Self, RefinementError> {
         let mut rng = CounterRng::new(seed, WEIGHTS, 0);
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
@@ -110,8 +110,8 @@ impl Refiner {
     }
 
     /// Reads weights that [`Refiner::write`] wrote.
-    pub fn read(path: &Path, architecture: Architecture) -> Result<Self, RefinementError> {
-        let Architecture { channels, blocks, .. } = architecture;
+    pub fn read(path: &Path, architecture: RefinerArchitecture) -> Result<Self, RefinementError> {
+        let RefinerArchitecture { channels, blocks, .. } = architecture;
         // Before anything is made of such numbers.
         if !(1..=MOST).contains(&channels) || blocks > MOST {
             return Err(RefinementError::Architecture { channels, blocks });
@@ -127,7 +127,7 @@ impl Refiner {
     }
 
     /// The network's size.
-    pub fn architecture(&self) -> Architecture {
+    pub fn architecture(&self) -> RefinerArchitecture {
         self.architecture
     }
 
@@ -237,7 +237,7 @@ impl Refiner {
 }
 
 /// Name, inputs and outputs of each layer.
-fn layers(architecture: Architecture) -> Vec<(String, usize, usize)> {
+fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks)
         .flat_map(|i| [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]);
@@ -251,7 +251,7 @@ fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
 }
 
 /// Names and shapes of the parameters.
-fn shapes(architecture: Architecture) -> Vec<(String, Vec<i64>)> {
+fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
     let both = |(name, inputs, outputs): (String, usize, usize)| {
         [(format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()), (format!("{name}.bias"), vec![outputs as i64])]
     };
@@ -268,7 +268,7 @@ mod tests {
     }
 
     /// A network whose every weight says something.
-    fn random(architecture: Architecture) -> Refiner {
+    fn random(architecture: RefinerArchitecture) -> Refiner {
         let mut refiner = Refiner::new(architecture, 5).unwrap();
         let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn tiles_leave_no_seams() {
         nets::deterministic();
-        let architecture = Architecture { channels: 6, blocks: 2, guidance: None };
+        let architecture = RefinerArchitecture { channels: 6, blocks: 2, guidance: None };
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = picture(width, height);
@@ -309,7 +309,7 @@ mod tests {
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
-        let mut refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
+        let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
         let (dark, view) = (Picture::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), picture(16, 16));
         let added = |view: &Picture| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
@@ -321,7 +321,7 @@ mod tests {
     #[test]
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
-        let refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
+        let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let view = picture(150, 10);
         let mirrored = |p: &Picture| {
             let data =
@@ -341,15 +341,17 @@ mod tests {
     fn what_is_written_is_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
-        let architecture = Architecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
+        let architecture = RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();
         assert!(refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t));
-        for other in [Architecture { channels: 7, ..architecture }, Architecture { blocks: 2, ..architecture }] {
+        for other in [RefinerArchitecture { channels: 7, ..architecture }, RefinerArchitecture { blocks: 2, ..architecture }] {
             assert!(Refiner::read(&path, other).is_err());
         }
-        for other in [Architecture { channels: 0, ..architecture }, Architecture { blocks: u32::MAX, ..architecture }] {
+        for other in
+            [RefinerArchitecture { channels: 0, ..architecture }, RefinerArchitecture { blocks: u32::MAX, ..architecture }]
+        {
             assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
         }
         assert!(matches!(

@@ -325,7 +325,7 @@ mod tests {
     use scene::{Camera, Intrinsics};
 
     use super::*;
-    use crate::{Architecture, Rendered};
+    use crate::{RefinerArchitecture, Rendered};
 
     /// Stripes, and the same blurred by a pixel.
     fn example(phase: usize) -> KnownView {
@@ -358,7 +358,7 @@ mod tests {
     fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
         let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
+        let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
