@@ -412,7 +412,7 @@ pub(crate) fn coarse_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
 
-impl radiance::Supervision for Supersampling {
+impl radiance::Supervisor for Supersampling {
     fn set_progress(&mut self, done: f64) {
         self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
@@ -520,7 +520,7 @@ impl radiance::Supervision for Supersampling {
 
 #[cfg(test)]
 mod tests {
-    use radiance::Supervision as _;
+    use radiance::Supervisor as _;
     use scene::{Bounds, Camera, Distortion, View, Views};
 
     use super::*;

@@ -2,7 +2,7 @@
 //!
 //! * [`RayField`]: whatever rays can be cast through; [`FieldFile`] says what an artifact holds.
 //! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
-//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
+//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that casts rays and judges colours.
 //! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere (`torch-field`) shares: how far it has come, where there
 //!   may be something, how rays run through the unit cube.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
@@ -50,4 +50,4 @@ pub use passes::Passes;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use simd::{Family, set_family};
 pub use tally::Tally;
-pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions};
+pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};

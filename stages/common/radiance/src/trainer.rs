@@ -18,7 +18,7 @@ use crate::tally::Tally;
 
 /// Where a trainer's rays come from and how their colours are judged. Rays come in bundles that are judged together: the s×s
 /// sub-pixel rays of an LR pixel are a pixel bundle.
-pub trait Supervision: Sync {
+pub trait Supervisor: Sync {
     /// Is told before every step which share of the training's rays is done, from which alone its bundles may change.
     fn set_progress(&mut self, _done: f64) {}
     /// Rays in a bundle of this step.
@@ -223,7 +223,7 @@ impl Trainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TrainingError> {
         supervision.set_progress(self.tally.done(self.options.rays));
         let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
@@ -439,7 +439,7 @@ impl Shard {
         worker: &mut Worker,
         field: &Field,
         transposed: &[f32],
-        supervision: &impl Supervision,
+        supervision: &impl Supervisor,
         options: &TrainingOptions,
         (first_bundle, first_ray): (u64, u64),
         range: std::ops::Range<usize>,
@@ -516,7 +516,7 @@ mod tests {
         background: f32,
     }
 
-    impl Supervision for White {
+    impl Supervisor for White {
         fn rays_per_bundle(&self) -> usize {
             1
         }

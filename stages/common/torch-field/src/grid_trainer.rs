@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervision, Tally, TrainingOptions};
+use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -85,7 +85,7 @@ impl GridTrainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TorchFieldError> {
         supervision.set_progress(self.tally.done(self.options.rays));
         let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
@@ -121,7 +121,7 @@ impl GridTrainer {
     }
 
     /// Some bundles forward and back.
-    fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<GridPiece, TchError> {
+    fn run(&self, supervision: &impl Supervisor, step: Step, range: Range<usize>) -> Result<GridPiece, TchError> {
         let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
@@ -313,7 +313,7 @@ mod tests {
         seen: Vec<f32>,
     }
 
-    impl Supervision for Painted {
+    impl Supervisor for Painted {
         fn rays_per_bundle(&self) -> usize {
             4
         }

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{StepReport, Supervision, Tally};
+use radiance::{StepReport, Supervisor, Tally};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -118,7 +118,7 @@ impl MlpTrainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.tally.done(self.options.rays);
         supervision.set_progress(done);
         let bundle = supervision.rays_per_bundle();
@@ -159,7 +159,7 @@ impl MlpTrainer {
     }
 
     /// Forward and backward: on the CPU in shards, in parallel; on a GPU in as few pieces as its memory allows.
-    fn pieces(&self, supervision: &impl Supervision, step: Step) -> Result<Vec<MlpPiece>, TorchFieldError> {
+    fn pieces(&self, supervision: &impl Supervisor, step: Step) -> Result<Vec<MlpPiece>, TorchFieldError> {
         let plan = StepContext { step, seed: self.options.seed, noise: self.options.noise };
         if self.field.device != Device::Cpu {
             return step.in_pieces(|range| plan.run(&self.field, supervision, range));
@@ -211,7 +211,7 @@ impl StepContext {
     fn run_all(
         self,
         field: &Mlp,
-        supervision: &impl Supervision,
+        supervision: &impl Supervisor,
         range: std::ops::Range<usize>,
     ) -> Result<Option<MlpPiece>, TchError> {
         let samples = (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
@@ -236,7 +236,7 @@ impl StepContext {
     }
 
     /// Some bundles forward and back, at once.
-    fn run(self, field: &Mlp, supervision: &impl Supervision, range: std::ops::Range<usize>) -> Result<MlpPiece, TchError> {
+    fn run(self, field: &Mlp, supervision: &impl Supervisor, range: std::ops::Range<usize>) -> Result<MlpPiece, TchError> {
         let rays = self.step.sample_rays(supervision, &range);
         let draws = SampleDraws::new(field, self.seed, self.step.first_ray(&range), rays.len(), self.noise)?;
         let seen = field.see(&Batch::new(&rays, field)?, Some(&draws))?;
@@ -260,7 +260,7 @@ mod tests {
     /// Rays side by side, every other of which should be dark.
     struct Stripes;
 
-    impl Supervision for Stripes {
+    impl Supervisor for Stripes {
         fn rays_per_bundle(&self) -> usize {
             1
         }

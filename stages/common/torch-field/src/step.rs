@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use radiance::{Ray, Supervision, Tally};
+use radiance::{Ray, Supervisor, Tally};
 use tch::{TchError, Tensor};
 
 use crate::TorchFieldError;
@@ -36,7 +36,7 @@ impl Step {
     }
 
     /// The rays of some of its bundles.
-    pub(crate) fn sample_rays(self, supervision: &impl Supervision, range: &Range<usize>) -> Vec<Ray> {
+    pub(crate) fn sample_rays(self, supervision: &impl Supervisor, range: &Range<usize>) -> Vec<Ray> {
         let mut rays = vec![Ray::default(); range.len() * self.bundle];
         for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.bundle)) {
             supervision.sample_rays(self.first_bundle + g as u64, rays);
@@ -47,7 +47,7 @@ impl Step {
     /// Judges their colours (n × 3).
     pub(crate) fn loss_and_gradient(
         self,
-        supervision: &impl Supervision,
+        supervision: &impl Supervisor,
         range: &Range<usize>,
         colour: &Tensor,
     ) -> Result<Judged, TchError> {
@@ -62,7 +62,7 @@ impl Step {
     }
 
     /// Lets supervision keep what was seen.
-    pub(crate) fn remember<'a>(self, supervision: &mut impl Supervision, colours: impl Iterator<Item = &'a [[f32; 3]]>) {
+    pub(crate) fn remember<'a>(self, supervision: &mut impl Supervisor, colours: impl Iterator<Item = &'a [[f32; 3]]>) {
         let bundles = colours.flat_map(|c| c.chunks_exact(self.bundle));
         (self.first_bundle..).zip(bundles).for_each(|(bundle, colours)| supervision.remember(bundle, colours));
     }
