@@ -291,8 +291,8 @@ fn poses_are_refined_and_test_views_registered() {
     let folder = as_transforms(&project);
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
-    let mut draws = radiance::Draws::new(7, 1, 1);
-    let mut off = |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * draws.uniform() - 1.0)));
+    let mut rng = counter_rng::CounterRng::new(7, 1, 1);
+    let mut off = |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * rng.uniform() - 1.0)));
     for frame in transforms["frames"].as_array_mut().unwrap() {
         let matrix: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
         let turn = DMat3::from_quat(DQuat::from_scaled_axis(off(0.02)));

@@ -258,7 +258,7 @@ fn change_depth(path: &Path, change: fn(usize, f32) -> f32) {
 
 /// A depth's factor, different at every pixel.
 fn noise(seed: u64, pixel: usize) -> f32 {
-    1.0 + 0.03 * (radiance::uniform(seed, 2, pixel as u64) - 0.5)
+    1.0 + 0.03 * (counter_rng::uniform(seed, 2, pixel as u64) - 0.5)
 }
 
 /// Depth with noise, depth of surfaces that lie elsewhere, references that see nothing, are of another exposure or show something else: never

@@ -20,7 +20,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-pub use render::Frame;
+pub use render::RenderedImage;
 pub use world::World;
 
 /// Horizontal angle of view, as in NeRF's Blender scenes.
@@ -126,7 +126,7 @@ impl Stage for DemoScene {
 }
 
 /// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
-fn write_depth(path: &std::path::Path, frame: &Frame) -> Result<(), PixelError> {
+fn write_depth(path: &std::path::Path, frame: &RenderedImage) -> Result<(), PixelError> {
     let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
     let size = frame.colour.width;
     write_exr(

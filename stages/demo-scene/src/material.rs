@@ -20,7 +20,7 @@ pub(crate) enum Material {
 }
 
 /// Albedo and gloss of a point, in linear light.
-pub(crate) struct Surface {
+pub(crate) struct Reflectance {
     pub(crate) albedo: DVec3,
     /// Strength of the highlight.
     pub(crate) specular: f64,
@@ -49,8 +49,8 @@ fn cell(x: f64) -> i64 {
 }
 
 /// The surface of a material at a point in the shape's own space (centred, about 1 in size), with its normal there.
-pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Surface {
-    let matt = |albedo| Surface { albedo, specular: 0.05, exponent: 12, mirror: 0.0 };
+pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Reflectance {
+    let matt = |albedo| Reflectance { albedo, specular: 0.05, exponent: 12, mirror: 0.0 };
     match material {
         Material::Tiles => {
             let radius = (p.x * p.x + p.y * p.y).sqrt();
@@ -89,14 +89,14 @@ pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) ->
             let wave = libm::sin(9.0 * p.x + 3.0 * libm::sin(5.0 * p.y + 2.0 * p.z) + f64::from(seed));
             let vein = (1.0 - wave.abs()).powi(6);
             let albedo = DVec3::new(0.62, 0.05, 0.05).lerp(DVec3::new(0.85, 0.70, 0.55), 0.8 * vein);
-            Surface { albedo, specular: 0.9, exponent: 120, mirror: 0.12 }
+            Reflectance { albedo, specular: 0.9, exponent: 120, mirror: 0.12 }
         }
         Material::Stripes => {
             let stripe = (p.z * 7.0 + 0.3 * libm::sin(6.0 * p.x)).floor().rem_euclid(2.0) < 1.0;
             matt(if stripe { DVec3::new(0.85, 0.70, 0.10) } else { DVec3::new(0.08, 0.20, 0.50) })
         }
-        Material::Rod => Surface { albedo: DVec3::splat(0.12), specular: 0.35, exponent: 30, mirror: 0.0 },
-        Material::Copper => Surface { albedo: DVec3::new(0.55, 0.24, 0.10), specular: 0.7, exponent: 50, mirror: 0.05 },
+        Material::Rod => Reflectance { albedo: DVec3::splat(0.12), specular: 0.35, exponent: 30, mirror: 0.0 },
+        Material::Copper => Reflectance { albedo: DVec3::new(0.55, 0.24, 0.10), specular: 0.7, exponent: 50, mirror: 0.05 },
         Material::Sign => {
             let line = cell(p.z * 6.0);
             let gap = (p.z * 6.0).rem_euclid(1.0);

@@ -5,7 +5,7 @@ use crate::material::surface;
 use crate::world::World;
 
 /// A rendered view.
-pub struct Frame {
+pub struct RenderedImage {
     /// Display-encoded sRGB with straight alpha.
     pub colour: Rgba8,
     /// z-depth of the first surface at each pixel's centre.
@@ -16,7 +16,7 @@ pub struct Frame {
 const SUN: DVec3 = DVec3::new(0.48, 0.36, 0.8);
 
 /// Renders one view with `samples`² rays a pixel, averaged in linear light over the pixel's square.
-pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u32, samples: u32) -> Frame {
+pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u32, samples: u32) -> RenderedImage {
     let focal = 0.5 * f64::from(size) / libm::tan(0.5 * angle_x);
     let half = 0.5 * f64::from(size);
     let column = |c: usize| DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
@@ -46,7 +46,7 @@ pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u3
             depth.push(world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32));
         }
     }
-    Frame { colour: Rgba8::new(size as usize, size as usize, colour), depth }
+    RenderedImage { colour: Rgba8::new(size as usize, size as usize, colour), depth }
 }
 
 /// Light from the first surface along a ray, or from the sky; `None` where there is neither.

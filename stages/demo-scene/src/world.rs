@@ -27,7 +27,7 @@ struct Thing {
 
 /// Things behind one bounding ball, so that most rays pass them at the cost of one test.
 #[derive(Clone, Debug)]
-struct Group {
+struct Cluster {
     centre: DVec3,
     radius: f64,
     things: Vec<Thing>,
@@ -49,7 +49,7 @@ pub(crate) struct Hit {
 /// The scene: things on a round base, inside a ball of radius 1.35 around the origin.
 #[derive(Clone, Debug)]
 pub struct World {
-    groups: Vec<Group>,
+    groups: Vec<Cluster>,
     pub(crate) seed: u32,
     /// Whether there is a sky, which every ray meets that meets nothing else.
     pub(crate) sky: bool,
@@ -186,7 +186,7 @@ impl World {
     }
 }
 
-fn group(things: Vec<Thing>) -> Group {
+fn group(things: Vec<Thing>) -> Cluster {
     let spheres: Vec<(DVec3, f64)> = things
         .iter()
         .map(|t| {
@@ -196,10 +196,10 @@ fn group(things: Vec<Thing>) -> Group {
         .collect();
     let centre = spheres.iter().map(|(c, _)| *c).sum::<DVec3>() / spheres.len() as f64;
     let radius = spheres.iter().map(|(c, r)| (*c - centre).length() + r).fold(0.0, f64::max);
-    Group { centre, radius, things }
+    Cluster { centre, radius, things }
 }
 
-impl Group {
+impl Cluster {
     fn may_meet(&self, origin: DVec3, direction: DVec3) -> bool {
         let to = self.centre - origin;
         let along = to.dot(direction);

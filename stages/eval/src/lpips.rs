@@ -11,13 +11,13 @@ use crate::LpipsNetwork;
 
 /// A network and its heads.
 pub struct Lpips {
-    layers: Vec<Layer>,
+    layers: Vec<LpipsLayer>,
     heads: Vec<Tensor>,
     /// Pixels along a side that its poolings need.
     least: usize,
 }
 
-enum Layer {
+enum LpipsLayer {
     /// A convolution and a ReLU.
     Conv { conv: Conv, stride: i64, padding: i64 },
     /// SqueezeNet's: squeezed to few channels, expanded by 1×1 and 3×3 side by side; a ReLU after each.
@@ -29,26 +29,26 @@ enum Layer {
 }
 
 /// Reads a network's layers in order, and knows how many channels the next one takes.
-struct Reader<'a> {
+struct LayerReader<'a> {
     weights: &'a Weights,
-    layers: Vec<Layer>,
+    layers: Vec<LpipsLayer>,
     channels: i64,
     /// Channels at the end of each stage.
     stages: Vec<i64>,
 }
 
-impl Reader<'_> {
+impl LayerReader<'_> {
     /// A convolution with torchvision's index in `features`.
     fn conv(&mut self, index: usize, outputs: i64, size: i64, stride: i64, padding: i64) -> Result<(), WeightsError> {
         let conv = Conv::read(self.weights, &format!("features.{index}"), [outputs, self.channels, size, size])?;
-        self.layers.push(Layer::Conv { conv, stride, padding });
+        self.layers.push(LpipsLayer::Conv { conv, stride, padding });
         self.channels = outputs;
         Ok(())
     }
 
     fn fire(&mut self, index: usize, squeezed: i64, expanded: i64) -> Result<(), WeightsError> {
         let conv = |part: &str, shape| Conv::read(self.weights, &format!("features.{index}.{part}"), shape);
-        self.layers.push(Layer::Fire {
+        self.layers.push(LpipsLayer::Fire {
             squeeze: conv("squeeze", [squeezed, self.channels, 1, 1])?,
             expand1: conv("expand1x1", [expanded, squeezed, 1, 1])?,
             expand3: conv("expand3x3", [expanded, squeezed, 3, 3])?,
@@ -58,11 +58,11 @@ impl Reader<'_> {
     }
 
     fn pool(&mut self, size: i64, border: bool) {
-        self.layers.push(Layer::Pool { size, border });
+        self.layers.push(LpipsLayer::Pool { size, border });
     }
 
     fn stage(&mut self) {
-        self.layers.push(Layer::Stage);
+        self.layers.push(LpipsLayer::Stage);
         self.stages.push(self.channels);
     }
 
@@ -117,7 +117,7 @@ fn relu(conv: &Conv, x: &Tensor, stride: i64, padding: i64) -> Result<Tensor, Tc
     conv.forward(x, stride, padding)?.f_relu()
 }
 
-impl Layer {
+impl LpipsLayer {
     fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
         match self {
             Self::Conv { conv, stride, padding } => relu(conv, x, *stride, *padding),
@@ -137,7 +137,7 @@ impl Lpips {
         nets::deterministic();
         let [net, linear] = network.files();
         let (net, linear) = (Weights::read(&folder.join(net))?, Weights::read(&folder.join(linear))?);
-        let mut reader = Reader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
+        let mut reader = LayerReader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
         let least = match network {
             LpipsNetwork::Squeeze => reader.squeeze().map(|()| 17),
             LpipsNetwork::Alex => reader.alex().map(|()| 31),
@@ -165,7 +165,7 @@ impl Lpips {
         let mut heads = self.heads.iter();
         for layer in &self.layers {
             (a, b) = (layer.forward(&a)?, layer.forward(&b)?);
-            if let Layer::Stage = layer
+            if let LpipsLayer::Stage = layer
                 && let Some(head) = heads.next()
             {
                 let difference = normalised(&a)?.f_sub(&normalised(&b)?)?.f_square()?;

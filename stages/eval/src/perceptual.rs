@@ -42,19 +42,19 @@ impl LpipsNetwork {
 pub(crate) struct Perceptual {
     given: Vec<LpipsNetwork>,
     #[cfg(feature = "torch")]
-    readers: Vec<Reader>,
+    readers: Vec<LpipsPool>,
 }
 
 /// A network's files, and copies of it that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
 #[cfg(feature = "torch")]
-struct Reader {
+struct LpipsPool {
     folder: std::path::PathBuf,
     network: LpipsNetwork,
     free: std::sync::Mutex<Vec<Lpips>>,
 }
 
 #[cfg(feature = "torch")]
-impl Reader {
+impl LpipsPool {
     fn new(folder: &std::path::Path, network: LpipsNetwork) -> anyhow::Result<Self> {
         let reader = Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
         reader.keep(reader.take()?);
@@ -87,7 +87,7 @@ impl Perceptual {
             let message = format!("input weights: {}: no network is there; {}", folder.display(), wanted(&LpipsNetwork::ALL));
             return Err(Failure::BadInput(message).into());
         }
-        let readers = given.iter().map(|&network| Reader::new(folder, network)).collect::<anyhow::Result<_>>()?;
+        let readers = given.iter().map(|&network| LpipsPool::new(folder, network)).collect::<anyhow::Result<_>>()?;
         Ok(Self { given, readers })
     }
 

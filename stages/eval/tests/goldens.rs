@@ -75,7 +75,7 @@ fn lpips_is_that_of_pytorch_with_every_network() {
                 let shape: Vec<i64> = serde_json::from_value(entry["shape"].clone()).unwrap();
                 let (scale, shift) = (entry["scale"].as_f64().unwrap() as f32, entry["shift"].as_f64().unwrap() as f32);
                 let count = shape.iter().product::<i64>() as u64;
-                let values: Vec<f32> = (0..count).map(|i| scale * radiance::uniform(7, purpose, i) + shift).collect();
+                let values: Vec<f32> = (0..count).map(|i| scale * counter_rng::uniform(7, purpose, i) + shift).collect();
                 purpose += 1;
                 (entry["name"].as_str().unwrap().to_owned(), tch::Tensor::from_slice(&values).reshape(&shape))
             });

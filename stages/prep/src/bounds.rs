@@ -32,12 +32,12 @@ pub enum SpaceError {
 const BEYOND: f64 = 2.5;
 
 /// A posed view, and between which depths it sees anything, where that is known.
-pub type Sight = (Camera, Option<[f64; 2]>);
+pub type SeenDepths = (Camera, Option<[f64; 2]>);
 
 /// Where the scene is, and the space that suits it: NDC where all cameras look one way and the depths they see are known, the
 /// contraction where something is known to lie far outside the box, else the box. A `kind` that is given is taken. The box is that of
 /// the training views; `others` are cameras that will look, too.
-pub fn place(training: &[Sight], others: &[Sight], kind: Option<SpaceKind>) -> Result<Bounds, SpaceError> {
+pub fn place(training: &[SeenDepths], others: &[SeenDepths], kind: Option<SpaceKind>) -> Result<Bounds, SpaceError> {
     let boxed = bounds_of(training);
     let ndc = || -> Result<Bounds, SpaceError> {
         let all = [training, others].concat();
@@ -57,7 +57,7 @@ pub fn place(training: &[Sight], others: &[Sight], kind: Option<SpaceKind>) -> R
 }
 
 /// What all cameras see, from the middle of them: the frustum of NDC.
-fn frustum(sights: &[Sight]) -> Result<Frustum, SpaceError> {
+fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
     let mean = |f: &dyn Fn(&Camera) -> DVec3| sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64;
     let forward = common_direction(sights.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
     let up = mean(&|c| c.rotation().y_axis);
@@ -89,16 +89,17 @@ fn frustum(sights: &[Sight]) -> Result<Frustum, SpaceError> {
 }
 
 /// Whether more lies outside the box than a box can hold.
-fn reaches_beyond(bounds: &Bounds, sights: &[Sight]) -> bool {
+fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let reach = BEYOND * 0.5 * bounds.longest_side();
-    let far =
-        |(camera, depths): &Sight| depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach);
+    let far = |(camera, depths): &SeenDepths| {
+        depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
+    };
     2 * sights.iter().filter(|s| far(s)).count() > sights.len()
 }
 
 /// The same box with all around it: from where the nearest view sees something to far beyond the farthest.
-fn contracted(boxed: Bounds, sights: &[Sight]) -> Bounds {
+fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
     let radius = 0.5 * boxed.longest_side();
     let known = |pick: &dyn Fn([f64; 2]) -> f64| sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>();
     let near = known(&|d| 0.5 * d[0]).into_iter().fold(0.05 * radius, f64::min);
@@ -118,7 +119,7 @@ fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_
 /// that a scene which fits into its views fits into the box. Cameras that look past each other (one view, a forward-facing
 /// row) leave the centre open along their axes. Then the box is around all that they see between the nearest and the farthest depth
 /// that is known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender scenes' habit.
-fn bounds_of(sights: &[Sight]) -> Bounds {
+fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
     let mut normal = DMat3::ZERO;
     let mut right = DVec3::ZERO;
@@ -157,7 +158,7 @@ fn bounds_of(sights: &[Sight]) -> Bounds {
 }
 
 /// A box around what each camera sees between its depths, a tenth more to either side. `None` where a camera has none.
-fn around_frusta(sights: &[Sight]) -> Option<Bounds> {
+fn around_frusta(sights: &[SeenDepths]) -> Option<Bounds> {
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for (camera, depths) in sights {
@@ -256,7 +257,7 @@ mod tests {
         assert!(unknown.is_valid() && unknown != bounds);
     }
 
-    fn sights(cameras: &[Camera], depths: Option<[f64; 2]>) -> Vec<Sight> {
+    fn sights(cameras: &[Camera], depths: Option<[f64; 2]>) -> Vec<SeenDepths> {
         cameras.iter().map(|c| (c.clone(), depths)).collect()
     }
 

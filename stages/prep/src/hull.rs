@@ -16,13 +16,13 @@ pub fn carve(bounds: &Bounds, cameras: &[Camera], alphas: &[Vec<f32>], footprint
     let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
     let cell = (max - min) / GRID as f64;
     let radius = 0.5 * cell.length();
-    let masks: Vec<Mask> = alphas
+    let masks: Vec<NearAlpha> = alphas
         .par_iter()
         .zip(cameras)
         .map(|(alpha, camera)| {
             let nearest = (camera.centre() - camera.centre().clamp(min, max)).length().max(1e-3 * (max - min).length());
             let spread = (radius * camera.intrinsics.fx.max(camera.intrinsics.fy) / nearest).ceil() as usize;
-            Mask::new(alpha, camera, footprint + spread)
+            NearAlpha::new(alpha, camera, footprint + spread)
         })
         .collect();
     (0..GRID * GRID)
@@ -68,13 +68,13 @@ pub(crate) fn tightened(bounds: &Bounds, cameras: &[Camera], alphas: &[Vec<f32>]
 }
 
 /// Which pixels have alpha within a distance.
-struct Mask {
+struct NearAlpha {
     width: usize,
     height: usize,
     near_alpha: Vec<bool>,
 }
 
-impl Mask {
+impl NearAlpha {
     fn new(alpha: &[f32], camera: &Camera, distance: usize) -> Self {
         let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
         // A square dilation, one axis after the other.

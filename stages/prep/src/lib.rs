@@ -30,7 +30,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-pub use bounds::{Sight, SpaceError, SpaceKind, place};
+pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
 pub use degrade::{LowResolution, degrade};
 pub use hull::{GRID, carve};
 pub use sizes::{SizeError, Sizes, enlarged, sizes};

@@ -18,7 +18,8 @@ use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Sta
 use paper_refiner::{OVERLAP, PaperRefiner};
 use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
-    Guidance, KnownView, Network, OwnPhotographs, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE, guided,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE,
+    with_references,
 };
 use scene::{Background, Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -89,13 +90,14 @@ impl Stage for Refine {
         let mut views = Views::read(input)?;
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
-        let photographs = context.optional_input("photographs").map(OwnPhotographs::read).transpose()?;
+        let photographs = context.optional_input("photographs").map(LrObservations::read).transpose()?;
         // Those that the network learnt by agreed, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
-            let agreeing = |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.agreeing(rendered)?, truth });
-            references = references.into_iter().map(agreeing).collect::<Result<_, _>>()?;
+            let consistent =
+                |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.make_consistent(rendered)?, truth });
+            references = references.into_iter().map(consistent).collect::<Result<_, _>>()?;
         }
-        let mut job = Job {
+        let mut job = RefineJob {
             context,
             input,
             background: views.background.shown(),
@@ -106,12 +108,12 @@ impl Stage for Refine {
             references,
             photographs,
             enlarged: context.optional_input("enlarged").map(Enlarged::read).transpose()?,
-            agreeing: file.agreeing,
+            takes_consistent: file.agreeing,
         };
         if let Some(guidance) = job.network.guidance().filter(|_| !job.references.is_empty()) {
             job.leave_out(&views, guidance, LITTLE * file.trusted.unwrap_or(1.0))?;
         }
-        let mut agreed = 0;
+        let mut consistent = 0;
         let mut uses = vec![Use::default(); job.references.len()];
         let progress = context.progress("refining", views.views.len() as u64);
         for view in &mut views.views {
@@ -119,18 +121,19 @@ impl Stage for Refine {
             let name = &view.camera.name;
             let [image, preview] = [format!("images/{name}.exr"), format!("previews/{name}.png")];
             let made: Made = context.part(name, &[&image, &preview], || job.refine(view, &image, &preview))?;
-            agreed += usize::from(made.agreed);
+            consistent += usize::from(made.is_consistent);
             uses.iter_mut().zip(&made.uses).for_each(|(sum, of_use)| sum.add(of_use));
             view.depth = view.depth.as_ref().map(|_| image.clone());
             view.image = Some(image);
             progress.add(1);
         }
-        if job.agreeing && agreed < views.views.len() {
+        if job.takes_consistent && consistent < views.views.len() {
             context.say("the network was trained on views that agree with LR photographs of their own, which some of these haven't: train one without");
         }
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
-        let own = if agreed == 0 { String::new() } else { format!("; {agreed} of them agree with their own photographs") };
+        let own =
+            if consistent == 0 { String::new() } else { format!("; {consistent} of them agree with their own photographs") };
         let is_mean =
             |view: &&View| job.enlarged.as_ref().is_some_and(|enlarged| enlarged.views.taken_by(&view.camera).is_some());
         let all = counted(views.views.len(), "view");
@@ -142,7 +145,7 @@ impl Stage for Refine {
     }
 }
 
-/// The references that a guided network asks for; what another is given is said and left out.
+/// The references that a reference-based network asks for; what another is given is said and left out.
 fn references(context: &Context, wanted: bool, background: Background) -> anyhow::Result<Vec<KnownView>> {
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
     let Some((pictures, rendered)) = given else {
@@ -261,14 +264,15 @@ const JUDGES: usize = 8;
 /// How a view was refined.
 #[derive(Serialize, Deserialize)]
 struct Made {
-    /// Whether it was made to agree with its own photograph.
-    agreed: bool,
+    /// Whether it was made consistent with its own LR observation.
+    #[serde(rename = "agreed")]
+    is_consistent: bool,
     /// What each reference was of use for.
     uses: Vec<Use>,
 }
 
 /// What all views share.
-struct Job<'a> {
+struct RefineJob<'a> {
     context: &'a Context,
     input: &'a GivenInput,
     background: f32,
@@ -277,13 +281,13 @@ struct Job<'a> {
     turns: u32,
     overlap: usize,
     references: Vec<KnownView>,
-    photographs: Option<OwnPhotographs<'a>>,
+    photographs: Option<LrObservations<'a>>,
     enlarged: Option<Enlarged<'a>>,
-    /// Whether the network was trained on views that agree with their own photographs.
-    agreeing: bool,
+    /// Whether the network was trained on views that are consistent with their own LR observations.
+    takes_consistent: bool,
 }
 
-impl Job<'_> {
+impl RefineJob<'_> {
     /// Refines one view and writes its files.
     fn refine(&self, view: &View, image: &str, preview: &str) -> anyhow::Result<Made> {
         let (rendered, file, own) = self.shown(view)?;
@@ -293,27 +297,27 @@ impl Job<'_> {
             Some(enlarged) => enlarged.mean(redrawn, &view.camera)?,
             None => redrawn,
         };
-        let refined = self.agree(mean, own.as_ref());
+        let refined = self.make_consistent(mean, own.as_ref());
         self.write(&self.context.output_path(image)?, &file, &refined, &rendered.opacity)?;
         write_png(&self.context.output_path(preview)?, &refined.to_rgba8())?;
-        Ok(Made { agreed: own.is_some(), uses })
+        Ok(Made { is_consistent: own.is_some(), uses })
     }
 
     /// A view as the network takes it, its file's channels, and its own photograph.
     fn shown(&self, view: &View) -> anyhow::Result<(Rendered, ExrImage, Option<Photograph>)> {
         let (rendered, image) = read(self.input, view, self.background)?;
         let own = self.photographs.as_ref().map(|photographs| photographs.of(&view.camera)).transpose()?.flatten();
-        if !self.agreeing {
+        if !self.takes_consistent {
             return Ok((rendered, image, own));
         }
-        let colours = self.agree(rendered.colours(), own.as_ref());
+        let colours = self.make_consistent(rendered.colours(), own.as_ref());
         Ok((rendered.with_colours(&colours), image, own))
     }
 
-    /// A picture of a view that agrees with its own photograph, where there is one.
-    fn agree(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
+    /// A picture of a view that is consistent with its own LR observation, where there is one.
+    fn make_consistent(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
         match self.photographs.as_ref().zip(own) {
-            Some((photographs, own)) => photographs.agree(&picture, own),
+            Some((photographs, own)) => photographs.project(&picture, own),
             None => picture,
         }
     }
@@ -326,9 +330,9 @@ impl Job<'_> {
                 let Some(guidance) = self.network.guidance() else {
                     return Ok(network.refine_by(&rendered.view, self.strength, self.turns)?);
                 };
-                let guided = guided(rendered, &references, guidance);
-                uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
-                Ok(network.refine_by(&guided.view, self.strength, self.turns)?)
+                let conditioned = with_references(rendered, &references, guidance);
+                uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
+                Ok(network.refine_by(&conditioned.view, self.strength, self.turns)?)
             }
             AnyRefiner::Paper(network, patches) => {
                 let mut drawn = network.refine(rendered, &references, *patches, self.overlap).bad_input("input views")?;
@@ -344,12 +348,12 @@ impl Job<'_> {
     /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
     /// far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
-        let trusted = self.trusted(&self.references, views, guidance, 1.0)?;
+        let confidence = self.confidence(&self.references, views, guidance, 1.0)?;
         let references = std::mem::take(&mut self.references);
-        for (reference, share) in references.into_iter().zip(trusted) {
+        for (reference, share) in references.into_iter().zip(confidence) {
             // At another depth a reference sees nothing by its own.
             let blind = Guidance { occlusion: false, ..guidance };
-            let through = |by: f32| anyhow::Ok(self.trusted(std::slice::from_ref(&reference), views, blind, by)?[0]);
+            let through = |by: f32| anyhow::Ok(self.confidence(std::slice::from_ref(&reference), views, blind, by)?[0]);
             let is_right = || -> anyhow::Result<bool> {
                 let elsewhere = f64::max(through(1.0 - ELSEWHERE)?, through(1.0 + ELSEWHERE)?);
                 Ok(through(1.0)? >= SENSITIVE * elsewhere)
@@ -369,17 +373,17 @@ impl Job<'_> {
     }
 
     /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
-    fn trusted(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
+    fn confidence(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
         for view in views.views.iter().step_by(every) {
             let mut shown = self.shown(view)?.0;
             shown.depth.iter_mut().for_each(|depth| *depth *= depths);
-            let guided = guided(&shown, &references, guidance);
-            uses.iter_mut().zip(&guided.uses).for_each(|(sum, of_use)| sum.add(of_use));
+            let conditioned = with_references(&shown, &references, guidance);
+            uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
-        Ok(uses.iter().map(Use::trusted).collect())
+        Ok(uses.iter().map(Use::confidence_share).collect())
     }
 
     /// Says which references were of no use; in a word or two, of what use all were.
@@ -401,7 +405,7 @@ impl Job<'_> {
         if all.seen == 0 {
             return format!(" by {references} that see nothing of them");
         }
-        format!(" by {references}, trusted by {:.0} %", 100.0 * all.trusted())
+        format!(" by {references}, trusted by {:.0} %", 100.0 * all.confidence_share())
     }
 
     /// A view's file with other colours.

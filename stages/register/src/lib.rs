@@ -9,7 +9,7 @@ use std::error::Error;
 
 use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings};
 use pixels::{Picture, PixelError};
-use poses::{Moved, Options, Pyramid, Step, refine};
+use poses::{CameraMove, Moved, Options, Pyramid, refine};
 use radiance::RayField;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -138,7 +138,7 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
 
 /// How far cameras went, and what it was good for; a warning, where they went far.
 fn summary(found: &[Registered]) -> (String, Option<String>) {
-    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| Step { from, to, depth: *depth }));
+    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| CameraMove { from, to, depth: *depth }));
     let errors: Vec<[f64; 2]> = found.iter().filter_map(|registered| registered.errors).collect();
     let mean = |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
     let (count, all, before, after) = (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));

@@ -79,7 +79,7 @@ impl Stage for RenderDepth {
         let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
             let [image, preview] = [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
-            let job = Job { context, params, members: &fields, background: file.background, camera: &camera };
+            let job = RenderJob { context, params, members: &fields, background: file.background, camera: &camera };
             context.part(&camera.name, &[&image, &preview], || job.render(&image, &preview, &progress))?;
             done += u64::from(camera.intrinsics.height);
             progress.set(done, "");
@@ -109,7 +109,7 @@ fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
 }
 
 /// One view.
-struct Job<'a> {
+struct RenderJob<'a> {
     context: &'a Context,
     params: &'a Params,
     members: &'a [Box<dyn RayField>],
@@ -117,7 +117,7 @@ struct Job<'a> {
     camera: &'a Camera,
 }
 
-impl Job<'_> {
+impl RenderJob<'_> {
     fn render(&self, image: &str, preview: &str, progress: &artifact::Progress) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);

@@ -41,7 +41,7 @@ pub(crate) struct Outcome {
     pub(crate) skipped: Vec<usize>,
 }
 
-enum Progress {
+enum NodeProgress {
     Pending,
     Running,
     Over,
@@ -53,7 +53,7 @@ type Report = (usize, Result<(Record, bool), StageFailure>);
 pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options, stop: &AtomicBool) -> Outcome {
     let count = plan.nodes.len();
     let mut outcome = Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() };
-    let mut progress: Vec<Progress> = (0..count).map(|_| Progress::Pending).collect();
+    let mut progress: Vec<NodeProgress> = (0..count).map(|_| NodeProgress::Pending).collect();
     let display = Display::new();
     let (sender, reports) = mpsc::channel::<Report>();
     std::thread::scope(|scope| {
@@ -62,7 +62,7 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
             let give_up = stop.load(Ordering::Relaxed) || (!options.keep_going && !outcome.failures.is_empty());
             let ready: Vec<usize> = (0..count)
                 .filter(|&i| {
-                    matches!(progress[i], Progress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some())
+                    matches!(progress[i], NodeProgress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some())
                 })
                 .collect();
             let places = if give_up { 0 } else { options.jobs.saturating_sub(running) };
@@ -70,14 +70,14 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
             // Stages that run side by side share the cores; one alone has them all.
             let together = (running + starting.len()).clamp(1, options.jobs);
             for &index in starting {
-                progress[index] = Progress::Running;
+                progress[index] = NodeProgress::Running;
                 running += 1;
                 let parents: BTreeMap<usize, Record> =
                     plan.nodes[index].parents().filter_map(|p| Some((p, outcome.records[p].clone()?))).collect();
                 let (sender, display) = (sender.clone(), &display);
                 let threads = (options.threads / together).max(1);
                 scope.spawn(move || {
-                    let job = Job { node: &plan.nodes[index], store, file, options, threads, display, stop };
+                    let job = NodeJob { node: &plan.nodes[index], store, file, options, threads, display, stop };
                     // The receiver lives as long as the scope. A panic doesn't come here: it ends the program (`panics`).
                     sender.send((index, job.run(&parents))).ok();
                 });
@@ -87,7 +87,7 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
             }
             let Ok((index, result)) = reports.recv() else { break };
             running -= 1;
-            progress[index] = Progress::Over;
+            progress[index] = NodeProgress::Over;
             match result {
                 Ok((record, ran)) => {
                     outcome.records[index] = Some(record);
@@ -102,12 +102,12 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
             }
         }
     });
-    outcome.skipped = (0..count).filter(|&i| matches!(progress[i], Progress::Pending)).collect();
+    outcome.skipped = (0..count).filter(|&i| matches!(progress[i], NodeProgress::Pending)).collect();
     outcome
 }
 
 /// One node's work.
-struct Job<'a> {
+struct NodeJob<'a> {
     node: &'a Node,
     store: &'a Store,
     file: &'a RunFile,
@@ -117,7 +117,7 @@ struct Job<'a> {
     stop: &'a AtomicBool,
 }
 
-impl Job<'_> {
+impl NodeJob<'_> {
     /// Finds the record or makes it. `parents` are the records of the nodes that it needs.
     fn run(&self, parents: &BTreeMap<usize, Record>) -> Result<(Record, bool), StageFailure> {
         let output_of = |index: usize| parents[&index].output.clone();
@@ -263,7 +263,7 @@ impl Display {
             display: self,
             label: label.to_owned(),
             bar,
-            shown: Mutex::new(Shown { when: Instant::now(), label: String::new(), pace: Pace::default() }),
+            shown: Mutex::new(LastShown { when: Instant::now(), label: String::new(), pace: Pace::default() }),
         }
     }
 }
@@ -273,11 +273,11 @@ pub(crate) struct StageView<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
-    shown: Mutex<Shown>,
+    shown: Mutex<LastShown>,
 }
 
 /// What was last shown of a stage, and how fast the work that it last told of gets on.
-struct Shown {
+struct LastShown {
     when: Instant,
     label: String,
     pace: Pace,

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 /// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times stay.
 #[derive(Default, Serialize, Deserialize)]
-struct Cache(BTreeMap<String, Entry>);
+struct HashCache(BTreeMap<String, Entry>);
 
 #[derive(Serialize, Deserialize)]
 struct Entry {
@@ -27,7 +27,7 @@ pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String
     let files = list_files(&absolute).map_err(fail)?;
     let (listing, newest) = listing(&files).map_err(fail)?;
     let cache_file = store.root().join("cache/sources.json");
-    let mut cache: Cache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+    let mut cache: HashCache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
     let place = name_of(&absolute);
     if let Some(entry) = cache.0.get(&place).filter(|e| e.listing == listing) {
         return Ok(entry.content.clone());

@@ -82,7 +82,8 @@ impl Programs {
     ) -> Result<Self, Interrupted> {
         let file = store.root().join("cache/describe.json");
         // A cache that can't be read is an empty one.
-        let mut cache: Cache = std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+        let mut cache: DescriptionCache =
+            std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
         let (mut answers, mut unasked) = (Answers::new(), BTreeMap::new());
         let paths: BTreeMap<&str, PathBuf> = pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
@@ -130,7 +131,7 @@ impl Programs {
 
 /// Answers of `describe` by the program's path.
 #[derive(Default, Serialize, Deserialize)]
-struct Cache(BTreeMap<String, Answer>);
+struct DescriptionCache(BTreeMap<String, Answer>);
 
 #[derive(Serialize, Deserialize)]
 struct Answer {
@@ -149,7 +150,7 @@ struct Identity {
     blake3: Option<String>,
 }
 
-impl Cache {
+impl DescriptionCache {
     fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
         self.0.get(&id(path)).filter(|answer| answer.identity == *identity).map(|answer| answer.description.clone())
     }

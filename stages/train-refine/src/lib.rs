@@ -23,7 +23,7 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr};
 use refinement::{
-    Architecture, Guidance, KnownView, Network, OwnPhotographs, REFINER_FILE, RefinementError, Refiner, RefinerFile,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, RefinementError, Refiner, RefinerArchitecture, RefinerFile,
     RefinerTrainer, RefinerTraining, Rendered, Training, WEIGHTS_FILE,
 };
 use scene::{View, Views};
@@ -150,12 +150,12 @@ impl Stage for TrainRefine {
         if params.square % 2 == 1 {
             return Err(Failure::Usage(format!("parameter square: {} is odd; an even number is expected", params.square)).into());
         }
-        let own = own_photographs(context)?;
+        let own = lr_observations(context)?;
         let (training, left_out) = examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
         if params.references > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
-        let architecture = Architecture {
+        let architecture = RefinerArchitecture {
             channels: params.channels.unwrap_or(32),
             blocks: params.blocks,
             guidance: (params.references > 0).then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),
@@ -177,7 +177,7 @@ impl Stage for TrainRefine {
             strength: scores.strength,
             rendered_psnr: scores.rendered_psnr,
             refined_psnr: scores.refined_psnr,
-            trusted: scores.trusted,
+            trusted: scores.confidence,
             agreeing: own.is_some(),
         };
         context.write_json(REFINER_FILE, &file)?;
@@ -186,11 +186,11 @@ impl Stage for TrainRefine {
 }
 
 /// LR photographs of the rehearsal's views, where those of the views to be refined will be known, too: the task is to be the same.
-fn own_photographs(context: &Context) -> anyhow::Result<Option<OwnPhotographs<'_>>> {
+fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_>>> {
     let Some((photographs, cameras)) = context.optional_input("photographs").zip(context.optional_input("cameras")) else {
         return Ok(None);
     };
-    let own = OwnPhotographs::read(photographs)?;
+    let own = LrObservations::read(photographs)?;
     if !own.are_of_all(&Views::read(cameras)?) {
         return Ok(None);
     }
@@ -255,7 +255,7 @@ fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> 
 fn examples(
     views: &GivenInput,
     truth: &GivenInput,
-    own: Option<&OwnPhotographs<'_>>,
+    own: Option<&LrObservations<'_>>,
 ) -> anyhow::Result<(Vec<KnownView>, Vec<KnownView>)> {
     let (rendered, known) = (Views::read(views)?, Views::read(truth)?);
     let background = known.background.shown();
@@ -267,7 +267,7 @@ fn examples(
         let image = read_exr(&views.path(file)).bad_input(place())?;
         let mut rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
         if let Some(own) = own {
-            rendered = own.agreeing(rendered)?;
+            rendered = own.make_consistent(rendered)?;
         }
         Ok(Some(KnownView::new(rendered, photograph.over(background)).bad_input("input views")?))
     };

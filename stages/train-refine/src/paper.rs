@@ -1,5 +1,5 @@
 use artifact::{Context, FailureExt as _, GivenInput};
-use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, Perceptual};
+use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss};
 use pixels::psnr_of;
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 
@@ -50,8 +50,8 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
     say(context, "the references that it learnt from", &file)
 }
 
-fn perceptual(input: &GivenInput) -> anyhow::Result<Perceptual> {
+fn perceptual(input: &GivenInput) -> anyhow::Result<PerceptualLoss> {
     let file = VGG.iter().map(|name| input.path(name)).find(|path| path.is_file());
     let file = file.unwrap_or_else(|| input.path(VGG[0]));
-    Perceptual::read(&file).bad_input("input weights")
+    PerceptualLoss::read(&file).bad_input("input weights")
 }

@@ -3,7 +3,7 @@
 //! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
 //! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's average (its eq. 4), or the
 //!   kernel that made the LR images.
-//! * `memory`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
+//! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
 //! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
 //! * `exposure`: how bright each photograph is, where that is asked for.
 //! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`: whether it was better to ask.
@@ -12,8 +12,8 @@
 mod checkpoint;
 mod exposure;
 mod field_trainer;
+mod hr_cache;
 mod member;
-mod memory;
 mod moving_cameras;
 mod order;
 mod params;

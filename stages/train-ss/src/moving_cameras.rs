@@ -1,5 +1,5 @@
 use pixels::Picture;
-use poses::{Moved, Options, Pyramid, Step, refine, take_back_common_motion};
+use poses::{CameraMove, Moved, Options, Pyramid, refine, take_back_common_motion};
 use radiance::RayField;
 use scene::Camera;
 
@@ -72,7 +72,7 @@ impl MovingCameras {
         let seen = self.now.iter().zip(&self.photographs).take(count);
         let depths = seen.map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
         let depths = depths.collect::<Result<Vec<_>, Box<dyn std::error::Error + Send + Sync>>>()?;
-        let steps = self.were.iter().zip(&self.now).zip(depths).map(|((from, to), depth)| Step { from, to, depth });
+        let steps = self.were.iter().zip(&self.now).zip(depths).map(|((from, to), depth)| CameraMove { from, to, depth });
         Ok(Moved::between(steps))
     }
 

@@ -1,5 +1,5 @@
+use counter_rng::CounterRng;
 use pixels::Picture;
-use radiance::Draws;
 
 /// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
 /// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
@@ -25,11 +25,11 @@ impl Focus {
     }
 
     /// Draws the number of a pixel.
-    pub(crate) fn draw(&self, pixels: u64, draws: &mut Draws) -> u64 {
-        if self.even == 1.0 || draws.uniform() < self.even {
-            draws.below(pixels)
+    pub(crate) fn draw(&self, pixels: u64, rng: &mut CounterRng) -> u64 {
+        if self.even == 1.0 || rng.uniform() < self.even {
+            rng.below(pixels)
         } else {
-            self.detailed[draws.below(self.detailed.len() as u64) as usize]
+            self.detailed[rng.below(self.detailed.len() as u64) as usize]
         }
     }
 
@@ -65,7 +65,7 @@ pub(crate) fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
     loop {
         let (mut left, mut right) = (at >> bits, at & mask);
         for round in 0..4 {
-            let mixed = Draws::new(seed, ORDER + round, (epoch << 32) ^ right).below(mask + 1);
+            let mixed = CounterRng::new(seed, ORDER + round, (epoch << 32) ^ right).below(mask + 1);
             (left, right) = (right, left ^ mixed);
         }
         at = left << bits | right;
@@ -87,7 +87,7 @@ mod tests {
         assert!(detailed(&flat).eq((2..5).flat_map(|y| (3..6).map(move |x| 20 * y + x))), "what is around a dot");
         let focus = Focus::new(7.0, 200, detailed(&flat).map(|p| p as u64).collect());
         let (mut counts, draws) = ([0u32; 200], 400_000);
-        (0..draws).for_each(|k| counts[focus.draw(200, &mut Draws::new(1, 2, k)) as usize] += 1);
+        (0..draws).for_each(|k| counts[focus.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1);
         for (pixel, &count) in (0..200).zip(&counts) {
             let mean = f64::from(count) * 200.0 / draws as f64 * f64::from(focus.weight(pixel));
             assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");

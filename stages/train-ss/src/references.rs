@@ -108,19 +108,19 @@ mod tests {
     fn fine() -> Picture {
         let sample = |i: usize| {
             let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
-            0.2 + 0.5 * radiance::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
+            0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
         };
         Picture::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
     }
 
     #[test]
     fn exposures_are_taken_back_and_other_pictures_are_left_out() {
-        let low = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
+        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
         let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
             let said = std::cell::RefCell::new(String::new());
             let mut picture = fine();
             picture.data.iter_mut().for_each(|v| *v = change(*v));
-            let kept = checked(photographs(name, picture), &low(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
+            let kept = checked(photographs(name, picture), &lr(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
             (kept.pictures.into_iter().next().map(|p| p.picture), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);

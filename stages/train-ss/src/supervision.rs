@@ -2,16 +2,17 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use counter_rng::CounterRng;
 use pixels::{Filter, Picture, Resampling};
 use poses::Moved;
-use radiance::{Draws, Ray, RayField};
+use radiance::{Ray, RayField};
 use scene::{Background, Camera, Intrinsics, Photograph};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::Photographs;
 use crate::exposure::Exposures;
-use crate::memory::{Kernel, Memory};
+use crate::hr_cache::{HrCache, KernelOperator};
 use crate::moving_cameras::MovingCameras;
 use crate::order::{Focus, detailed, shuffled};
 
@@ -42,7 +43,7 @@ pub enum Order {
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
 /// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises the
 /// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
-/// rendered, those around it remembered ([`Memory`]), so that the whole footprint costs no more rays than the average. Each
+/// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
 /// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
 ///
 /// Of an HR reference a block of pixels is drawn at a time, one for each sub-ray to meet, and altogether four times as many blocks as an LR picture has
@@ -51,7 +52,7 @@ pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
     /// How many of them are LR photographs.
-    low: usize,
+    lr_views: usize,
     pixels: u64,
     background: Background,
     /// Sub-rays along x and y, when all are cast and now.
@@ -62,16 +63,16 @@ pub struct Supersampling {
     crop_groups: u64,
     focus: Focus,
     seed: u64,
-    memory: Option<Memory>,
+    cache: Option<HrCache>,
     exposures: Option<Exposures>,
     moving: Option<MovingCameras>,
 }
 
 struct TrainingView {
-    /// What groups are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
+    /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
     picture: Picture,
     /// A reference's own pixels.
-    fine: Option<Picture>,
+    hr: Option<Picture>,
     /// How many numbers the pixels of the views before this one have.
     before: u64,
     intrinsics: Intrinsics,
@@ -83,16 +84,16 @@ struct TrainingView {
 }
 
 impl TrainingView {
-    fn new(picture: Picture, fine: Option<Picture>, before: u64, camera: &Camera) -> Self {
+    fn new(picture: Picture, hr: Option<Picture>, before: u64, camera: &Camera) -> Self {
         let (intrinsics, none) = (camera.intrinsics, [0.0; 3]);
-        let mut view = Self { picture, fine, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
+        let mut view = Self { picture, hr, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
         view.place(camera);
         view
     }
 
     /// The photograph at its own size.
     fn photograph(&self) -> &Picture {
-        self.fine.as_ref().unwrap_or(&self.picture)
+        self.hr.as_ref().unwrap_or(&self.picture)
     }
 
     /// Has its rays cast from where a camera is.
@@ -147,21 +148,21 @@ const SATURATED: f32 = 254.5 / 255.0;
 impl Supersampling {
     /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are neither drawn nor compared with.
     pub fn new(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Self {
-        let (background, low) = (photographs.views.background, photographs.pictures.len());
-        let low_pixels: u64 = photographs.pictures.iter().map(|p| (p.picture.width * p.picture.height) as u64).sum();
-        let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
+        let (background, lr_views) = (photographs.views.background, photographs.pictures.len());
+        let lr_pixels: u64 = photographs.pictures.iter().map(|p| (p.picture.width * p.picture.height) as u64).sum();
+        let hr_length = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
         let operator = |picture: &Picture| {
-            let (low, high) = ((picture.width, picture.height), (fine(picture.width, 0), fine(picture.height, 1)));
-            (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
+            let (lr, hr) = ((picture.width, picture.height), (hr_length(picture.width, 0), hr_length(picture.height, 1)));
+            (Resampling::new(Filter::Lanczos, lr, hr), Resampling::new(options.filter, hr, lr))
         };
         let smallest = |i: usize, length: fn(&Picture) -> usize| {
-            let low = photographs.pictures.iter().map(|p| fine(length(&p.picture), i));
-            low.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
+            let lr = photographs.pictures.iter().map(|p| hr_length(length(&p.picture), i));
+            lr.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
         };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
-        let mut memory = None;
-        let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<Kernel>)> = BTreeMap::new();
+        let mut cache = None;
+        let mut kernels: BTreeMap<(usize, usize), (Resampling, Arc<KernelOperator>)> = BTreeMap::new();
         let mut pixels = 0;
         let mut with_detail = Vec::new();
         let mut ready = Vec::new();
@@ -170,7 +171,7 @@ impl Supersampling {
         for (view, Photograph { mut picture, mask }) in all.flat_map(|p| p.views.views.into_iter().zip(p.pictures)) {
             match options.supervision {
                 // References are what they are: nothing has shrunk them.
-                _ if ready.len() >= low => {}
+                _ if ready.len() >= lr_views => {}
                 Supervision::Average => {}
                 Supervision::Refiltered => {
                     let (enlarge, shrink) = operator(&picture);
@@ -179,29 +180,29 @@ impl Supersampling {
                 Supervision::Kernel => {
                     let (enlarge, kernel) = kernels.entry((picture.width, picture.height)).or_insert_with(|| {
                         let (enlarge, shrink) = operator(&picture);
-                        (enlarge, Arc::new(Kernel::new(shrink)))
+                        (enlarge, Arc::new(KernelOperator::new(shrink)))
                     });
-                    memory.get_or_insert_with(|| Memory::new(full)).add(&enlarge.apply(&picture), kernel.clone());
+                    cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&picture), kernel.clone());
                 }
             }
             let before = pixels;
             let (whole, known) = (picture.clone(), Photograph { picture, mask }.known());
             // What the kernel needs to know of pixels around those that don't count stays: what was photographed, since it blurred into its neighbours.
-            let (whole, picture, fine) = if ready.len() < low {
+            let (whole, picture, hr) = if ready.len() < lr_views {
                 (whole, known, None)
             } else {
                 (block_means(&whole, full), block_means(&known, full), Some(known))
             };
             let count = (picture.width * picture.height) as u64;
             // Each block of a reference has so many numbers.
-            let draws = if fine.is_none() { 1 } else { (REFERENCE_DRAWS * low_pixels / (low as u64 * count)).max(1) };
+            let draws = if hr.is_none() { 1 } else { (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1) };
             if options.detail > 1.0 {
                 let counts = |pixel: &usize| !picture.data[pixel * picture.channels].is_nan();
                 let detailed: Vec<usize> = detailed(&whole).filter(counts).collect();
                 with_detail.extend((0..draws).flat_map(|k| detailed.iter().map(move |&pixel| before + k * count + pixel as u64)));
             }
             pixels += draws * count;
-            ready.push(TrainingView::new(picture, fine, before, &view.camera));
+            ready.push(TrainingView::new(picture, hr, before, &view.camera));
             cameras.push(view.camera);
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
@@ -211,7 +212,7 @@ impl Supersampling {
         let side = full;
         Self {
             views: ready,
-            low,
+            lr_views,
             pixels,
             background,
             full,
@@ -221,7 +222,7 @@ impl Supersampling {
             crop_groups,
             focus,
             seed,
-            memory,
+            cache,
             exposures,
             moving,
         }
@@ -232,14 +233,14 @@ impl Supersampling {
         self.full
     }
 
-    /// The memory, where the kernel is what counts for a view by now.
-    fn kernel(&self, view: usize) -> Option<&Memory> {
-        self.memory.as_ref().filter(|_| self.side == self.full && view < self.low)
+    /// The cache, where the kernel is what counts for a view by now.
+    fn kernel(&self, view: usize) -> Option<&HrCache> {
+        self.cache.as_ref().filter(|_| self.side == self.full && view < self.lr_views)
     }
 
     /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
     pub(crate) fn kept(&self) -> impl Iterator<Item = Cow<'_, [u8]>> {
-        let renders = self.memory.iter().flat_map(Memory::parts).map(Cow::Borrowed);
+        let renders = self.cache.iter().flat_map(HrCache::parts).map(Cow::Borrowed);
         let exposures = self.exposures.iter().map(|e| Cow::Owned(e.bytes()));
         renders.chain(exposures).chain(self.moving.iter().map(|m| Cow::Owned(m.bytes())))
     }
@@ -247,7 +248,7 @@ impl Supersampling {
     /// Bytes of each of the three.
     fn kept_lengths(&self) -> [usize; 3] {
         [
-            self.memory.as_ref().map_or(0, Memory::len),
+            self.cache.as_ref().map_or(0, HrCache::len),
             self.exposures.as_ref().map_or(0, Exposures::len),
             self.moving.as_ref().map_or(0, MovingCameras::len),
         ]
@@ -263,7 +264,7 @@ impl Supersampling {
         let [renders, sums, _] = self.kept_lengths();
         let (renders, rest) = kept.split_at(renders);
         let (sums, poses) = rest.split_at(sums);
-        self.memory.iter_mut().for_each(|memory| memory.restore(renders));
+        self.cache.iter_mut().for_each(|cache| cache.restore(renders));
         self.exposures.iter_mut().for_each(|exposures| exposures.restore(sums));
         self.moving.iter_mut().for_each(|moving| moving.restore(poses));
         self.place_views();
@@ -295,30 +296,30 @@ impl Supersampling {
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<Moved>> {
         let Some(moving) = &self.moving else { return Ok(None) };
-        let moved = moving.moved(&*field()?, self.low, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
+        let moved = moving.moved(&*field()?, self.lr_views, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
         Ok(Some(moved))
     }
 
     /// Where the photographs were taken from, where that was asked for.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.low])
+        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
-        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.low])
+        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
     }
 
-    /// The view and pixel that a group trains on.
-    fn pixel(&self, group: u64) -> (usize, usize) {
-        let mut draws = Draws::new(self.seed, PIXEL, group);
+    /// The view and pixel that a bundle trains on.
+    fn pixel(&self, bundle: u64) -> (usize, usize) {
+        let mut rng = CounterRng::new(self.seed, PIXEL, bundle);
         let (view, pixel) = match self.order {
-            Order::Epochs if group >= self.crop_groups => {
-                let group = group - self.crop_groups;
-                self.place(shuffled(self.seed, group / self.pixels, group % self.pixels, self.pixels))
+            Order::Epochs if bundle >= self.crop_groups => {
+                let bundle = bundle - self.crop_groups;
+                self.place(shuffled(self.seed, bundle / self.pixels, bundle % self.pixels, self.pixels))
             }
             _ => {
-                let mut draw = || self.place(self.focus.draw(self.pixels, &mut draws));
+                let mut draw = || self.place(self.focus.draw(self.pixels, &mut rng));
                 let mut place = draw();
                 for _ in 1..REDRAWS {
                     if self.counts(place) {
@@ -330,8 +331,8 @@ impl Supersampling {
             }
         };
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
-        if group < self.crop_groups {
-            let mut middle = |length: u64| length / 4 + draws.below((length / 2).max(1));
+        if bundle < self.crop_groups {
+            let mut middle = |length: u64| length / 4 + rng.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
             return (view, (y * width + x) as usize);
         }
@@ -351,11 +352,11 @@ impl Supersampling {
         !picture.data[pixel * picture.channels].is_nan()
     }
 
-    /// What lies behind a group's rays: with an open background, or none, another colour each time, so that opacity is learnt.
-    fn behind(&self, group: u64) -> [f32; 3] {
+    /// What lies behind a bundle's rays: with an open background, or none, another colour each time, so that opacity is learnt.
+    fn behind(&self, bundle: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
-            let mut draws = Draws::new(self.seed, BACKGROUND, group);
-            [0, 1, 2].map(|_| draws.uniform())
+            let mut rng = CounterRng::new(self.seed, BACKGROUND, bundle);
+            [0, 1, 2].map(|_| rng.uniform())
         } else {
             [self.background.shown(); 3]
         }
@@ -375,10 +376,10 @@ fn unclipped_residual(prediction: f32, target: f32, back: f32) -> f32 {
 
 /// The picture as averaging would have made it: y + (A - K)·Uy, with A the average over LR pixels.
 fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> Picture {
-    let fine = enlarge.apply(picture);
-    let average = Resampling::new(Filter::Box, (fine.width, fine.height), (picture.width, picture.height));
-    let mut out = average.apply(&fine);
-    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&fine).data) {
+    let hr = enlarge.apply(picture);
+    let average = Resampling::new(Filter::Box, (hr.width, hr.height), (picture.width, picture.height));
+    let mut out = average.apply(&hr);
+    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&hr).data) {
         *value += y - ky;
     }
     out
@@ -411,8 +412,8 @@ pub(crate) fn coarse_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
 
-impl radiance::Supervision for Supersampling {
-    fn begin(&mut self, done: f64) {
+impl radiance::Supervisor for Supersampling {
+    fn set_progress(&mut self, done: f64) {
         self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
         if done < self.coarse {
@@ -422,20 +423,20 @@ impl radiance::Supervision for Supersampling {
         }
     }
 
-    fn rays_per_group(&self) -> usize {
+    fn rays_per_bundle(&self) -> usize {
         self.side[0] * self.side[1]
     }
 
-    fn cast(&self, group: u64, rays: &mut [Ray]) {
-        let (index, pixel) = self.pixel(group);
+    fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+        let (index, pixel) = self.pixel(bundle);
         let view = &self.views[index];
-        let background = self.behind(group);
+        let background = self.behind(bundle);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
         // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
-        let (start, apart) = match (self.kernel(index), &view.fine) {
-            (Some(memory), _) => memory.block_in_pixels(index, x, y),
-            (None, Some(fine)) => {
-                let start = [block_start(x, self.full[0], fine.width), block_start(y, self.full[1], fine.height)];
+        let (start, apart) = match (self.kernel(index), &view.hr) {
+            (Some(cache), _) => cache.block_in_pixels(index, x, y),
+            (None, Some(hr)) => {
+                let start = [block_start(x, self.full[0], hr.width), block_start(y, self.full[1], hr.height)];
                 (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
             }
             (None, None) => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
@@ -451,19 +452,19 @@ impl radiance::Supervision for Supersampling {
         }
     }
 
-    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
-        let (index, pixel) = self.pixel(group);
+    fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        let (index, pixel) = self.pixel(bundle);
         let picture = &self.views[index].picture;
         let sample = &picture.data[pixel * picture.channels..][..picture.channels];
         let share = 1.0 / colours.len() as f32;
         let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
-        let behind = if picture.channels == 4 { self.behind(group) } else { [0.0; 3] };
-        let is_cropped = group < self.crop_groups;
+        let behind = if picture.channels == 4 { self.behind(bundle) } else { [0.0; 3] };
+        let is_cropped = bundle < self.crop_groups;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
-        if let Some(memory) = self.kernel(index) {
+        if let Some(cache) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
             let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
-            let own = memory.pull(index, at, colours, picture, residual, gradients);
+            let own = cache.back_project(index, at, colours, picture, residual, gradients);
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
             return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
@@ -472,12 +473,12 @@ impl radiance::Supervision for Supersampling {
             _ => back[c] * sample[c],
         };
         let mut loss = 0.0;
-        if let Some(fine) = self.views[index].fine.as_ref().filter(|_| self.side == self.full) {
-            let left = block_start(pixel % picture.width, self.full[0], fine.width);
-            let top = block_start(pixel / picture.width, self.full[1], fine.height);
+        if let Some(hr) = self.views[index].hr.as_ref().filter(|_| self.side == self.full) {
+            let left = block_start(pixel % picture.width, self.full[0], hr.width);
+            let top = block_start(pixel / picture.width, self.full[1], hr.height);
             for (k, (colour, gradient)) in colours.iter().zip(gradients).enumerate() {
-                let at = (top + k / self.full[0]) * fine.width + left + k % self.full[0];
-                let sample = &fine.data[at * fine.channels..][..fine.channels];
+                let at = (top + k / self.full[0]) * hr.width + left + k % self.full[0];
+                let sample = &hr.data[at * hr.channels..][..hr.channels];
                 for c in 0..3 {
                     let residual = residual(colour[c], target(sample, c));
                     loss += f64::from(weight * share) * f64::from(residual) * f64::from(residual) / 3.0;
@@ -497,11 +498,11 @@ impl radiance::Supervision for Supersampling {
         loss
     }
 
-    fn remember(&mut self, group: u64, colours: &[[f32; 3]]) {
-        if self.memory.is_none() && self.exposures.is_none() {
+    fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
+        if self.cache.is_none() && self.exposures.is_none() {
             return;
         }
-        let (index, pixel) = self.pixel(group);
+        let (index, pixel) = self.pixel(bundle);
         let picture = &self.views[index].picture;
         if let Some(exposures) = &mut self.exposures {
             let at = pixel * picture.channels;
@@ -510,16 +511,16 @@ impl radiance::Supervision for Supersampling {
             let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
-        let is_remembered = self.side == self.full && index < self.low;
-        if let Some(memory) = self.memory.as_mut().filter(|_| is_remembered) {
-            memory.remember(index, pixel % picture.width, pixel / picture.width, colours);
+        let is_cached = self.side == self.full && index < self.lr_views;
+        if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {
+            cache.remember(index, pixel % picture.width, pixel / picture.width, colours);
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use radiance::Supervision as _;
+    use radiance::Supervisor as _;
     use scene::{Bounds, Camera, Distortion, View, Views};
 
     use super::*;
@@ -570,15 +571,15 @@ mod tests {
         for (kind, scale) in cases {
             let (supersampling, camera) = example(kind, scale, None);
             let size = [(5.0 * scale[0]).round(), (4.0 * scale[1]).round()];
-            let fine = camera.resized(size[0] as u32, size[1] as u32);
-            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
+            let hr = camera.resized(size[0] as u32, size[1] as u32);
+            let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
             let mut seen = vec![false; (size[0] * size[1]) as usize];
-            for group in 0..200 {
-                supersampling.cast(group, &mut rays);
+            for bundle in 0..200 {
+                supersampling.sample_rays(bundle, &mut rays);
                 for ray in &rays {
                     let pixel = (0..seen.len()).find(|i| {
                         let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
-                        let expected = fine.ray(x, y).direction.as_vec3().to_array();
+                        let expected = hr.ray(x, y).direction.as_vec3().to_array();
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
                     seen[pixel.unwrap_or_else(|| panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray"))] = true;
@@ -588,20 +589,20 @@ mod tests {
         }
     }
 
-    /// Behind an opaque scene lies another colour in every group, and what is asked for is the same: a field that is opaque alone
+    /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the same: a field that is opaque alone
     /// can give it.
     #[test]
     fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
         let behind = |background| -> Vec<[f32; 3]> {
             let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
             supersampling.background = background;
-            let mut rays = vec![Ray::default(); supersampling.rays_per_group()];
-            let groups = (0..40).map(|group| {
-                supersampling.cast(group, &mut rays);
+            let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
+            let bundles = (0..40).map(|bundle| {
+                supersampling.sample_rays(bundle, &mut rays);
                 assert!(rays.iter().all(|r| r.background == rays[0].background));
                 rays[0].background
             });
-            groups.collect()
+            bundles.collect()
         };
         assert!(behind(Background::White).iter().all(|b| *b == [1.0; 3]));
         let colours = behind(Background::Opaque);
@@ -615,15 +616,15 @@ mod tests {
             let (supersampling, _) = example(kind, [2.0, 2.0], None);
             let colours: Vec<[f32; 3]> = (0..4).map(|k| [0.1 * k as f32, 0.5, 0.9]).collect();
             let mut gradients = vec![[0.0; 3]; 4];
-            supersampling.judge(7, &colours, &mut gradients);
+            supersampling.loss_and_gradient(7, &colours, &mut gradients);
             for k in 0..4 {
                 for c in 0..3 {
                     let mut moved = colours.clone();
                     let mut scrap = vec![[0.0; 3]; 4];
                     moved[k][c] += 0.01;
-                    let up = supersampling.judge(7, &moved, &mut scrap);
+                    let up = supersampling.loss_and_gradient(7, &moved, &mut scrap);
                     moved[k][c] -= 0.02;
-                    let numeric = (up - supersampling.judge(7, &moved, &mut scrap)) / 0.02;
+                    let numeric = (up - supersampling.loss_and_gradient(7, &moved, &mut scrap)) / 0.02;
                     assert!((f64::from(gradients[k][c]) - numeric).abs() < 1e-5, "{kind:?}");
                 }
             }
@@ -634,20 +635,20 @@ mod tests {
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
         let truth = fine_picture(10, 8);
-        let low = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
+        let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
         let worst = |kind| {
-            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(low.clone()));
+            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
             let mut worst = (0.0f64, 0.0f32);
-            for group in 0..800 {
-                let pixel = supersampling.pixel(group).1;
+            for bundle in 0..800 {
+                let pixel = supersampling.pixel(bundle).1;
                 let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
                 let colours: Vec<[f32; 3]> =
                     (0..4).map(|k| std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])).collect();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = supersampling.judge(group, &colours, &mut gradients);
-                supersampling.remember(group, &colours);
-                // Until then the memory isn't full of the truth.
-                if group >= 400 {
+                let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
+                supersampling.remember(bundle, &colours);
+                // Until then the cache isn't full of the truth.
+                if bundle >= 400 {
                     let gradient = gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
                     worst = (worst.0.max(loss), worst.1.max(gradient));
                 }
@@ -670,8 +671,8 @@ mod tests {
         let white = Picture::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
         let mut gradients = [[0.0; 3]; 4];
-        assert!(supersampling.judge(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
-        assert!(supersampling.judge(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
+        assert!(supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
+        assert!(supersampling.loss_and_gradient(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
@@ -681,8 +682,8 @@ mod tests {
         let rays_at = |scale: f64, done: f64| {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
             supersampling.coarse = 0.3;
-            supersampling.begin(done);
-            supersampling.rays_per_group()
+            supersampling.set_progress(done);
+            supersampling.rays_per_bundle()
         };
         for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
             assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
@@ -721,9 +722,9 @@ mod tests {
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
             // Far from the masked pixels all is as without them; beside them the kernel feels less.
             let judged = |of: &Supersampling, pixel: usize| {
-                let group = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
+                let bundle = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
                 let mut gradients = [[0.0; 3]; 4];
-                let loss = of.judge(group, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+                let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
                 (loss, gradients)
             };
             assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
@@ -755,11 +756,11 @@ mod tests {
             assert_eq!(joined.pixels, 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut seen = [false; 72];
-            for group in 0..800 {
-                if joined.pixel(group).0 == 0 {
+            for bundle in 0..800 {
+                if joined.pixel(bundle).0 == 0 {
                     continue;
                 }
-                joined.cast(group, &mut rays);
+                joined.sample_rays(bundle, &mut rays);
                 let pixels = rays.map(|ray| {
                     let of =
                         |pixel: usize| camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3();
@@ -770,32 +771,32 @@ mod tests {
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
-                let loss = joined.judge(group, &colours, &mut gradients);
+                let loss = joined.loss_and_gradient(bundle, &colours, &mut gradients);
                 assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
                 let pulled = gradients[3][0];
                 assert!(
                     (pulled - 0.2 / 12.0).abs() < 1e-6 && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
-                joined.remember(group, &colours);
+                joined.remember(bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-rays they meet the block's mean together.
             joined.coarse = 0.5;
-            joined.begin(0.0);
-            let group = (0..).find(|&group| joined.pixel(group) == (1, 4)).unwrap();
-            joined.cast(group, &mut rays[..1]);
+            joined.set_progress(0.0);
+            let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
+            joined.sample_rays(bundle, &mut rays[..1]);
             assert!(camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6, "{kind:?}");
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
-            assert!(joined.judge(group, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
-            joined.begin(1.0);
+            assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
+            joined.set_progress(1.0);
             // LR pictures have what they had.
             let plain = Supersampling::new(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));
             let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
-            joined.judge(drawn(&joined), &colours, &mut gradients[0]);
-            plain.judge(drawn(&plain), &colours, &mut gradients[1]);
+            joined.loss_and_gradient(drawn(&joined), &colours, &mut gradients[0]);
+            plain.loss_and_gradient(drawn(&plain), &colours, &mut gradients[1]);
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // Of a larger one no more is drawn.

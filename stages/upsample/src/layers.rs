@@ -30,12 +30,12 @@ impl Linear {
 }
 
 /// Layer normalisation over the last dimension.
-pub(crate) struct Norm {
+pub(crate) struct LayerNorm {
     scale: Tensor,
     shift: Tensor,
 }
 
-impl Norm {
+impl LayerNorm {
     pub(crate) fn read(weights: &Weights, name: &str, width: i64) -> Result<Self, WeightsError> {
         Ok(Self {
             scale: weights.tensor(&format!("{name}.weight"), &[width])?,

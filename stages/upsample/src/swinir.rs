@@ -2,15 +2,15 @@ use nets::{Conv, Weights, WeightsError};
 use tch::{Kind, TchError, Tensor};
 
 use crate::Network;
-use crate::layers::{Linear, Norm, count, leaky, root};
+use crate::layers::{LayerNorm, Linear, count, leaky, root};
 
 /// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for super-resolution, by the names of its released weights:
 /// the classical, the lightweight and the real-world models. Width, depth, heads, window, scale and kind are what the file says.
 pub(crate) struct SwinIr {
     first: Conv,
-    embedded: Option<Norm>,
+    embedded: Option<LayerNorm>,
     groups: Vec<Group>,
-    norm: Norm,
+    norm: LayerNorm,
     after: Convs,
     head: Head,
     window: i64,
@@ -28,7 +28,7 @@ const FAR: f32 = -100.0;
 
 /// Transformer blocks, and a convolution after them.
 struct Group {
-    blocks: Vec<Block>,
+    blocks: Vec<TransformerBlock>,
     after: Convs,
 }
 
@@ -46,8 +46,8 @@ enum Head {
 }
 
 /// Attention within windows, then a network of two layers, each added to what came in.
-struct Block {
-    norms: [Norm; 2],
+struct TransformerBlock {
+    norms: [LayerNorm; 2],
     qkv: Linear,
     /// Heads × places × places.
     bias: Tensor,
@@ -65,12 +65,12 @@ impl SwinIr {
         let window = ((root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
         let groups = count(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
         let (head, scale) = Head::read(weights, width)?;
-        let embedded = weights.has("patch_embed.norm.weight").then(|| Norm::read(weights, "patch_embed.norm", width));
+        let embedded = weights.has("patch_embed.norm.weight").then(|| LayerNorm::read(weights, "patch_embed.norm", width));
         Ok(Self {
             first: Conv::read(weights, "conv_first", [width, 3, 3, 3])?,
             embedded: embedded.transpose()?,
             groups: (0..groups).map(|i| Group::read(weights, i, width, window)).collect::<Result<_, _>>()?,
-            norm: Norm::read(weights, "norm", width)?,
+            norm: LayerNorm::read(weights, "norm", width)?,
             after: Convs::read(weights, "conv_after_body", width)?,
             head,
             window,
@@ -129,7 +129,7 @@ impl Group {
         let name = |i: usize| format!("layers.{index}.residual_group.blocks.{i}");
         let blocks = count(weights, 0, |i| format!("{}.norm1.weight", name(i)));
         // Windows of every other block are shifted by half a window.
-        let block = |i: usize| Block::read(weights, &name(i), width, window, if i % 2 == 1 { window / 2 } else { 0 });
+        let block = |i: usize| TransformerBlock::read(weights, &name(i), width, window, if i % 2 == 1 { window / 2 } else { 0 });
         Ok(Self {
             blocks: (0..blocks).map(block).collect::<Result<_, _>>()?,
             after: Convs::read(weights, &format!("layers.{index}.conv"), width)?,
@@ -217,7 +217,7 @@ impl Head {
     }
 }
 
-impl Block {
+impl TransformerBlock {
     fn read(weights: &Weights, name: &str, width: i64, window: i64, shift: i64) -> Result<Self, WeightsError> {
         let part = |part: &str| format!("{name}.{part}");
         let table = part("attn.relative_position_bias_table");
@@ -227,7 +227,7 @@ impl Block {
         let [hidden, _] = weights.shape::<2>(&part("mlp.fc1.weight"))?;
         let linear = |of: &str, outputs: i64, inputs: i64| Linear::read(weights, &part(of), [outputs, inputs]);
         Ok(Self {
-            norms: [Norm::read(weights, &part("norm1"), width)?, Norm::read(weights, &part("norm2"), width)?],
+            norms: [LayerNorm::read(weights, &part("norm1"), width)?, LayerNorm::read(weights, &part("norm2"), width)?],
             qkv: linear("attn.qkv", 3 * width, width)?,
             bias: table.index_select(0, &relative(window)).reshape([window * window, window * window, heads]).permute([2, 0, 1]),
             projection: linear("attn.proj", width, width)?,

@@ -74,7 +74,7 @@ pub struct Progress {
     total: u64,
     mode: ProgressMode,
     bar: Option<indicatif::ProgressBar>,
-    state: Mutex<State>,
+    state: Mutex<ProgressState>,
     stop: Option<StopAfter>,
 }
 
@@ -93,7 +93,7 @@ impl StopAfter {
     }
 }
 
-struct State {
+struct ProgressState {
     done: u64,
     note: String,
     pace: Pace,
@@ -109,7 +109,7 @@ impl Progress {
                 .expect("the template is constant");
             indicatif::ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned())
         });
-        let state = State { done: 0, note: String::new(), pace: Pace::default(), shown: Instant::now(), is_shown: false };
+        let state = ProgressState { done: 0, note: String::new(), pace: Pace::default(), shown: Instant::now(), is_shown: false };
         Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state), stop: None }
     }
 
@@ -131,7 +131,7 @@ impl Progress {
         self.update(|state| state.done += steps);
     }
 
-    fn update(&self, change: impl FnOnce(&mut State)) {
+    fn update(&self, change: impl FnOnce(&mut ProgressState)) {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         change(&mut state);
         let done = state.done;

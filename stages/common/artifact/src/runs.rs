@@ -13,7 +13,7 @@ use crate::{unique, unix_time};
 /// A line of a run's file: what the run needs becomes known while it goes on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Line {
+enum RunLine {
     /// The first: who runs what.
     Run { holder: Holder, command: Vec<String> },
     /// An action whose record or checkpoints it needs.
@@ -83,12 +83,12 @@ impl Run {
         // A line that a kill cut short says nothing.
         for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
             match line {
-                Line::Run { holder, command } => (run.holder, run.command) = (Some(holder), command),
-                Line::Action { key, .. } => {
+                RunLine::Run { holder, command } => (run.holder, run.command) = (Some(holder), command),
+                RunLine::Action { key, .. } => {
                     run.keys.insert(key);
                 }
-                Line::Waiting(waiting) => run.waiting.push(waiting),
-                Line::Ended { unix } => run.ended_unix = Some(unix),
+                RunLine::Waiting(waiting) => run.waiting.push(waiting),
+                RunLine::Ended { unix } => run.ended_unix = Some(unix),
             }
         }
         Some(run)
@@ -112,20 +112,20 @@ impl RunFile {
 
     /// The run needs this action. Whoever says so has entered the store, so that the action can't go in between.
     pub fn needs(&self, _: &Entered, stage: &str, key: &str) -> Result<(), StoreError> {
-        self.write(&Line::Action { stage: stage.to_owned(), key: key.to_owned() })
+        self.write(&RunLine::Action { stage: stage.to_owned(), key: key.to_owned() })
     }
 
     /// The run may need any record that this node may have.
     pub fn waits(&self, _: &Entered, waiting: Waiting) -> Result<(), StoreError> {
-        self.write(&Line::Waiting(waiting))
+        self.write(&RunLine::Waiting(waiting))
     }
 
     /// The run has ended; what it needed is kept for as long as its owner wants.
     pub fn end(self) -> Result<(), StoreError> {
-        self.write(&Line::Ended { unix: unix_time() })
+        self.write(&RunLine::Ended { unix: unix_time() })
     }
 
-    fn write(&self, line: &Line) -> Result<(), StoreError> {
+    fn write(&self, line: &RunLine) -> Result<(), StoreError> {
         let Some(mut file) = self.file.as_ref() else { return Ok(()) };
         let text = serde_json::to_string(line).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
         // One write a line: threads of a run share the file.
@@ -150,7 +150,7 @@ impl Store {
             at(&path, file.lock())?;
         }
         let run = RunFile { id, file };
-        run.write(&Line::Run { holder, command })?;
+        run.write(&RunLine::Run { holder, command })?;
         Ok(run)
     }
 
@@ -172,8 +172,8 @@ impl Store {
 
     /// Pins actions under a name: garbage collection keeps them until [`Store::unpin`].
     pub fn pin(&self, _: &Entered, name: &str, command: Vec<String>, actions: &[(String, String)]) -> Result<(), StoreError> {
-        let mut lines = vec![Line::Run { holder: Holder::this_process(), command }];
-        lines.extend(actions.iter().map(|(stage, key)| Line::Action { stage: stage.clone(), key: key.clone() }));
+        let mut lines = vec![RunLine::Run { holder: Holder::this_process(), command }];
+        lines.extend(actions.iter().map(|(stage, key)| RunLine::Action { stage: stage.clone(), key: key.clone() }));
         let texts = lines.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>();
         let text = texts.map_err(|e| StoreError::NoArtifact(e.to_string()))?.join("\n") + "\n";
         let path = self.pin_path(name);

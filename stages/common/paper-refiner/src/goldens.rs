@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use nets::Weights;
 use tch::{Kind, Tensor};
 
-use crate::Perceptual;
+use crate::PerceptualLoss;
 use crate::network::PaperRefiner;
 use crate::trainer::loss;
 
@@ -49,9 +49,9 @@ fn network_and_loss_are_those_of_pytorch() {
         let prefix = format!("golden.{kind}.");
         let perceptual = (blocks > 0).then(|| {
             let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/vgg-{kind}.safetensors"));
-            Perceptual::of(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
+            PerceptualLoss::of(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
         });
-        assert_eq!(perceptual.as_ref().map_or(0, Perceptual::blocks), blocks);
+        assert_eq!(perceptual.as_ref().map_or(0, PerceptualLoss::blocks), blocks);
         let network = read();
         let found = network.forward(&rendered, &references, true).unwrap();
         let (loss, _) = loss(&found, &truth, perceptual.as_ref()).unwrap();

@@ -6,7 +6,7 @@
 //!
 //! * [`PaperRefiner`]: the network (Choi et al. 2019's maximum over references, batch normalisation, tanh). [`PaperRefiner::refine`] goes through
 //!   a view by patches that overlap and are blended, with reference patches where geometry says that they show the same.
-//! * [`PaperTrainer`], [`PaperTraining`]: its training: L1 and, where VGG-19's weights are given, [`Perceptual`].
+//! * [`PaperTrainer`], [`PaperTraining`]: its training: L1 and, where VGG-19's weights are given, [`PerceptualLoss`].
 //!
 //! Colours are display-encoded sRGB on the background that is shown, 0..1 outside and -1..1 inside. The reference's code takes its patches
 //! from one column of eight pixels, doesn't test whether anything stands between, drops a remainder of patches and lets them overlap without
@@ -27,7 +27,7 @@ mod patches;
 mod perspective;
 mod trainer;
 
-pub use loss::Perceptual;
+pub use loss::PerceptualLoss;
 pub use network::PaperRefiner;
 pub use patches::OVERLAP;
 pub use trainer::{PaperTrainer, PaperTraining};

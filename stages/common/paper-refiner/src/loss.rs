@@ -10,7 +10,7 @@ use tch::{Kind, TchError, Tensor};
 /// Two kinds of file are known by the names in them: torchvision's (`features.N.weight`), and those in Caffe's scaling (`convB_N.weight`), whose
 /// features are hundreds of times as large and are therefore divided by the truth's mean feature, layer by layer.
 #[derive(Debug)]
-pub struct Perceptual {
+pub struct PerceptualLoss {
     /// Convolutions by block; what comes after the last that is compared isn't kept.
     blocks: Vec<Vec<Conv>>,
     caffe: bool,
@@ -28,7 +28,7 @@ const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 /// Keeps a mean feature of 0 from dividing.
 const LEAST: f64 = 1e-6;
 
-impl Perceptual {
+impl PerceptualLoss {
     /// Reads VGG-19's weights, as far as they go; the first block must be whole.
     pub fn read(path: &Path) -> Result<Self, RefinementError> {
         Self::of(&Weights::read(path)?, BLOCKS.map(|(outputs, _)| outputs))

@@ -1,30 +1,30 @@
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use nets::Weights;
-use radiance::Draws;
 use refinement::RefinementError;
 use tch::{TchError, Tensor};
 
 /// The published network, or one as it with other widths.
 #[derive(Debug)]
 pub struct PaperRefiner {
-    encoder: Vec<Layer>,
-    decoder: Vec<Layer>,
+    encoder: Vec<ConvLayer>,
+    decoder: Vec<ConvLayer>,
     width: u32,
 }
 
 /// A convolution of 3×3 with zeros around, normalisation by batch where there is one, ReLU (the last layer has tanh).
 #[derive(Debug)]
-struct Layer {
+struct ConvLayer {
     kernel: Tensor,
     bias: Tensor,
-    norm: Option<Norm>,
+    norm: Option<BatchNorm>,
     stride: i64,
 }
 
 /// Batch normalisation: the mean and variance of a batch while training, their running means afterwards.
 #[derive(Debug)]
-struct Norm {
+struct BatchNorm {
     scale: Tensor,
     shift: Tensor,
     mean: Tensor,
@@ -78,19 +78,19 @@ impl PaperRefiner {
         let mut number = 0;
         Self::build(width, |_, shape, part| {
             number += 1;
-            let mut draws = Draws::new(seed, WEIGHTS, number);
+            let mut rng = CounterRng::new(seed, WEIGHTS, number);
             let mut normal = || {
                 // Box and Muller; a uniform of 0 would be infinitely far.
-                let (u, v) = (1.0 - f64::from(draws.uniform()), f64::from(draws.uniform()));
+                let (u, v) = (1.0 - f64::from(rng.uniform()), f64::from(rng.uniform()));
                 (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
             };
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
             let values: Vec<f32> = match part {
-                Part::Kernel => (0..count).map(|_| ((2.0 / inputs).sqrt() * normal()) as f32).collect(),
-                Part::Scale => (0..count).map(|_| (1.0 + 0.02 * normal()) as f32).collect(),
-                Part::Variance => vec![1.0; count as usize],
-                Part::Bias | Part::Shift | Part::Mean => vec![0.0; count as usize],
+                LayerTensor::Kernel => (0..count).map(|_| ((2.0 / inputs).sqrt() * normal()) as f32).collect(),
+                LayerTensor::Scale => (0..count).map(|_| (1.0 + 0.02 * normal()) as f32).collect(),
+                LayerTensor::Variance => vec![1.0; count as usize],
+                LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => vec![0.0; count as usize],
             };
             Ok(Tensor::f_from_slice(&values)?.f_reshape(shape)?)
         })
@@ -123,28 +123,28 @@ impl PaperRefiner {
 
     fn build(
         width: u32,
-        mut tensor: impl FnMut(&str, &[i64], Part) -> Result<Tensor, RefinementError>,
+        mut tensor: impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
         let mut layers = |name: &str, specs: &[Spec]| {
             let channels = |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
-            let layer = |(i, &(inputs, outputs, stride, normalised)): (usize, &Spec)| -> Result<Layer, RefinementError> {
+            let layer = |(i, &(inputs, outputs, stride, normalised)): (usize, &Spec)| -> Result<ConvLayer, RefinementError> {
                 let (inputs, outputs) = (channels(inputs), channels(outputs));
-                let mut of = |part: Part, shape: &[i64]| {
+                let mut of = |part: LayerTensor, shape: &[i64]| {
                     let tensor = tensor(&format!("{name}.{i}.{}", part.name()), shape, part)?;
                     Ok::<_, RefinementError>(if part.is_learnt() { tensor.set_requires_grad(true) } else { tensor })
                 };
-                let (kernel, bias) = (of(Part::Kernel, &[outputs, inputs, 3, 3])?, of(Part::Bias, &[outputs])?);
+                let (kernel, bias) = (of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?, of(LayerTensor::Bias, &[outputs])?);
                 let norm = if normalised {
-                    Some(Norm {
-                        scale: of(Part::Scale, &[outputs])?,
-                        shift: of(Part::Shift, &[outputs])?,
-                        mean: of(Part::Mean, &[outputs])?,
-                        variance: of(Part::Variance, &[outputs])?,
+                    Some(BatchNorm {
+                        scale: of(LayerTensor::Scale, &[outputs])?,
+                        shift: of(LayerTensor::Shift, &[outputs])?,
+                        mean: of(LayerTensor::Mean, &[outputs])?,
+                        variance: of(LayerTensor::Variance, &[outputs])?,
                     })
                 } else {
                     None
                 };
-                Ok(Layer { kernel, bias, norm, stride })
+                Ok(ConvLayer { kernel, bias, norm, stride })
             };
             specs.iter().enumerate().map(layer).collect::<Result<Vec<_>, _>>()
         };
@@ -154,8 +154,8 @@ impl PaperRefiner {
 
     /// All tensors by name, running means among them.
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        let of = |name: &str, layers: &[Layer]| -> Vec<(String, Tensor)> {
-            let layer = |(i, layer): (usize, &Layer)| {
+        let of = |name: &str, layers: &[ConvLayer]| -> Vec<(String, Tensor)> {
+            let layer = |(i, layer): (usize, &ConvLayer)| {
                 let tensors = layer.tensors().into_iter();
                 tensors.map(|(part, tensor)| (format!("{name}.{i}.{}", part.name()), tensor)).collect::<Vec<_>>()
             };
@@ -166,12 +166,12 @@ impl PaperRefiner {
 
     /// What is learnt.
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
-        self.encoder.iter().chain(&self.decoder).flat_map(Layer::tensors).filter(|(part, _)| part.is_learnt()).map(|(_, t)| t)
+        self.encoder.iter().chain(&self.decoder).flat_map(ConvLayer::tensors).filter(|(part, _)| part.is_learnt()).map(|(_, t)| t)
     }
 
     /// Another handle on the same tensors, for another thread.
     pub(crate) fn share(&self) -> Self {
-        let of = |layers: &[Layer]| layers.iter().map(Layer::share).collect();
+        let of = |layers: &[ConvLayer]| layers.iter().map(ConvLayer::share).collect();
         Self { encoder: of(&self.encoder), decoder: of(&self.decoder), width: self.width }
     }
 
@@ -221,7 +221,7 @@ impl PaperRefiner {
 
 /// What a tensor of a layer is for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Part {
+enum LayerTensor {
     Kernel,
     Bias,
     Scale,
@@ -230,7 +230,7 @@ enum Part {
     Variance,
 }
 
-impl Part {
+impl LayerTensor {
     fn name(self) -> &'static str {
         match self {
             Self::Kernel => "weight",
@@ -247,24 +247,29 @@ impl Part {
     }
 }
 
-impl Layer {
+impl ConvLayer {
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor, TchError> {
         let y = x.f_conv2d(&self.kernel, Some(&self.bias), [self.stride; 2], [1, 1], [1, 1], 1)?;
-        let Some(Norm { scale, shift, mean, variance }) = &self.norm else { return Ok(y) };
+        let Some(BatchNorm { scale, shift, mean, variance }) = &self.norm else { return Ok(y) };
         y.f_batch_norm(Some(scale), Some(shift), Some(mean), Some(variance), training, MOMENTUM, EPSILON, false)
     }
 
-    fn tensors(&self) -> Vec<(Part, Tensor)> {
+    fn tensors(&self) -> Vec<(LayerTensor, Tensor)> {
         let norm = self.norm.iter().flat_map(|norm| {
-            let Norm { scale, shift, mean, variance } = norm;
-            [(Part::Scale, scale), (Part::Shift, shift), (Part::Mean, mean), (Part::Variance, variance)]
+            let BatchNorm { scale, shift, mean, variance } = norm;
+            [
+                (LayerTensor::Scale, scale),
+                (LayerTensor::Shift, shift),
+                (LayerTensor::Mean, mean),
+                (LayerTensor::Variance, variance),
+            ]
         });
-        let all = [(Part::Kernel, &self.kernel), (Part::Bias, &self.bias)].into_iter().chain(norm);
+        let all = [(LayerTensor::Kernel, &self.kernel), (LayerTensor::Bias, &self.bias)].into_iter().chain(norm);
         all.map(|(part, tensor)| (part, tensor.shallow_clone())).collect()
     }
 
     fn share(&self) -> Self {
-        let norm = self.norm.as_ref().map(|norm| Norm {
+        let norm = self.norm.as_ref().map(|norm| BatchNorm {
             scale: norm.scale.shallow_clone(),
             shift: norm.shift.shallow_clone(),
             mean: norm.mean.shallow_clone(),

@@ -94,14 +94,14 @@ fn matches(rendered: &Rendered, references: &[&KnownView], (x, y): Corner, count
     let mut found = Vec::new();
     for (dx, dy) in (0..LOOKS).flat_map(|j| (0..LOOKS).map(move |i| (i * step + step / 2, j * step + step / 2))) {
         for (r, other) in surfaces.iter().enumerate() {
-            let Some(sight) = surface.sight(x + dx, y + dy, other) else { continue };
+            let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };
             let truth = &references[r].truth;
             // The pixel's centre is seen at `place`: its patch begins as far before it as it does here.
             let corner = |place: f32, by: usize, size: usize| {
                 ((place - 0.5).round() as isize - by as isize).clamp(0, (size - PATCH) as isize) as usize
             };
-            let at = (corner(sight.place[0], dx, truth.width), corner(sight.place[1], dy, truth.height));
-            found.push((sight.cosine.max(0.0) * sight.detail.min(1.0), r, at));
+            let at = (corner(visibility.place[0], dx, truth.width), corner(visibility.place[1], dy, truth.height));
+            found.push((visibility.cosine.max(0.0) * visibility.detail.min(1.0), r, at));
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2)));

@@ -1,5 +1,5 @@
+use counter_rng::CounterRng;
 use pixels::Picture;
-use radiance::Draws;
 
 /// A random perspective, as torchvision draws them: every corner of a picture moves inwards by at most a share of its half width and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,8 +20,8 @@ impl Perspective {
     }
 
     /// A random one.
-    pub(crate) fn draw(width: usize, height: usize, draws: &mut Draws) -> Self {
-        let mut inwards = |size: usize| draws.below((DISTORTION * (size / 2) as f64) as u64 + 1) as f64;
+    pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
+        let mut inwards = |size: usize| rng.below((DISTORTION * (size / 2) as f64) as u64 + 1) as f64;
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {
@@ -106,7 +106,7 @@ mod tests {
         let none = Perspective::identity(40, 30);
         assert_eq!(none.colour(&picture, 7, 5), [0, 1, 2].map(|c| picture.data[(5 * 40 + 7) * 3 + c]));
         for seed in 0..20 {
-            let warp = Perspective::draw(40, 30, &mut Draws::new(seed, 1, 2));
+            let warp = Perspective::draw(40, 30, &mut CounterRng::new(seed, 1, 2));
             let [left, top, right, bottom] = warp.filled;
             assert!(right <= 40 && bottom <= 30 && right - left > 20 && bottom - top > 15);
             for (x, y) in (0..40).flat_map(|x| (0..30).map(move |y| (x, y))) {

@@ -1,13 +1,13 @@
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use nets::Adam;
-use radiance::Draws;
 use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};
 
 use crate::network::{COARSEST, COLOURS};
 use crate::perspective::Perspective;
-use crate::{PaperRefiner, Perceptual};
+use crate::{PaperRefiner, PerceptualLoss};
 
 /// How to train a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,7 +32,7 @@ pub struct PaperTraining {
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: PaperTraining,
-    perceptual: Option<Perceptual>,
+    perceptual: Option<PerceptualLoss>,
     adam: Adam,
 }
 
@@ -46,7 +46,11 @@ const PATCHES: u64 = 322;
 
 impl PaperTrainer {
     /// Starts from a network.
-    pub fn new(network: PaperRefiner, options: PaperTraining, perceptual: Option<Perceptual>) -> Result<Self, RefinementError> {
+    pub fn new(
+        network: PaperRefiner,
+        options: PaperTraining,
+        perceptual: Option<PerceptualLoss>,
+    ) -> Result<Self, RefinementError> {
         let adam = Adam::new(network.parameters())?;
         Ok(Self { network, options, perceptual, adam })
     }
@@ -69,9 +73,9 @@ impl Training for PaperTrainer {
         }
         let (mut rendered, mut truth, mut others) = (Vec::new(), Vec::new(), Vec::new());
         for i in 0..batch {
-            let mut draws = Draws::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
-            let number = draws.below(examples.len() as u64);
-            let drawn = Drawn::new(&examples[number as usize], number, &self.options, &mut draws);
+            let mut rng = CounterRng::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
+            let number = rng.below(examples.len() as u64);
+            let drawn = TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
             drawn.append(&mut rendered, &mut truth, &mut others);
         }
         let side = patch as i64;
@@ -101,14 +105,14 @@ impl Training for PaperTrainer {
 }
 
 /// L1 of pictures in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
-pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&Perceptual>) -> Result<(Tensor, f64), TchError> {
+pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&PerceptualLoss>) -> Result<(Tensor, f64), TchError> {
     let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
     let error = first.f_double_value(&[])?;
     Ok((perceptual.map_or_else(|| Ok(first.shallow_clone()), |p| p.distance(found, truth)?.f_add(&first))?, error))
 }
 
 /// A patch to learn from.
-struct Drawn<'a> {
+struct TrainingPatch<'a> {
     example: &'a KnownView,
     warp: Perspective,
     patch: usize,
@@ -117,21 +121,21 @@ struct Drawn<'a> {
     references: Vec<(usize, usize)>,
 }
 
-impl<'a> Drawn<'a> {
-    fn new(example: &'a KnownView, number: u64, options: &PaperTraining, draws: &mut Draws) -> Self {
+impl<'a> TrainingPatch<'a> {
+    fn new(example: &'a KnownView, number: u64, options: &PaperTraining, rng: &mut CounterRng) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
-        let which = draws.below(PERSPECTIVES);
+        let which = rng.below(PERSPECTIVES);
         // The same 200 throughout.
-        let mut shape = Draws::new(options.seed, WARPS, number * PERSPECTIVES + which);
+        let mut shape = CounterRng::new(options.seed, WARPS, number * PERSPECTIVES + which);
         let warp = if which == 0 { Perspective::identity(width, height) } else { Perspective::draw(width, height, &mut shape) };
         let [left, top, right, bottom] = warp.filled;
-        let within = |low: usize, high: usize, draws: &mut Draws| low + draws.below((high.max(low) - low + 1) as u64) as usize;
+        let within = |low: usize, high: usize, rng: &mut CounterRng| low + rng.below((high.max(low) - low + 1) as u64) as usize;
         let last = |end: usize| end.saturating_sub(options.patch);
-        let corner = (within(left.min(last(right)), last(right), draws), within(top.min(last(bottom)), last(bottom), draws));
-        let near = |at: usize, size: usize, draws: &mut Draws| {
-            within(at.saturating_sub(WINDOW).min(last(size)), (at + WINDOW).min(last(size)), draws)
+        let corner = (within(left.min(last(right)), last(right), rng), within(top.min(last(bottom)), last(bottom), rng));
+        let near = |at: usize, size: usize, rng: &mut CounterRng| {
+            within(at.saturating_sub(WINDOW).min(last(size)), (at + WINDOW).min(last(size)), rng)
         };
-        let references = (0..options.references).map(|_| (near(corner.0, width, draws), near(corner.1, height, draws))).collect();
+        let references = (0..options.references).map(|_| (near(corner.0, width, rng), near(corner.1, height, rng))).collect();
         Self { example, warp, patch: options.patch, corner, references }
     }
 

@@ -39,11 +39,11 @@ use scene::Camera;
 /// A photograph at several sizes.
 #[derive(Clone, Debug)]
 pub struct Pyramid {
-    levels: Vec<Level>,
+    levels: Vec<PyramidLevel>,
 }
 
 #[derive(Clone, Debug)]
-struct Level {
+struct PyramidLevel {
     width: usize,
     height: usize,
     telling: Vec<Telling>,
@@ -81,7 +81,7 @@ impl Pyramid {
         let level = |level: u32| {
             let [width, height] = size(level);
             let shrink = Resampling::new(Filter::Box, (photograph.width, photograph.height), (width, height));
-            Level::new(&shrink.apply(photograph))
+            PyramidLevel::new(&shrink.apply(photograph))
         };
         Self { levels: (0..=smaller).take_while(is_large).map(level).collect() }
     }
@@ -92,7 +92,7 @@ impl Pyramid {
     }
 }
 
-impl Level {
+impl PyramidLevel {
     fn new(picture: &Picture) -> Self {
         let (width, height) = (picture.width, picture.height);
         let colour = |x: usize, y: usize| [0, 1, 2].map(|c| picture.data[(y * width + x) * 3 + c]);
@@ -188,7 +188,12 @@ struct Equations {
 }
 
 impl Equations {
-    fn of(field: &dyn RayField, camera: &Camera, level: &Level, options: &Options) -> Result<Self, Box<dyn Error + Send + Sync>> {
+    fn of(
+        field: &dyn RayField,
+        camera: &Camera,
+        level: &PyramidLevel,
+        options: &Options,
+    ) -> Result<Self, Box<dyn Error + Send + Sync>> {
         let camera = camera.resized(level.width as u32, level.height as u32);
         let cast = |pixel: &Telling| camera.ray(pixel.x as f64 + 0.5, pixel.y as f64 + 0.5);
         let rays: Vec<Ray> = level
@@ -302,7 +307,7 @@ fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
 
 /// A camera before and after.
 #[derive(Clone, Copy, Debug)]
-pub struct Step<'a> {
+pub struct CameraMove<'a> {
     /// Where it was; its pixels are the photograph's.
     pub from: &'a Camera,
     /// Where it is.
@@ -328,9 +333,9 @@ const FAR_PIXELS: f64 = 3.0;
 
 impl Moved {
     /// Over all cameras.
-    pub fn between<'a>(steps: impl Iterator<Item = Step<'a>>) -> Self {
+    pub fn between<'a>(steps: impl Iterator<Item = CameraMove<'a>>) -> Self {
         let (mut count, mut sum) = (0.0f64, Self { angle: 0.0, distance: 0.0, pixels: 0.0 });
-        for Step { from, to, depth } in steps {
+        for CameraMove { from, to, depth } in steps {
             count += 1.0;
             let distance = from.centre().distance(to.centre());
             sum.angle += rotation(from).angle_between(rotation(to));

@@ -164,7 +164,7 @@ fn what_says_nothing_moves_nothing() {
 fn motions_are_told() {
     let camera = camera(2);
     let moved = motion([0.0, 0.01, 0.0], [0.3, 0.0, -0.4]).applied_to(&camera);
-    let step = |to, depth| Step { from: &camera, to, depth };
+    let step = |to, depth| CameraMove { from: &camera, to, depth };
     let told = Moved::between([step(&moved, Some(4.0)), step(&camera, None)].into_iter());
     assert!((told.angle - 0.005).abs() < 1e-6 && (told.distance - 0.25).abs() < 1e-9, "{told:?}");
     // Half of a focal length of 70 pixels times 0.5 / 4.

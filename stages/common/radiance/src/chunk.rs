@@ -8,7 +8,7 @@ use crate::grid::{FEATURES, encode};
 use crate::math::{exp, sigmoid};
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::occupancy::{DONE, march};
-use crate::ray::UnitRay;
+use crate::ray::NormalizedRay;
 use crate::simd::{LANES, kernel};
 use crate::spherical::{BASIS, spherical_harmonics};
 
@@ -151,7 +151,7 @@ impl Chunk {
     }
 
     /// Renders rays into [`Chunk::sums`]. `offsets` shift each ray's samples by a share of a step.
-    pub(crate) fn forward(&mut self, field: &Field, rays: &[UnitRay], offsets: &[f32]) {
+    pub(crate) fn forward(&mut self, field: &Field, rays: &[NormalizedRay], offsets: &[f32]) {
         let step = field.step();
         for list in [&mut self.kept, &mut self.kept_ray, &mut self.active, &mut self.next] {
             list.clear();
@@ -180,7 +180,7 @@ impl Chunk {
     }
 
     /// Takes every active ray some samples further, and drops those that end.
-    fn round(&mut self, field: &Field, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize) {
+    fn round(&mut self, field: &Field, rays: &[NormalizedRay], offsets: &[f32], step: f32, most: usize) {
         let start = self.t.len();
         self.starts.clear();
         let (t, marched, starts) = (&mut self.t, &mut self.marched, &mut self.starts);
@@ -256,7 +256,7 @@ impl Chunk {
     }
 
     /// Colours of the samples that count, and each ray's sums.
-    fn shade(&mut self, field: &Field, rays: &[UnitRay]) {
+    fn shade(&mut self, field: &Field, rays: &[NormalizedRay]) {
         let m = self.kept.len().next_multiple_of(LANES);
         let input = fit(&mut self.colour_in, COLOUR_INPUTS * m);
         gather(&self.rounds, &self.kept, &self.density, DENSITY_OUTPUTS, 1, &mut input[..(DENSITY_OUTPUTS - 1) * m], m);

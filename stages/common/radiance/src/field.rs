@@ -1,5 +1,6 @@
 use std::path::{Path, PathBuf};
 
+use counter_rng::CounterRng;
 use rayon::prelude::*;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use scene::Bounds;
@@ -11,7 +12,6 @@ use crate::field_file::in_ranges;
 use crate::grid::{FEATURES, Level, levels};
 use crate::mlp::Layer;
 use crate::occupancy::{CELLS, Occupancy};
-use crate::random::Draws;
 use crate::ray::{Ray, clip};
 use crate::spherical::BASIS;
 
@@ -177,14 +177,14 @@ impl Field {
     pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
         let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {
-            *value = 2e-4 * (crate::random::uniform(seed, 1, i as u64) - 0.5);
+            *value = 2e-4 * (counter_rng::uniform(seed, 1, i as u64) - 0.5);
         }
-        let mut draws = Draws::new(seed, 2, 0);
+        let mut rng = CounterRng::new(seed, 2, 0);
         for layer in field.layers.all() {
             // He et al. 2015, uniform.
             let bound = (6.0 / layer.inputs as f32).sqrt();
             for value in &mut field.network[layer.range()] {
-                *value = bound * (2.0 * draws.uniform() - 1.0);
+                *value = bound * (2.0 * rng.uniform() - 1.0);
             }
         }
         field

@@ -160,7 +160,7 @@ kernel! {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::uniform;
+    use counter_rng::uniform;
 
     fn positions(n: usize) -> Vec<[f32; 3]> {
         let mut p: Vec<[f32; 3]> = (0..n as u64).map(|i| [0, 1, 2].map(|a| uniform(5, a, i))).collect();

@@ -2,8 +2,8 @@
 //!
 //! * [`RayField`]: whatever rays can be cast through; [`FieldFile`] says what an artifact holds.
 //! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
-//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervision`] that casts rays and judges colours.
-//! * [`Tally`], [`Occupancy`], [`UnitRay`]: what a training of the same field elsewhere (`torch-field`) shares: how far it has come, where there
+//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that casts rays and judges colours.
+//! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere (`torch-field`) shares: how far it has come, where there
 //!   may be something, how rays run through the unit cube.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
 //! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
@@ -34,7 +34,6 @@ mod math;
 mod mlp;
 mod occupancy;
 mod passes;
-mod random;
 mod ray;
 #[cfg(test)]
 mod reference;
@@ -48,8 +47,7 @@ pub use field::{Architecture, Field, FieldError, Pixel, RayField};
 pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
 pub use occupancy::Occupancy;
 pub use passes::Passes;
-pub use random::{Draws, uniform};
-pub use ray::{Course, Ray, UnitRay, clip};
+pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use simd::{Family, set_family};
 pub use tally::Tally;
-pub use trainer::{StepReport, Supervision, Trainer, TrainingError, TrainingOptions};
+pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};

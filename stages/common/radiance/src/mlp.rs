@@ -215,8 +215,8 @@ impl Layer {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::uniform;
     use crate::simd::{Family, set_family};
+    use counter_rng::uniform;
 
     fn numbers(seed: u64, len: usize) -> Vec<f32> {
         (0..len).map(|i| 2.0 * uniform(seed, 0, i as u64) - 1.0).collect()

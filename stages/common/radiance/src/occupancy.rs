@@ -1,10 +1,10 @@
 //! Which cells of the unit cube may hold something: what rays skip by.
 
+use counter_rng::CounterRng;
 use rayon::prelude::*;
 use scene::Bounds;
 
-use crate::random::Draws;
-use crate::ray::{Course, FASTEST, UnitRay};
+use crate::ray::{FASTEST, NormalizedRay, RayMap};
 use crate::simd::kernel;
 
 /// Cells along each axis.
@@ -95,7 +95,7 @@ impl Occupancy {
     }
 
     /// Cells to look at, at a step of a training: none at most of them.
-    pub fn looks(&self, step: u64) -> Vec<u32> {
+    pub fn cells_to_update(&self, step: u64) -> Vec<u32> {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
@@ -112,13 +112,13 @@ impl Occupancy {
 
     /// Where in a cell to look at that step, in the unit cube.
     pub fn place_in(cell: u32, seed: u64, step: u64) -> [f32; 3] {
-        let mut draws = Draws::new(seed, 3, step * CELLS as u64 + u64::from(cell));
-        corner(cell as usize).map(|c| (c as f32 + draws.uniform()) / GRID as f32)
+        let mut rng = CounterRng::new(seed, 3, step * CELLS as u64 + u64::from(cell));
+        corner(cell as usize).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
     /// Takes the densities that were found in cells, and decides anew which cells may hold something, for rays with samples so far apart in
     /// the cube.
-    pub fn learn(&mut self, cells: &[u32], densities: &[f32], step: f32) {
+    pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
         if cells.is_empty() {
             return;
         }
@@ -186,7 +186,7 @@ kernel! {
     /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends t and positions; `starts` gets
     /// the first sample of each active ray, and the end.
     pub(crate) fn march<L>(
-        occupancy: &Occupancy, rays: &[UnitRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
+        occupancy: &Occupancy, rays: &[NormalizedRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
         t: &mut Vec<f32>, positions: &mut Vec<[f32; 3]>, starts: &mut Vec<usize>,
     ) {
         let last = GRID as f32 - 1.0;
@@ -224,7 +224,7 @@ kernel! {
                 };
                 // Where the ray leaves this empty cell or block; at least one step on.
                 let mut exit = f32::INFINITY;
-                if let Course::Straight { .. } = ray.course {
+                if let RayMap::Straight { .. } = ray.map {
                     for i in 0..3 {
                         let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
                         let until = (face - ray.origin[i]) * inverse[i];
@@ -253,7 +253,7 @@ kernel! {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::random::Draws;
+    use counter_rng::CounterRng;
 
     #[test]
     fn skipping_loses_no_sample() {
@@ -261,8 +261,8 @@ mod tests {
         occupancy.set(|cell| (cell / 7) % 11 == 0 && cell % GRID > 40);
         let step = 3.0f32.sqrt() / 512.0;
         for seed in 0..200 {
-            let mut draws = Draws::new(1, 2, seed);
-            let mut unit = || draws.uniform();
+            let mut rng = CounterRng::new(1, 2, seed);
+            let mut unit = || rng.uniform();
             let origin = [unit(), unit(), unit()];
             let d = [unit() - 0.5, unit() - 0.5, if seed % 5 == 0 { 0.0 } else { unit() - 0.5 }];
             let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
@@ -271,7 +271,7 @@ mod tests {
                 .filter(|&i| direction[i] != 0.0)
                 .map(|i| (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i])
                 .fold(f32::INFINITY, f32::min);
-            let ray = UnitRay { origin, direction, leave, ..UnitRay::default() };
+            let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
             let mut found = Vec::new();
             // In parts, as the renderer does.
             let (mut next, mut positions) = ([0], Vec::new());
@@ -307,8 +307,8 @@ mod tests {
         occupancy.limit_to_hull(&Bounds { max: [1.0; 3], ..Bounds::default() }, &hull);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        assert_eq!(occupancy.looks(EVERY).len(), 26 + 8);
-        occupancy.learn(&all, &vec![1e3; CELLS], 0.003);
+        assert_eq!(occupancy.cells_to_update(EVERY).len(), 26 + 8);
+        occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);
     }
 

@@ -16,36 +16,36 @@ pub struct Ray {
 
 /// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in cube sides.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct UnitRay {
+pub struct NormalizedRay {
     /// Where t is 0.
     pub origin: [f32; 3],
-    /// Of its course.
+    /// Along which t moves.
     pub direction: [f32; 3],
     /// Where it enters and leaves; nothing when `enter >= leave`.
     pub enter: f32,
     /// Where it leaves.
     pub leave: f32,
-    /// How it runs in between.
-    pub course: Course,
+    /// How t maps to places and distances in between.
+    pub map: RayMap,
     /// The direction in the world, unit length: what colours depend on, whatever the field's space.
     pub view: [f32; 3],
 }
 
-/// How a ray runs through the unit cube, and its distance in scene units at t.
+/// Maps the parameter t of a ray to its place in the unit cube and its distance in scene units.
 #[derive(Clone, Copy, Debug)]
-pub enum Course {
-    /// Position origin + t·direction, distance start + t·scale / (1 - t·bend): a perspective map keeps lines straight and moves
-    /// along them as a Möbius map does; a box has `bend` 0.
+pub enum RayMap {
+    /// Position origin + t·direction, distance start + t·scale / (1 - t·perspective): a perspective map keeps lines straight and moves
+    /// along them as a Möbius map does; a box has `perspective` 0.
     Straight {
         /// Distance where t is 0.
         start: f32,
         /// How fast it grows there.
         scale: f32,
         /// How fast that itself grows.
-        bend: f32,
+        perspective: f32,
     },
     /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's radius; from there it is
-    /// `reach`·sinh(4t) to the point, whose steps thereby grow as fast as the contraction shrinks them. The distance is
+    /// `radii`·sinh(4t) to the point, whose steps thereby grow as fast as the contraction shrinks them. The distance is
     /// start + scale·sinh(4t).
     Contracted {
         /// Distance of the point nearest to the centre.
@@ -53,13 +53,13 @@ pub enum Course {
         /// Scene units for each sinh(4t).
         scale: f32,
         /// Ball radii for each sinh(4t).
-        reach: f32,
+        radii: f32,
     },
 }
 
-impl Default for Course {
+impl Default for RayMap {
     fn default() -> Self {
-        Self::Straight { start: 0.0, scale: 1.0, bend: 0.0 }
+        Self::Straight { start: 0.0, scale: 1.0, perspective: 0.0 }
     }
 }
 
@@ -73,14 +73,14 @@ fn sinh4(t: f32) -> f32 {
     0.5 * (e - 1.0 / e)
 }
 
-impl UnitRay {
+impl NormalizedRay {
     /// The place in the unit cube at t.
     #[inline(always)]
     pub fn position(&self, t: f32) -> [f32; 3] {
-        match self.course {
-            Course::Straight { .. } => std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i])),
-            Course::Contracted { reach, .. } => {
-                let along = reach * sinh4(t);
+        match self.map {
+            RayMap::Straight { .. } => std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i])),
+            RayMap::Contracted { radii, .. } => {
+                let along = radii * sinh4(t);
                 let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
                 let length = u.iter().map(|x| x * x).sum::<f32>().sqrt();
                 let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
@@ -92,9 +92,9 @@ impl UnitRay {
     /// The distance in scene units at t.
     #[inline(always)]
     pub fn distance(&self, t: f32) -> f32 {
-        match self.course {
-            Course::Straight { start, scale, bend } => t * scale / bend.mul_add(-t, 1.0) + start,
-            Course::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
+        match self.map {
+            RayMap::Straight { start, scale, perspective } => t * scale / perspective.mul_add(-t, 1.0) + start,
+            RayMap::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
         }
     }
 
@@ -106,10 +106,10 @@ impl UnitRay {
 
 /// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64, so that scenes of 1e-6 and 1e6
 /// units lose nothing.
-pub fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
+pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
     // A NaN or a zero direction anywhere ends here.
     if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite()) {
-        return UnitRay::miss(ray);
+        return NormalizedRay::miss(ray);
     }
     let (origin, direction) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
     let clipped = match &bounds.space {
@@ -117,23 +117,23 @@ pub fn clip(bounds: &Bounds, ray: &Ray) -> UnitRay {
         Space::Ndc(frustum) => through_frustum(frustum, bounds.near, origin, direction),
         Space::Contraction => through_contraction(bounds, origin, direction),
     };
-    clipped.map_or(UnitRay::miss(ray), |clipped| UnitRay { view: ray.direction, ..clipped })
+    clipped.map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay { view: ray.direction, ..clipped })
 }
 
-fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let side = bounds.longest_side();
     let origin = (origin - DVec3::from(bounds.min)) / side;
     let extent = (DVec3::from(bounds.max) - DVec3::from(bounds.min)) / side;
     // On the inner side of a face: offset + slope·t >= 0.
     let faces = (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
     let (enter, leave) = clip_to(faces, [bounds.near / side, bounds.far / side])?;
-    let course = Course::Straight { start: 0.0, scale: side as f32, bend: 0.0 };
+    let map = RayMap::Straight { start: 0.0, scale: side as f32, perspective: 0.0 };
     let (origin, direction) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(UnitRay { origin, direction, enter: enter as f32, leave: leave as f32, course, view: [0.0; 3] })
+    Some(NormalizedRay { origin, direction, enter: enter as f32, leave: leave as f32, map, view: [0.0; 3] })
 }
 
 /// Between the frustum's planes, from a distance on; its far plane lies behind all that is known, so the range's far end says no more.
-fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let (o, d) = (frustum.to_camera(origin), frustum.turn(direction));
     let depths = [(o.z - frustum.near, d.z), (frustum.far - o.z, -d.z)];
     let sides = (0..2).flat_map(|i| {
@@ -150,23 +150,23 @@ fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3
     }
     // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from the far end.
     let c = length * to.z / (leave - enter);
-    let course = Course::Straight { start: enter as f32, scale: (from.z / c) as f32, bend: (d.z / c) as f32 };
+    let map = RayMap::Straight { start: enter as f32, scale: (from.z / c) as f32, perspective: (d.z / c) as f32 };
     let direction = (end - start) / length;
     let (origin, direction) = (start.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(UnitRay { origin, direction, enter: 0.0, leave: length as f32, course, view: [0.0; 3] })
+    Some(NormalizedRay { origin, direction, enter: 0.0, leave: length as f32, map, view: [0.0; 3] })
 }
 
-fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<UnitRay> {
+fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
     let radius = 0.5 * bounds.longest_side();
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let from = (origin - centre) / radius;
     let to_nearest = -from.dot(direction);
     let nearest = from + to_nearest * direction;
-    let reach = nearest.length().max(1.0);
-    let t = |distance: f64| 0.25 * ((distance / radius - to_nearest) / reach).asinh();
-    let course = Course::Contracted { start: (to_nearest * radius) as f32, scale: (reach * radius) as f32, reach: reach as f32 };
+    let radii = nearest.length().max(1.0);
+    let t = |distance: f64| 0.25 * ((distance / radius - to_nearest) / radii).asinh();
+    let map = RayMap::Contracted { start: (to_nearest * radius) as f32, scale: (radii * radius) as f32, radii: radii as f32 };
     let (origin, direction) = (nearest.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(UnitRay { origin, direction, enter: t(bounds.near) as f32, leave: t(bounds.far) as f32, course, view: [0.0; 3] })
+    Some(NormalizedRay { origin, direction, enter: t(bounds.near) as f32, leave: t(bounds.far) as f32, map, view: [0.0; 3] })
 }
 
 /// The part of a range of x in which all of some functions offset + slope·x aren't negative; `None` where there is none.
@@ -239,8 +239,8 @@ mod tests {
             };
             let mut met = [0; 2];
             for k in 0..200 {
-                let mut draws = crate::random::Draws::new(5, 0, k);
-                let mut draw = || f64::from(draws.uniform()) - 0.5;
+                let mut rng = counter_rng::CounterRng::new(5, 0, k);
+                let mut draw = || f64::from(rng.uniform()) - 0.5;
                 let from = centre + scale * DVec3::new(draw(), draw(), draw());
                 let direction = (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
                 let ray = ray(from.as_vec3().to_array(), direction.as_vec3().to_array());
@@ -276,8 +276,8 @@ mod tests {
     fn contracted_rays_move_at_most_twice_as_fast_as_t() {
         let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e4, space: Space::Contraction };
         for k in 0..300 {
-            let mut draws = crate::random::Draws::new(6, 0, k);
-            let mut draw = || 2.0 * draws.uniform() - 1.0;
+            let mut rng = counter_rng::CounterRng::new(6, 0, k);
+            let mut draw = || 2.0 * rng.uniform() - 1.0;
             let far = [0.5, 3.0, 40.0][k as usize % 3];
             let origin = [far * draw(), far * draw(), far * draw()];
             let direction = unit([draw(), draw(), draw()].map(f64::from)).as_vec3().to_array();

@@ -1,5 +1,6 @@
 //! The same field written plainly in f64: the judge of the fused f32 passes. Tests only.
 
+use counter_rng::CounterRng;
 use scene::Bounds;
 
 use crate::chunk::{Chunk, FeatureGradients};
@@ -8,7 +9,6 @@ use crate::field::{Architecture, COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
 use crate::grid::{FEATURES, Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
 use crate::occupancy::march;
-use crate::random::Draws;
 use crate::ray::{Ray, clip};
 use crate::simd::LANES;
 use crate::spherical::spherical_harmonics;
@@ -99,12 +99,12 @@ fn example() -> (Field, Vec<Ray>) {
     let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, finest_z: 20, log2_entries: 9, hidden: 16, steps: 24 };
     let mut field =
         Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() }, 3);
-    let mut draws = Draws::new(8, 8, 8);
+    let mut rng = CounterRng::new(8, 8, 8);
     // Features of the size that training reaches, and fog thick enough that every sample counts.
-    field.grid.iter_mut().for_each(|g| *g = draws.uniform() - 0.5);
+    field.grid.iter_mut().for_each(|g| *g = rng.uniform() - 0.5);
     let rays = (0..20)
         .map(|_| {
-            let mut unit = || 2.0 * draws.uniform() - 1.0;
+            let mut unit = || 2.0 * rng.uniform() - 1.0;
             let target = [0.6 * unit(), 0.6 * unit(), 0.6 * unit()];
             let origin = [3.0 * unit(), 3.0, 2.0 * unit()];
             let d: [f32; 3] = std::array::from_fn(|i| target[i] - origin[i]);
@@ -157,8 +157,8 @@ fn fused_passes_equal_the_plain_ones() {
     let like = likenesses.iter().flatten().filter(|l| **l > 0.0).count();
     println!("{like} samples of {} pass for the background", likenesses.iter().flatten().count());
     assert!(like > 20);
-    let mut draws = Draws::new(1, 1, 1);
-    let g: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| draws.uniform() - 0.5)).collect();
+    let mut rng = CounterRng::new(1, 1, 1);
+    let g: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
     let loss = |judge: &Judge<'_>| -> f64 {
         let dot = |i: usize| -> f64 {
             let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);

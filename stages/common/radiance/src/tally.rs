@@ -4,8 +4,8 @@
 pub struct Tally {
     /// Steps taken.
     pub steps: u64,
-    /// Groups of rays cast: those that were judged together.
-    pub groups: u64,
+    /// Bundles of rays cast: those that were judged together.
+    pub bundles: u64,
     /// Rays cast.
     pub rays: u64,
     /// What learning rates are multiplied with.
@@ -18,7 +18,7 @@ const APART: u64 = 100;
 
 impl Default for Tally {
     fn default() -> Self {
-        Self { steps: 0, groups: 0, rays: 0, rate_scale: 1.0, last_fault: None }
+        Self { steps: 0, bundles: 0, rays: 0, rate_scale: 1.0, last_fault: None }
     }
 }
 
@@ -28,16 +28,16 @@ impl Tally {
         (self.rays as f64 / rays.max(1) as f64).min(1.0)
     }
 
-    /// Groups of the next step, which would like to have so many rays; `None` once all are spent.
-    pub fn groups_of_step(&self, rays: u64, wanted: usize, group: usize) -> Option<usize> {
-        let left = rays.saturating_sub(self.rays) as usize / group;
-        (left > 0).then(|| (wanted / group).clamp(1, left))
+    /// Bundles of the next step, which would like to have so many rays; `None` once all are spent.
+    pub fn bundles_of_step(&self, rays: u64, wanted: usize, bundle: usize) -> Option<usize> {
+        let left = rays.saturating_sub(self.rays) as usize / bundle;
+        (left > 0).then(|| (wanted / bundle).clamp(1, left))
     }
 
-    /// Counts groups of so many rays each.
-    pub fn cast(&mut self, groups: usize, group: usize) {
-        self.groups += groups as u64;
-        self.rays += (groups * group) as u64;
+    /// Counts bundles of so many rays each.
+    pub fn count(&mut self, bundles: usize, bundle: usize) {
+        self.bundles += bundles as u64;
+        self.rays += (bundles * bundle) as u64;
     }
 
     /// Takes note of a step that wasn't finite; whether the training may go on.
@@ -50,13 +50,13 @@ impl Tally {
 
     /// For a checkpoint.
     pub fn counters(&self) -> [u64; 5] {
-        [self.steps, self.groups, self.rays, self.rate_scale.to_bits(), self.last_fault.unwrap_or(u64::MAX)]
+        [self.steps, self.bundles, self.rays, self.rate_scale.to_bits(), self.last_fault.unwrap_or(u64::MAX)]
     }
 
     /// From a checkpoint.
-    pub fn from_counters([steps, groups, rays, rate_scale, fault]: [u64; 5]) -> Self {
+    pub fn from_counters([steps, bundles, rays, rate_scale, fault]: [u64; 5]) -> Self {
         let last_fault = (fault != u64::MAX).then_some(fault);
-        Self { steps, groups, rays, rate_scale: f64::from_bits(rate_scale), last_fault }
+        Self { steps, bundles, rays, rate_scale: f64::from_bits(rate_scale), last_fault }
     }
 }
 
@@ -67,12 +67,12 @@ mod tests {
     #[test]
     fn a_step_has_what_is_wanted_or_what_is_left() {
         let mut tally = Tally::default();
-        assert_eq!(tally.groups_of_step(100, 40, 9), Some(4));
-        assert_eq!(tally.groups_of_step(100, 4, 9), Some(1));
-        tally.cast(10, 9);
-        assert_eq!((tally.groups_of_step(100, 40, 9), tally.done(100)), (Some(1), 0.9));
-        tally.cast(1, 9);
-        assert_eq!(tally.groups_of_step(100, 40, 9), None);
+        assert_eq!(tally.bundles_of_step(100, 40, 9), Some(4));
+        assert_eq!(tally.bundles_of_step(100, 4, 9), Some(1));
+        tally.count(10, 9);
+        assert_eq!((tally.bundles_of_step(100, 40, 9), tally.done(100)), (Some(1), 0.9));
+        tally.count(1, 9);
+        assert_eq!(tally.bundles_of_step(100, 40, 9), None);
     }
 
     #[test]

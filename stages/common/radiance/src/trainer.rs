@@ -1,6 +1,7 @@
 use std::path::Path;
 use std::sync::Mutex;
 
+use counter_rng::uniform;
 use rayon::prelude::*;
 use safetensors::SafeTensors;
 
@@ -11,25 +12,24 @@ use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, wri
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
 use crate::occupancy::{CELLS, Occupancy};
-use crate::random::uniform;
-use crate::ray::{Ray, UnitRay, clip};
+use crate::ray::{NormalizedRay, Ray, clip};
 use crate::simd::LANES;
 use crate::tally::Tally;
 
-/// Where a trainer's rays come from and how their colours are judged. Rays come in groups that are judged together: the s×s
-/// sub-rays of an LR pixel.
-pub trait Supervision: Sync {
-    /// Is told before every step which share of the training's rays is done, from which alone its groups may change.
-    fn begin(&mut self, _done: f64) {}
-    /// Rays in a group of this step.
-    fn rays_per_group(&self) -> usize;
-    /// Casts the rays of a group. `group` counts from 0 over the whole training: draw from it alone.
-    fn cast(&self, group: u64, rays: &mut [Ray]);
-    /// The group's loss, given its rays' colours; writes the loss's gradient by each colour.
-    fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
-    /// Is given each group's colours again after a step that went well, in the order of the groups: for a supervision that keeps
+/// Where a trainer's rays come from and how their colours are judged. Rays come in bundles that are judged together: the s×s
+/// sub-pixel rays of an LR pixel are a pixel bundle.
+pub trait Supervisor: Sync {
+    /// Is told before every step which share of the training's rays is done, from which alone its bundles may change.
+    fn set_progress(&mut self, _done: f64) {}
+    /// Rays in a bundle of this step.
+    fn rays_per_bundle(&self) -> usize;
+    /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training: draw from it alone.
+    fn sample_rays(&self, bundle: u64, rays: &mut [Ray]);
+    /// The bundle's loss, given its rays' colours; writes the loss's gradient by each colour.
+    fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
+    /// Is given each bundle's colours again after a step that went well, in the order of the bundles: for a supervision that keeps
     /// what was rendered.
-    fn remember(&mut self, _group: u64, _colours: &[[f32; 3]]) {}
+    fn remember(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
 }
 
 /// How to train.
@@ -95,7 +95,7 @@ impl TrainingOptions {
 /// What a step did.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepReport {
-    /// Mean loss of the groups.
+    /// Mean loss of the bundles.
     pub loss: f64,
     /// Rays cast.
     pub rays: usize,
@@ -165,7 +165,7 @@ struct Worker {
     chunk: Chunk,
     lanes: Vec<f32>,
     rays: Vec<Ray>,
-    clipped: Vec<UnitRay>,
+    clipped: Vec<NormalizedRay>,
     offsets: Vec<f32>,
     backgrounds: Vec<[f32; 3]>,
     colours: Vec<[f32; 3]>,
@@ -223,35 +223,35 @@ impl Trainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TrainingError> {
-        supervision.begin(self.tally.done(self.options.rays));
-        let group = supervision.rays_per_group();
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TrainingError> {
+        supervision.set_progress(self.tally.done(self.options.rays));
+        let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
-        let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else { return Ok(None) };
         self.update_occupancy();
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
         let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
-        let (first_group, first_ray) = (self.tally.groups, self.tally.rays);
+        let (first_bundle, first_ray) = (self.tally.bundles, self.tally.rays);
         let judge = &*supervision;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
-            let range = groups * i / SHARDS..groups * (i + 1) / SHARDS;
+            let range = bundles * i / SHARDS..bundles * (i + 1) / SHARDS;
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, field, transposed, judge, options, (first_group, first_ray), range, groups);
+            shard.run(&mut worker, field, transposed, judge, options, (first_bundle, first_ray), range, bundles);
             lock(workers).push(worker);
         });
 
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
-        let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / groups as f64;
+        let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
         for shard in &self.shards {
             for (sum, g) in self.gradients.network.iter_mut().zip(&shard.network) {
                 *sum += g;
             }
         }
-        self.tally.cast(groups, group);
-        self.samples_per_ray = samples as f64 / (groups * group) as f64;
+        self.tally.count(bundles, bundle);
+        self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
         let fault = self.fault(loss);
         if let Some(tensor) = fault {
             self.gradients.network.fill(0.0);
@@ -261,11 +261,11 @@ impl Trainer {
         } else {
             self.apply();
             self.average();
-            let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(group));
-            (first_group..).zip(colours).for_each(|(group, colours)| supervision.remember(group, colours));
+            let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
+            (first_bundle..).zip(colours).for_each(|(bundle, colours)| supervision.remember(bundle, colours));
         }
         self.tally.steps += 1;
-        Ok(Some(StepReport { loss, rays: groups * group, samples, skipped: fault.is_some() }))
+        Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped: fault.is_some() }))
     }
 
     /// What isn't finite, before anything has been changed by it.
@@ -339,7 +339,7 @@ impl Trainer {
     /// Looks at the density of cells where it is time to.
     fn update_occupancy(&mut self) {
         let (field, seed, at) = (&self.field, self.options.seed, self.tally.steps);
-        let cells = field.occupancy.looks(at);
+        let cells = field.occupancy.cells_to_update(at);
         let found = cells.par_chunks(1024).map_init(
             || (Chunk::default(), vec![0.0; 3 * 1024]),
             |(chunk, positions), cells| {
@@ -353,7 +353,7 @@ impl Trainer {
         );
         let found: Vec<f32> = found.flatten_iter().collect();
         let step = field.step();
-        self.field.occupancy.learn(&cells, &found, step);
+        self.field.occupancy.update(&cells, &found, step);
     }
 
     /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.
@@ -439,13 +439,13 @@ impl Shard {
         worker: &mut Worker,
         field: &Field,
         transposed: &[f32],
-        supervision: &impl Supervision,
+        supervision: &impl Supervisor,
         options: &TrainingOptions,
-        (first_group, first_ray): (u64, u64),
+        (first_bundle, first_ray): (u64, u64),
         range: std::ops::Range<usize>,
-        groups: usize,
+        bundles: usize,
     ) {
-        let group = supervision.rays_per_group();
+        let bundle = supervision.rays_per_bundle();
         self.colours.clear();
         self.features.positions.clear();
         self.features.levels.iter_mut().for_each(Vec::clear);
@@ -453,25 +453,25 @@ impl Shard {
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
         worker.lanes.resize(field.network.len() * LANES, 0.0);
-        let chunk_groups = (CHUNK_RAYS / group).max(1);
-        let scale = 1.0 / groups as f32;
-        let of_ray = |weight: f32| weight * scale / group as f32;
+        let chunk_bundles = (CHUNK_RAYS / bundle).max(1);
+        let scale = 1.0 / bundles as f32;
+        let of_ray = |weight: f32| weight * scale / bundle as f32;
         let regularisers = Regularisers { distortion: of_ray(options.distortion), haze: of_ray(options.haze) };
         let mut next = range.start;
         while next < range.end {
-            let here = next..(next + chunk_groups).min(range.end);
-            let rays = here.len() * group;
+            let here = next..(next + chunk_bundles).min(range.end);
+            let rays = here.len() * bundle;
             worker.rays.resize(rays, Ray::default());
             worker.colours.resize(rays, [0.0; 3]);
             worker.gradients.resize(rays, [0.0; 3]);
             for (k, g) in here.clone().enumerate() {
-                supervision.cast(first_group + g as u64, &mut worker.rays[k * group..(k + 1) * group]);
+                supervision.sample_rays(first_bundle + g as u64, &mut worker.rays[k * bundle..(k + 1) * bundle]);
             }
             worker.clipped.clear();
             worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
             worker.backgrounds.clear();
             worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-            let ray = first_ray + (here.start * group) as u64;
+            let ray = first_ray + (here.start * bundle) as u64;
             worker.offsets.clear();
             worker.offsets.extend((0..rays as u64).map(|r| options.offset(ray + r)));
             worker.chunk.forward(field, &worker.clipped, &worker.offsets);
@@ -480,9 +480,12 @@ impl Shard {
                 *colour = std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
             }
             for (k, g) in here.clone().enumerate() {
-                let part = k * group..(k + 1) * group;
-                self.loss +=
-                    supervision.judge(first_group + g as u64, &worker.colours[part.clone()], &mut worker.gradients[part]);
+                let part = k * bundle..(k + 1) * bundle;
+                self.loss += supervision.loss_and_gradient(
+                    first_bundle + g as u64,
+                    &worker.colours[part.clone()],
+                    &mut worker.gradients[part],
+                );
             }
             self.colours.extend_from_slice(&worker.colours);
             worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
@@ -505,7 +508,7 @@ impl Shard {
 mod tests {
     use super::*;
     use crate::field::Architecture;
-    use crate::random::Draws;
+    use counter_rng::CounterRng;
     use scene::Bounds;
 
     /// Rays through the cube, before black or white, that should all be white.
@@ -513,18 +516,18 @@ mod tests {
         background: f32,
     }
 
-    impl Supervision for White {
-        fn rays_per_group(&self) -> usize {
+    impl Supervisor for White {
+        fn rays_per_bundle(&self) -> usize {
             1
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
-            let mut draws = Draws::new(1, 2, group);
-            let [x, y] = [0, 1].map(|_| 1.6 * draws.uniform() - 0.8);
+        fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+            let mut rng = CounterRng::new(1, 2, bundle);
+            let [x, y] = [0, 1].map(|_| 1.6 * rng.uniform() - 0.8);
             rays[0] = Ray { origin: [x, y, 4.0], direction: [0.0, 0.0, -1.0], background: [self.background; 3] };
         }
 
-        fn judge(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             gradients[0] = colours[0].map(|c| 2.0 * (c - 1.0));
             colours[0].iter().map(|c| f64::from((c - 1.0) * (c - 1.0))).sum()
         }
@@ -555,7 +558,7 @@ mod tests {
             let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
             while trainer.step(&mut white).unwrap().is_some() {}
             let mut rays = [Ray::default(); 64];
-            (0..).zip(&mut rays).for_each(|(group, ray)| white.cast(group, std::slice::from_mut(ray)));
+            (0..).zip(&mut rays).for_each(|(bundle, ray)| white.sample_rays(bundle, std::slice::from_mut(ray)));
             let field = trainer.finish();
             let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
             (field, opacity)

@@ -1,14 +1,19 @@
-use crate::guide::Shown;
 use crate::refiner::INPUTS;
 use crate::sums::Sums;
 use crate::view::{KnownView, Rendered};
+use crate::warped_reference::WarpedReference;
 
 /// Pixels that a reference is moved at most.
 const FARTHEST: f64 = 2.0;
 
 /// What a reference shows of rows from one on, each pixel from where what lies around it fits what is rendered: one step of Lucas and Kanade (1981) from
 /// where geometry puts it, held back by the detail that rendering lacks, whose squares stand for how little a difference says of a place.
-pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView, first_row: usize) -> Vec<Shown> {
+pub(crate) fn align(
+    warped: &[WarpedReference],
+    rendered: &Rendered,
+    reference: &KnownView,
+    first_row: usize,
+) -> Vec<WarpedReference> {
     let view = &rendered.view;
     let width = view.width;
     let pixel = |x: usize, y: usize| &view.data[(y * width + x) * INPUTS..(y * width + x + 1) * INPUTS];
@@ -18,9 +23,9 @@ pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView,
         let per = |far: f32, near: f32, pixels: usize| f64::from(far - near) / pixels.max(1) as f64;
         (per(pixel(right, y)[c], pixel(left, y)[c], right - left), per(pixel(x, bottom)[c], pixel(x, top)[c], bottom - top))
     };
-    let terms = |(i, own): (usize, &Shown)| {
+    let terms = |(i, own): (usize, &WarpedReference)| {
         let mut terms = [0.0; 6];
-        for c in (0..3).filter(|_| own.trust > 0.0) {
+        for c in (0..3).filter(|_| own.confidence > 0.0) {
             let (x, y) = slope(i % width, first_row + i / width, c);
             let (apart, lacks) = (f64::from(own.difference[c]), f64::from(own.lacking[c]));
             let of_channel = [x * x, x * y, y * y, x * apart, y * apart, lacks * lacks];
@@ -28,9 +33,9 @@ pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView,
         }
         terms
     };
-    let sums = Sums::new(width, &shown.iter().enumerate().map(terms).collect::<Vec<_>>());
-    let moved = |(i, own): (usize, &Shown)| {
-        if own.trust <= 0.0 {
+    let sums = Sums::new(width, &warped.iter().enumerate().map(terms).collect::<Vec<_>>());
+    let moved = |(i, own): (usize, &WarpedReference)| {
+        if own.confidence <= 0.0 {
             return *own;
         }
         let (x, y) = (i % width, i / width);
@@ -44,19 +49,19 @@ pub(crate) fn align(shown: &[Shown], rendered: &Rendered, reference: &KnownView,
             return *own;
         }
         let share = (FARTHEST / length).min(1.0);
-        let across = step((x > 0).then(|| &shown[i - 1]), own, (x + 1 < width).then(|| &shown[i + 1]));
-        let down = step(i.checked_sub(width).map(|above| &shown[above]), own, shown.get(i + width));
+        let across = step((x > 0).then(|| &warped[i - 1]), own, (x + 1 < width).then(|| &warped[i + 1]));
+        let down = step(i.checked_sub(width).map(|above| &warped[above]), own, warped.get(i + width));
         let place = std::array::from_fn(|k| own.place[k] + (share * (dx * across[k] + dy * down[k])) as f32);
-        Shown::new(reference, place, own.sight, pixel(x, first_row + y))
+        WarpedReference::new(reference, place, own.visibility, pixel(x, first_row + y))
     };
-    shown.iter().enumerate().map(moved).collect()
+    warped.iter().enumerate().map(moved).collect()
 }
 
 /// How far what a reference shows moves in it from one pixel to the next: the shorter of the steps from the one before and to the one after, for the
 /// other may lead over an edge; 0 where neither is shown.
-fn step(before: Option<&Shown>, own: &Shown, after: Option<&Shown>) -> [f64; 2] {
-    let between = |from: &Shown, to: &Shown| {
-        let is_shown = from.trust > 0.0 && to.trust > 0.0;
+fn step(before: Option<&WarpedReference>, own: &WarpedReference, after: Option<&WarpedReference>) -> [f64; 2] {
+    let between = |from: &WarpedReference, to: &WarpedReference| {
+        let is_shown = from.confidence > 0.0 && to.confidence > 0.0;
         is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
     };
     let steps = [after.and_then(|after| between(own, after)), before.and_then(|before| between(before, own))];

@@ -4,12 +4,13 @@
 //! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR pictures that
 //! were shrunk once more renders views of LR size, whose truth the LR pictures are.
 //!
-//! Where true pictures of some views are known at HR, references, a guided network sees what they show of each pixel, too. The field's depth
-//! says where they show it, and whether they see it at all.
+//! Where true pictures of some views are known at HR, references, a reference-based network sees what they show of each pixel,
+//! too. The field's depth says where they show it, and whether they see it at all.
 //!
 //! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
-//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile; [`guided`]: what a guided one takes, [`Guidance`] says how.
-//! * [`OwnPhotographs`]: LR pictures that views are made to agree with.
+//! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
+//! * [`with_references`]: a view as a reference-based network takes it; [`Guidance`] says how references are looked at.
+//! * [`LrObservations`]: LR images that views are made consistent with (data consistency).
 //! * [`RefinerTrainer`], [`RefinerTraining`]: learning from examples, a [`Training`].
 //! * [`RefinerFile`]: what a folder with a refiner says of it.
 //!
@@ -20,29 +21,29 @@
 //!
 //! ```
 //! use pixels::Picture;
-//! use refinement::{Architecture, Refiner};
+//! use refinement::{Refiner, RefinerArchitecture};
 //! nets::deterministic();
-//! let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance: None }, 7)?;
+//! let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance: None }, 7)?;
 //! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
 //! # Ok::<(), refinement::RefinementError>(())
 //! ```
 
-mod agreement;
 mod align;
+mod consistency;
 mod folded;
-mod guide;
 mod refiner;
 mod sums;
 mod trainer;
 mod view;
+mod warped_reference;
 
-pub use agreement::OwnPhotographs;
-pub use guide::{Guidance, Guided, Use, guided};
-pub use refiner::{Architecture, Network, REFINER_FILE, Refiner, RefinerFile, WEIGHTS_FILE};
-pub use trainer::{RefinerTrainer, RefinerTraining, Scores, Training};
+pub use consistency::LrObservations;
+pub use refiner::{Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, WEIGHTS_FILE};
+pub use trainer::{RefinerScores, RefinerTrainer, RefinerTraining, Training};
 pub use view::{KnownView, Rendered};
+pub use warped_reference::{ConditionedView, Guidance, Use, with_references};
 
 /// A refiner that can't be read, written, used or trained.
 #[derive(Debug, thiserror::Error)]

@@ -1,7 +1,7 @@
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use pixels::Picture;
-use radiance::Draws;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -9,12 +9,12 @@ use tch::{TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn, samples};
-use crate::guide::Guidance;
+use crate::warped_reference::Guidance;
 
 /// Size of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Architecture {
+pub struct RefinerArchitecture {
     /// Features of the hidden layers.
     pub channels: u32,
     /// Residual blocks of two layers each.
@@ -23,10 +23,10 @@ pub struct Architecture {
     pub guidance: Option<Guidance>,
 }
 
-impl Architecture {
+impl RefinerArchitecture {
     /// Channels of what it takes.
     pub(crate) fn inputs(self) -> usize {
-        if self.guidance.is_some() { GUIDED_INPUTS } else { INPUTS }
+        if self.guidance.is_some() { REFERENCE_INPUTS } else { INPUTS }
     }
 }
 
@@ -35,7 +35,7 @@ impl Architecture {
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
 pub enum Network {
     /// Ours: [`Refiner`].
-    Compact(Architecture),
+    Compact(RefinerArchitecture),
     /// The paper's (crate `paper-refiner`).
     Paper {
         /// Features of its first layer; 128 are published.
@@ -74,7 +74,7 @@ pub struct RefinerFile {
 /// nothing: borders are gone on with before it, and what it predicts depends on nothing but what it sees.
 #[derive(Debug)]
 pub struct Refiner {
-    architecture: Architecture,
+    architecture: RefinerArchitecture,
     /// Kernel and bias of each layer.
     parameters: Vec<Tensor>,
 }
@@ -82,7 +82,7 @@ pub struct Refiner {
 /// Channels of a rendered view: colour and opacity.
 pub(crate) const INPUTS: usize = 4;
 /// The same with the difference to references, their confidence, and what their own views lack.
-pub(crate) const GUIDED_INPUTS: usize = 11;
+pub(crate) const REFERENCE_INPUTS: usize = 11;
 /// Channels of a picture.
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
@@ -94,15 +94,15 @@ const WEIGHTS: u64 = 300;
 
 impl Refiner {
     /// A network that hasn't learnt anything: it adds nothing.
-    pub fn new(architecture: Architecture, seed: u64) -> Result<Self, RefinementError> {
-        let mut draws = Draws::new(seed, WEIGHTS, 0);
+    pub fn new(architecture: RefinerArchitecture, seed: u64) -> Result<Self, RefinementError> {
+        let mut rng = CounterRng::new(seed, WEIGHTS, 0);
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
         for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
             // As PyTorch draws them: blocks that begin by adding little. The last layer, and with it the prediction, starts at 0.
             let reach = if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
             let kernel: Vec<f32> =
-                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(draws.uniform()) - 1.0)) as f32).collect();
+                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32).collect();
             parameters.push(Tensor::f_from_slice(&kernel)?.f_reshape(kernel_shape(*inputs, *outputs))?.set_requires_grad(true));
             parameters.push(Tensor::f_from_slice(&vec![0.0f32; *outputs])?.set_requires_grad(true));
         }
@@ -110,8 +110,8 @@ impl Refiner {
     }
 
     /// Reads weights that [`Refiner::write`] wrote.
-    pub fn read(path: &Path, architecture: Architecture) -> Result<Self, RefinementError> {
-        let Architecture { channels, blocks, .. } = architecture;
+    pub fn read(path: &Path, architecture: RefinerArchitecture) -> Result<Self, RefinementError> {
+        let RefinerArchitecture { channels, blocks, .. } = architecture;
         // Before anything is made of such numbers.
         if !(1..=MOST).contains(&channels) || blocks > MOST {
             return Err(RefinementError::Architecture { channels, blocks });
@@ -127,7 +127,7 @@ impl Refiner {
     }
 
     /// The network's size.
-    pub fn architecture(&self) -> Architecture {
+    pub fn architecture(&self) -> RefinerArchitecture {
         self.architecture
     }
 
@@ -167,7 +167,8 @@ impl Refiner {
         layer(&x, 1 + 2 * self.architecture.blocks as usize)
     }
 
-    /// The view (for a guided network [`guided`](crate::guided)) with `strength` times what the network adds: a picture of three channels in
+    /// The view with `strength` times what the network adds; a reference-based network takes it from
+    /// [`with_references`](crate::with_references). A picture of three channels in
     /// 0..1. The network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another way, and the mean of its answers is
     /// added (Timofte et al. 2016).
     pub fn refine_by(&self, view: &Picture, strength: f32, turns: u32) -> Result<Picture, RefinementError> {
@@ -236,7 +237,7 @@ impl Refiner {
 }
 
 /// Name, inputs and outputs of each layer.
-fn layers(architecture: Architecture) -> Vec<(String, usize, usize)> {
+fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
     let blocks = (0..architecture.blocks)
         .flat_map(|i| [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]);
@@ -250,7 +251,7 @@ fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
 }
 
 /// Names and shapes of the parameters.
-fn shapes(architecture: Architecture) -> Vec<(String, Vec<i64>)> {
+fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
     let both = |(name, inputs, outputs): (String, usize, usize)| {
         [(format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()), (format!("{name}.bias"), vec![outputs as i64])]
     };
@@ -262,16 +263,16 @@ mod tests {
     use super::*;
 
     fn picture(width: usize, height: usize) -> Picture {
-        let mut draws = Draws::new(1, 2, 3);
-        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| draws.uniform()).collect())
+        let mut rng = CounterRng::new(1, 2, 3);
+        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| rng.uniform()).collect())
     }
 
     /// A network whose every weight says something.
-    fn random(architecture: Architecture) -> Refiner {
+    fn random(architecture: RefinerArchitecture) -> Refiner {
         let mut refiner = Refiner::new(architecture, 5).unwrap();
-        let mut draws = Draws::new(5, 6, 7);
+        let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
-            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (draws.uniform() - 0.5)).collect();
+            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (rng.uniform() - 0.5)).collect();
             *parameter = Tensor::from_slice(&values).reshape(parameter.size());
         }
         refiner
@@ -281,7 +282,7 @@ mod tests {
     #[test]
     fn tiles_leave_no_seams() {
         nets::deterministic();
-        let architecture = Architecture { channels: 6, blocks: 2, guidance: None };
+        let architecture = RefinerArchitecture { channels: 6, blocks: 2, guidance: None };
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = picture(width, height);
@@ -308,7 +309,7 @@ mod tests {
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
-        let mut refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
+        let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
         let (dark, view) = (Picture::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), picture(16, 16));
         let added = |view: &Picture| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
@@ -320,7 +321,7 @@ mod tests {
     #[test]
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
-        let refiner = random(Architecture { channels: 6, blocks: 1, guidance: None });
+        let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let view = picture(150, 10);
         let mirrored = |p: &Picture| {
             let data =
@@ -340,18 +341,23 @@ mod tests {
     fn what_is_written_is_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
-        let architecture = Architecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
+        let architecture = RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();
         assert!(refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t));
-        for other in [Architecture { channels: 7, ..architecture }, Architecture { blocks: 2, ..architecture }] {
+        for other in [RefinerArchitecture { channels: 7, ..architecture }, RefinerArchitecture { blocks: 2, ..architecture }] {
             assert!(Refiner::read(&path, other).is_err());
         }
-        for other in [Architecture { channels: 0, ..architecture }, Architecture { blocks: u32::MAX, ..architecture }] {
+        for other in
+            [RefinerArchitecture { channels: 0, ..architecture }, RefinerArchitecture { blocks: u32::MAX, ..architecture }]
+        {
             assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
         }
-        assert!(matches!(again.refine(&picture(8, 8)), Err(RefinementError::Channels { channels: 4, expected: GUIDED_INPUTS })));
+        assert!(matches!(
+            again.refine(&picture(8, 8)),
+            Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })
+        ));
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

@@ -1,17 +1,17 @@
 use std::ops::Range;
 use std::path::Path;
 
+use counter_rng::CounterRng;
 use nets::Adam;
 use pixels::{Picture, psnr_of};
-use radiance::Draws;
 use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
-use crate::guide::{Guidance, Use, guided};
-use crate::refiner::{GUIDED_INPUTS, OUTPUTS, Refiner};
+use crate::refiner::{OUTPUTS, REFERENCE_INPUTS, Refiner};
 use crate::view::KnownView;
+use crate::warped_reference::{Guidance, Use, with_references};
 
 /// A training, step by step, that can be interrupted.
 pub trait Training {
@@ -37,7 +37,7 @@ pub struct RefinerTraining {
     pub batch: usize,
     /// Pixels along a square's side; an even number.
     pub square: usize,
-    /// References that a guided network gets for a view.
+    /// References that a reference-based network gets for a view.
     pub references: usize,
     /// Highest learning rate; it rises over the first steps and falls to nothing, as a cosine.
     pub rate: f64,
@@ -51,7 +51,7 @@ pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
     adam: Adam,
-    /// What a guided network is shown now.
+    /// What a reference-based network is shown now.
     pool: Option<Pool>,
 }
 
@@ -66,13 +66,13 @@ struct Pool {
 impl Pool {
     fn new(round: u64, options: &RefinerTraining, guidance: Guidance, examples: &[KnownView]) -> Self {
         let view = |i: u64| {
-            let mut draws = Draws::new(options.seed, POOLS, round * POOL + i);
-            let mut draw = || draws.below(examples.len() as u64) as usize;
+            let mut rng = CounterRng::new(options.seed, POOLS, round * POOL + i);
+            let mut draw = || rng.below(examples.len() as u64) as usize;
             let (chosen, drawn): (usize, Vec<usize>) = (draw(), (0..options.references).map(|_| draw()).collect());
-            let alone = draws.below(ALONE) == 0;
+            let alone = rng.below(ALONE) == 0;
             // A view is no reference for itself.
             let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
-            (chosen, guided(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
+            (chosen, with_references(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
         };
         Self { round, views: (0..POOL).map(view).collect() }
     }
@@ -85,7 +85,7 @@ const WARM_UP: u64 = 50;
 /// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach nothing.
 const CONTRAST: f32 = 0.08;
 const REDRAWS: usize = 8;
-/// A guided network gets no reference once in so many times, so that it can do without.
+/// A reference-based network gets no reference once in so many times, so that it can do without.
 const ALONE: u64 = 8;
 /// Views that squares are drawn from at a time where there are references, and steps until they are drawn anew.
 const POOL: u64 = 32;
@@ -97,15 +97,15 @@ const POOLS: u64 = 303;
 
 /// How well views are rendered and refined.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Scores {
+pub struct RefinerScores {
     /// Mean PSNR as rendered, in dB.
     pub rendered_psnr: f64,
     /// Mean PSNR refined, with the best strength, in dB.
     pub refined_psnr: f64,
     /// Share of the prediction that has the least squared error, from 0 to 1.
     pub strength: f64,
-    /// Share of what references saw that they were trusted with, where there were any.
-    pub trusted: Option<f64>,
+    /// Confidence in references, a share of their visibility, where there were any.
+    pub confidence: Option<f64>,
 }
 
 impl RefinerTrainer {
@@ -122,32 +122,32 @@ impl RefinerTrainer {
 
     /// Scores examples that training left out, with references drawn from those that it had, and finds the share of the prediction that
     /// serves them best.
-    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<Scores, RefinementError> {
+    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Picture {
             let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
-            let mut draws = Draws::new(self.options.seed, SCORES, i as u64);
-            let drawn = (0..self.options.references).map(|_| draws.below(references.len() as u64) as usize);
-            let guided = guided(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
-            guided.uses.iter().for_each(|of_use| uses.add(of_use));
-            guided.view
+            let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
+            let drawn = (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
+            let conditioned = with_references(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
+            conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
+            conditioned.view
         };
         let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
-        let trusted = (uses.seen > 0).then(|| uses.trusted());
-        let (mut rendered, mut agreement, mut power) = (0.0, 0.0, 0.0);
+        let confidence = (uses.seen > 0).then(|| uses.confidence_share());
+        let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
             let colours = view.data.chunks_exact(view.channels).flat_map(|p| &p[..OUTPUTS]);
             let mut error = 0.0;
             for ((r, v), t) in refined.data.iter().zip(colours).zip(&truth.data) {
                 let (added, lacks) = (f64::from(r - v), f64::from(t - v));
-                agreement += added * lacks;
+                inner_product += added * lacks;
                 power += added * added;
                 error += lacks * lacks;
             }
             rendered += psnr_of(error / truth.data.len() as f64);
         }
-        let strength = if power > 0.0 { (agreement / power).clamp(0.0, 1.0) } else { 0.0 };
+        let strength = if power > 0.0 { (inner_product / power).clamp(0.0, 1.0) } else { 0.0 };
         let mut refined = 0.0;
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let by = self.refiner.refine_by(view, strength as f32, 1)?;
@@ -155,7 +155,7 @@ impl RefinerTrainer {
             refined += psnr_of(error / truth.data.len() as f64);
         }
         let count = examples.len().max(1) as f64;
-        Ok(Scores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, trusted })
+        Ok(RefinerScores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, confidence })
     }
 }
 
@@ -225,7 +225,7 @@ fn shard(
     let around = Square { x: 0, y: 0, size }.grown(refiner.reach());
     let square = Square { x: 0, y: 0, size };
     for i in range {
-        let drawn = Drawn::new(options, step * options.batch as u64 + i as u64, subjects);
+        let drawn = TrainingSquare::new(options, step * options.batch as u64 + i as u64, subjects);
         drawn.append(refiner, &mut inputs, &mut lacks);
     }
     let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
@@ -244,7 +244,7 @@ struct Subject<'a> {
 }
 
 /// A square of a view, as it is shown to the network.
-struct Drawn<'a> {
+struct TrainingSquare<'a> {
     subject: Subject<'a>,
     square: Square,
     turn: Turn,
@@ -255,15 +255,15 @@ struct Drawn<'a> {
     offset: f32,
 }
 
-impl<'a> Drawn<'a> {
+impl<'a> TrainingSquare<'a> {
     /// The square with that number.
     fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
-        let mut draws = Draws::new(options.seed, SQUARES, number);
+        let mut rng = CounterRng::new(options.seed, SQUARES, number);
         let mut place = || {
-            let subject = subjects[draws.below(subjects.len() as u64) as usize];
+            let subject = subjects[rng.below(subjects.len() as u64) as usize];
             // On even pixels, as the folds of whole views lie.
             let mut start =
-                |size: usize| (draws.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
+                |size: usize| (rng.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
             let (x, y) = (start(subject.view.width), start(subject.view.height));
             (subject, Square { x, y, size: (options.square, options.square) })
         };
@@ -275,11 +275,11 @@ impl<'a> Drawn<'a> {
             placed = place();
         }
         let (subject, square) = placed;
-        let turn = Turn::ALL[draws.below(Turn::ALL.len() as u64) as usize];
+        let turn = Turn::ALL[rng.below(Turn::ALL.len() as u64) as usize];
         let mut order = [0, 1, 2];
-        (1..OUTPUTS).for_each(|i| order.swap(i, draws.below(i as u64 + 1) as usize));
-        let (contrast, shift) = (0.5 + 0.7 * draws.uniform(), 0.4 * (draws.uniform() - 0.5));
-        let sign = if draws.below(2) == 1 { -1.0 } else { 1.0 };
+        (1..OUTPUTS).for_each(|i| order.swap(i, rng.below(i as u64 + 1) as usize));
+        let (contrast, shift) = (0.5 + 0.7 * rng.uniform(), 0.4 * (rng.uniform() - 0.5));
+        let sign = if rng.below(2) == 1 { -1.0 } else { 1.0 };
         // Around the middle of all colours.
         let (gain, offset) = (sign * contrast, 0.5 + sign * (shift - 0.5 * contrast));
         Self { subject, square, turn, order, gain, offset }
@@ -294,11 +294,11 @@ impl<'a> Drawn<'a> {
             let pixel = around.of(view, x, y);
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
-            if view.channels == GUIDED_INPUTS {
-                let [.., r, g, b, trust, x, y, z] = pixel else { unreachable!("a guided view has that many channels") };
+            if view.channels == REFERENCE_INPUTS {
+                let [.., r, g, b, confidence, x, y, z] = pixel else { unreachable!("a conditioned view has that many channels") };
                 let (differences, lacking) = ([r, g, b], [x, y, z]);
                 inputs.extend(self.order.map(|c| self.gain * differences[c]));
-                inputs.push(*trust);
+                inputs.push(*confidence);
                 inputs.extend(self.order.map(|c| self.gain * lacking[c]));
             }
         });
@@ -325,7 +325,7 @@ mod tests {
     use scene::{Camera, Intrinsics};
 
     use super::*;
-    use crate::{Architecture, Rendered};
+    use crate::{RefinerArchitecture, Rendered};
 
     /// Stripes, and the same blurred by a pixel.
     fn example(phase: usize) -> KnownView {
@@ -358,7 +358,7 @@ mod tests {
     fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
         let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(Architecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
+        let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
@@ -379,9 +379,9 @@ mod tests {
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
-        let pixels = guided(&view.rendered, &[&other], Guidance::default()).view;
+        let pixels = with_references(&view.rendered, &[&other], Guidance::default()).view;
         let (mut seen, mut worst) = (0, 0.0f32);
-        for (i, pixel) in pixels.data.chunks_exact(GUIDED_INPUTS).enumerate() {
+        for (i, pixel) in pixels.data.chunks_exact(REFERENCE_INPUTS).enumerate() {
             let column = i % 32;
             if pixel[7] == 0.0 {
                 // The other camera stands three pixels to the left: it doesn't see the last three columns.
@@ -395,7 +395,11 @@ mod tests {
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
         assert!(
-            guided(&view.rendered, &[], Guidance::default()).view.data.chunks_exact(GUIDED_INPUTS).all(|p| p[4..] == [0.0; 7])
+            with_references(&view.rendered, &[], Guidance::default())
+                .view
+                .data
+                .chunks_exact(REFERENCE_INPUTS)
+                .all(|p| p[4..] == [0.0; 7])
         );
     }
 }

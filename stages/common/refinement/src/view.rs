@@ -104,7 +104,7 @@ impl KnownView {
 
 #[cfg(test)]
 mod tests {
-    use radiance::Draws;
+    use counter_rng::CounterRng;
     use scene::Intrinsics;
 
     use super::*;
@@ -125,14 +125,14 @@ mod tests {
             },
             camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
-        let mut draws = Draws::new(1, 2, 3);
+        let mut rng = CounterRng::new(1, 2, 3);
         let (mut view, mut truth) = (Vec::new(), Vec::new());
         for i in 0..width * height {
             let patch = (i % width / 12 + i / width / 12 * 8) as u64;
-            let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * radiance::uniform(5, c, patch));
+            let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * counter_rng::uniform(5, c, patch));
             view.extend(colour);
             view.push(1.0);
-            truth.extend(colour.map(|v| (gain * (v + 0.2 * (draws.uniform() - 0.5)) + offset).clamp(0.0, 1.0)));
+            truth.extend(colour.map(|v| (gain * (v + 0.2 * (rng.uniform() - 0.5)) + offset).clamp(0.0, 1.0)));
         }
         let count = width * height;
         let view = Picture::new(width, height, 4, view);

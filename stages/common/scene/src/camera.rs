@@ -55,14 +55,14 @@ pub struct Camera {
 
 /// A half-line with a direction of unit length.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Ray {
+pub struct CameraRay {
     /// Where it starts: the camera's centre.
     pub origin: DVec3,
     /// Unit length.
     pub direction: DVec3,
 }
 
-impl Ray {
+impl CameraRay {
     /// The point at distance `t`.
     pub fn at(&self, t: f64) -> DVec3 {
         self.origin + t * self.direction
@@ -154,11 +154,11 @@ impl Camera {
     }
 
     /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j + 0.5) is a pixel's centre.
-    pub fn ray(&self, x: f64, y: f64) -> Ray {
+    pub fn ray(&self, x: f64, y: f64) -> CameraRay {
         let k = &self.intrinsics;
         let [x, y] = k.undistort([x, y]);
         let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
-        Ray { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
+        CameraRay { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
     }
 
     /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and where the lens's distortion says nothing of
@@ -184,7 +184,7 @@ impl Camera {
     }
 
     /// Depth per distance along a ray of this camera: multiply a distance by it to get z-depth.
-    pub fn depth_per_distance(&self, ray: &Ray) -> f64 {
+    pub fn depth_per_distance(&self, ray: &CameraRay) -> f64 {
         ray.direction.dot(self.forward())
     }
 

@@ -30,8 +30,8 @@ mod space;
 mod views;
 mod warp;
 
-pub use camera::{Camera, CameraError, Intrinsics, Ray, common_direction};
+pub use camera::{Camera, CameraError, CameraRay, Intrinsics, common_direction};
 pub use lens::Distortion;
 pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
-pub use warp::{Sight, Surface};
+pub use warp::{Surface, Visibility};

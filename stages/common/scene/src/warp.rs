@@ -15,7 +15,7 @@ pub struct Surface<'a> {
 
 /// How one view sees a point of a surface that another sees, too.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sight {
+pub struct Visibility {
     /// Where in its picture, in pixels from the top left corner.
     pub place: [f32; 2],
     /// Cosine of the angle between both lines of sight.
@@ -31,14 +31,14 @@ const SAME: f64 = 0.02;
 const SAME_PLACE: f64 = 0.5;
 
 impl Surface<'_> {
-    /// Where another view sees what this one sees at each pixel, row by row: [`Surface::sight`]'s places.
+    /// Where another view sees what this one sees at each pixel, row by row: [`Surface::visibility`]'s places.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel.
     pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        (0..width * height).map(|i| self.sight(i % width, i / width, other).map(|s| s.place)).collect()
+        (0..width * height).map(|i| self.visibility(i % width, i / width, other).map(|s| s.place)).collect()
     }
 
     /// How another view sees what this one sees at a pixel. `None` where this view sees no surface, the other doesn't look, or something
@@ -46,22 +46,22 @@ impl Surface<'_> {
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
-    pub fn sight(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Sight> {
-        let (sight, point) = self.look(column, row, other.camera)?;
+    pub fn visibility(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Visibility> {
+        let (visibility, point) = self.look(column, row, other.camera)?;
         let place = [column as f64 + 0.5, row as f64 + 0.5];
-        other.shows(point, sight.place.map(f64::from), (self.camera, place)).then_some(sight)
+        other.shows(point, visibility.place.map(f64::from), (self.camera, place)).then_some(visibility)
     }
 
     /// The same, were nothing between: how a camera would see it through whatever stands there.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
-    pub fn sight_through(&self, column: usize, row: usize, other: &Camera) -> Option<Sight> {
-        self.look(column, row, other).map(|(sight, _)| sight)
+    pub fn visibility_through(&self, column: usize, row: usize, other: &Camera) -> Option<Visibility> {
+        self.look(column, row, other).map(|(visibility, _)| visibility)
     }
 
     /// How a camera would see what this view sees at a pixel, and which point that is.
-    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Sight, DVec3)> {
+    fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Visibility, DVec3)> {
         let i = row * self.camera.intrinsics.width as usize + column;
         if self.opacity[i] < 0.5 {
             return None;
@@ -74,12 +74,12 @@ impl Surface<'_> {
         // NaN lies nowhere.
         let is_inside = (0.0..=size[0]).contains(&x) && (0.0..=size[1]).contains(&y);
         let way = point - other.centre();
-        let sight = Sight {
+        let visibility = Visibility {
             place: [x as f32, y as f32],
             cosine: (ray.direction.dot(way) / way.length()) as f32,
             detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
         };
-        is_inside.then_some((sight, point))
+        is_inside.then_some((visibility, point))
     }
 
     /// Whether what this view sees at a position is a point that another sees at a place: by the depth of one of the four pixels around,
@@ -150,7 +150,7 @@ mod tests {
                 let at_plate = b.centre() + way * ((1.0 - b.centre().z) / way.z);
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
-                let through = from_a.sight_through(i % 64, i / 64, &b).map(|sight| sight.place);
+                let through = from_a.visibility_through(i % 64, i / 64, &b).map(|visibility| visibility.place);
                 assert!(through.is_some() == inside && (place.is_none() || place == through), "pixel {i} through what hides it");
                 match place {
                     Some([px, py]) => {

@@ -1,13 +1,14 @@
 //! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make goldens`).
 
-use radiance::{MlpArchitecture, uniform};
+use counter_rng::uniform;
+use radiance::MlpArchitecture;
 use safetensors::SafeTensors;
 use scene::Bounds;
 use tch::{Device, Kind, Tensor};
 
 use crate::encoding::encode;
 use crate::mlp::{Batch, Mlp, SampleDraws};
-use crate::network::Network;
+use crate::network::MlpNetwork;
 use crate::sampling::{importance, middles, stratified};
 use crate::{MlpTrainer, MlpTraining, Schedule};
 
@@ -37,9 +38,9 @@ fn close(name: &str, ours: &Tensor, tolerance: f64) {
 }
 
 /// A network with the script's weights.
-fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> Network {
+fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> MlpNetwork {
     let mut next = purpose;
-    let read = Network::read(architecture, |_, shape| {
+    let read = MlpNetwork::read(architecture, |_, shape| {
         let drawn = draw(next, shape);
         next += 1;
         Ok(if shape.len() == 2 { (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0) } else { 0.2 * drawn - 0.05 })
@@ -79,7 +80,7 @@ fn small() -> (Mlp, Batch, SampleDraws) {
     let _ = direction.narrow(1, 2, 1).fill_(-1.0);
     let noise = Some([draw(9, &[8, 8]) - 0.5, draw(10, &[8, 16]) - 0.5]);
     let draws = SampleDraws { coarse: draw(7, &[8, 8]), fine: draw(8, &[8, 8]), noise };
-    (field, Batch { origin, direction, background: draw(5, &[8, 3]), courses: None }, draws)
+    (field, Batch { origin, direction, background: draw(5, &[8, 3]), maps: None }, draws)
 }
 
 #[test]

@@ -3,8 +3,8 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
-use crate::course::{Courses, fused};
 use crate::mlp::host;
+use crate::ray_maps::{RayMaps, fused};
 
 /// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same description and the same numbers, that
 /// judges the hand-written one, and its way to CUDA.
@@ -13,7 +13,7 @@ pub struct TorchGrid {
     pub(crate) architecture: Architecture,
     pub(crate) bounds: Bounds,
     pub(crate) device: Device,
-    pub(crate) levels: Vec<Level>,
+    pub(crate) levels: Vec<TorchLevel>,
     /// Entries × 4, of all levels.
     pub(crate) table: Tensor,
     /// Five layers, each inputs × outputs.
@@ -24,7 +24,7 @@ pub struct TorchGrid {
 
 /// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Level {
+pub(crate) struct TorchLevel {
     /// Cells along each axis.
     resolution: [i64; 3],
     pub(crate) first: i64,
@@ -59,10 +59,10 @@ pub(crate) struct GridSeen {
     pub(crate) shaded_ray: Tensor,
     /// Samples where there may be something.
     pub(crate) samples: usize,
-    courses: Courses,
+    maps: RayMaps,
 }
 
-fn levels(architecture: &Architecture) -> Vec<Level> {
+fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
     let (coarsest, finest) = (f64::from(architecture.coarsest), f64::from(architecture.finest));
     let ratio = (finest / coarsest).powf(1.0 / f64::from(architecture.levels.max(2) - 1));
     let mut first = 0;
@@ -74,7 +74,7 @@ fn levels(architecture: &Architecture) -> Vec<Level> {
         // Dense levels end with whole cache lines.
         let entries = if hashed { 1 << architecture.log2_entries } else { (vertices + 15) / 16 * 16 };
         first += entries;
-        Level { resolution, first: first - entries, entries, hashed }
+        TorchLevel { resolution, first: first - entries, entries, hashed }
     };
     (0..architecture.levels).map(level).collect()
 }
@@ -131,12 +131,12 @@ impl TorchGrid {
             layers: layers.try_into().expect("five layers"),
             occupied: Tensor::new(),
         };
-        made.occupy(occupancy)?;
+        made.set_occupancy(occupancy)?;
         Ok(made)
     }
 
     /// Takes over where there may be something.
-    pub(crate) fn occupy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
+    pub(crate) fn set_occupancy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
         self.occupied = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?.f_ne(0)?;
         Ok(())
     }
@@ -211,18 +211,18 @@ impl TorchGrid {
     /// What rays see, with samples `offsets` (n) of a step along.
     pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
-        let courses = Courses::new(&self.bounds, rays, self.device, false)?;
-        let longest = courses.leave.f_sub(&courses.enter)?.f_max()?.f_double_value(&[])?;
+        let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
+        let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
         let count = ((longest / self.step()).ceil() as i64).max(1);
         let k = Tensor::f_arange(count, (Kind::Float, self.device))?.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let t = fused(&k, &k.f_full_like(self.step())?, &courses.enter)?;
-        let positions = courses.positions(&t)?;
+        let t = fused(&k, &k.f_full_like(self.step())?, &maps.enter)?;
+        let positions = maps.positions(&t)?;
         let cell =
             positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?.f_clamp(0.0, CELLS as f64 - 1.0)?;
         let cell = cell.f_to_kind(Kind::Int64)?;
         let [x, y, z] = [0, 1, 2].map(|i| cell.i((.., .., i)));
         let cell = z.f_mul_scalar(CELLS)?.f_add(&y)?.f_mul_scalar(CELLS)?.f_add(&x)?;
-        let inside = t.f_lt_tensor(&courses.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
+        let inside = t.f_lt_tensor(&maps.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = positions.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
 
@@ -248,7 +248,7 @@ impl TorchGrid {
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
         let at = kept.f_index_select(0, &shaded)?;
         let ray = at.f_div_scalar_mode(count, "floor")?;
-        let basis = harmonics(&courses.view)?.f_index_select(0, &ray)?;
+        let basis = harmonics(&maps.view)?.f_index_select(0, &ray)?;
         let input = Tensor::f_cat(&[&raw.f_index_select(0, &shaded)?.f_narrow(1, 1, RAW - 1)?, &basis], -1)?;
         let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let colour = hidden.f_matmul(&self.layers[4])?.f_sigmoid()?;
@@ -266,7 +266,7 @@ impl TorchGrid {
             shaded_weight: weight,
             shaded_ray: ray,
             samples: kept.numel(),
-            courses,
+            maps,
         })
     }
 
@@ -289,16 +289,16 @@ impl TorchGrid {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
         let seen = self.see(rays, &offsets)?;
         let weights = seen.weights.f_mul(&seen.counted)?;
-        let distances = seen.courses.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
+        let distances = seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
         let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
         let (weight, distance) = (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
         let half = seen.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
         let before = half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
         let last = seen.t.size()[1] - 1;
         let is_half = host(&before.f_le(last)?)?;
-        let median = host(&seen.courses.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
+        let median = host(&seen.maps.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
         let (premultiplied, transmittance) = (host(&seen.premultiplied)?, host(&seen.transmittance)?);
-        let (hits, leave) = (host(&seen.courses.hits()?)?, host(&seen.courses.distances(&seen.courses.leave)?)?);
+        let (hits, leave) = (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
         let pixel = |(i, ray): (usize, &Ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
             let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };
@@ -322,14 +322,15 @@ impl RayField for TorchGrid {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{Draws, Passes};
+    use counter_rng::CounterRng;
+    use radiance::Passes;
 
     use super::*;
 
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
         let ray = |i| {
-            let mut draws = Draws::new(3, 1, i);
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
+            let mut rng = CounterRng::new(3, 1, i);
+            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             let (from, to) = (around(1.0), around(reach));
             let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
             let origin = from.map(|x| 4.0 * x / length(from));

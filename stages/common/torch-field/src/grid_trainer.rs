@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervision, Tally, TrainingOptions};
+use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -30,7 +30,7 @@ const EPSILON: f64 = 1e-15;
 const LOOKS: usize = 1 << 18;
 
 /// What a piece of a step leaves.
-struct Piece {
+struct GridPiece {
     gradients: Vec<Tensor>,
     colours: Vec<[f32; 3]>,
     loss: f64,
@@ -58,7 +58,7 @@ impl GridTrainer {
     /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
     pub fn limit_to_hull(&mut self, hull: &[u8]) -> Result<(), TorchFieldError> {
         self.occupancy.limit_to_hull(&self.grid.bounds, hull);
-        Ok(self.grid.occupy(&self.occupancy)?)
+        Ok(self.grid.set_occupancy(&self.occupancy)?)
     }
 
     /// Steps taken.
@@ -85,18 +85,18 @@ impl GridTrainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
-        supervision.begin(self.tally.done(self.options.rays));
-        let group = supervision.rays_per_group();
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TorchFieldError> {
+        supervision.set_progress(self.tally.done(self.options.rays));
+        let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
-        let Some(groups) = self.tally.groups_of_step(self.options.rays, wanted, group) else { return Ok(None) };
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else { return Ok(None) };
         self.look()?;
-        let step = Step::new(&self.tally, groups, group);
+        let step = Step::new(&self.tally, bundles, bundle);
         let pieces = step.in_pieces(|range| self.run(&*supervision, step, range))?;
-        let rays = groups * group;
+        let rays = bundles * bundle;
         let samples = pieces.iter().map(|p| p.samples).sum::<usize>();
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
-        self.tally.cast(groups, group);
+        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
+        self.tally.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / rays as f64;
         let (colours, gradients): (Vec<_>, Vec<_>) = pieces.into_iter().map(|p| (p.colours, p.gradients)).unzip();
         let mut gradients = gradients.into_iter();
@@ -120,23 +120,23 @@ impl GridTrainer {
         Ok(Some(StepReport { loss, rays, samples, skipped }))
     }
 
-    /// Some groups forward and back.
-    fn run(&self, supervision: &impl Supervision, step: Step, range: Range<usize>) -> Result<Piece, TchError> {
-        let rays = step.cast(supervision, &range);
+    /// Some bundles forward and back.
+    fn run(&self, supervision: &impl Supervisor, step: Step, range: Range<usize>) -> Result<GridPiece, TchError> {
+        let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let seen = self.grid.see(&rays, &Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?)?;
         let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
         let backgrounds = Tensor::f_from_slice(&backgrounds)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
         let colour = seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
-        let judged = step.judge(supervision, &range, &colour)?;
+        let judged = step.loss_and_gradient(supervision, &range, &colour)?;
         let mut towards = judged.towards;
         if self.options.distortion > 0.0 {
-            let share = f64::from(self.options.distortion) / (step.groups * step.group) as f64;
+            let share = f64::from(self.options.distortion) / (step.bundles * step.bundle) as f64;
             towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
         }
         if self.options.haze > 0.0 {
-            let share = f64::from(self.options.haze) / (step.groups * step.group) as f64;
+            let share = f64::from(self.options.haze) / (step.bundles * step.bundle) as f64;
             towards = towards.f_add(&haze(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
         }
         let gradients = if towards.requires_grad() {
@@ -145,7 +145,7 @@ impl GridTrainer {
             // No sample was met: nothing is learnt.
             self.first.iter().map(Tensor::f_zeros_like).collect::<Result<_, _>>()?
         };
-        Ok(Piece { gradients, colours: judged.colours, loss: judged.loss, samples: seen.samples })
+        Ok(GridPiece { gradients, colours: judged.colours, loss: judged.loss, samples: seen.samples })
     }
 
     /// Moves the parameters, and late in the training their average.
@@ -184,7 +184,7 @@ impl GridTrainer {
     /// Looks at the density of cells where it is time to.
     fn look(&mut self) -> Result<(), TchError> {
         let (seed, at) = (self.options.seed, self.tally.steps);
-        let cells = self.occupancy.looks(at);
+        let cells = self.occupancy.cells_to_update(at);
         if cells.is_empty() {
             return Ok(());
         }
@@ -194,8 +194,8 @@ impl GridTrainer {
             let positions = Tensor::f_from_slice(&positions)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
             found.extend(host(&self.grid.densities(&positions)?)?);
         }
-        self.occupancy.learn(&cells, &found, self.grid.step() as f32);
-        self.grid.occupy(&self.occupancy)
+        self.occupancy.update(&cells, &found, self.grid.step() as f32);
+        self.grid.set_occupancy(&self.occupancy)
     }
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
@@ -239,7 +239,7 @@ impl GridTrainer {
         let occupied = Vec::<u8>::try_from(weights.bytes(OCCUPIED, cells)?)?;
         no_grad(|| now.iter().zip(&parameters).try_for_each(|(to, from)| to.shallow_clone().f_copy_(from).map(drop)))?;
         self.occupancy.restore(density, &occupied);
-        self.grid.occupy(&self.occupancy)?;
+        self.grid.set_occupancy(&self.occupancy)?;
         (self.first, self.second, self.average) = (first, second, average);
         (self.tally, self.samples_per_ray) = (Tally::from_counters(tally), f64::from_bits(samples_per_ray));
         Ok(())
@@ -302,26 +302,27 @@ fn haze(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
 
 #[cfg(test)]
 mod tests {
-    use radiance::{Architecture, Draws, Ray, Trainer};
+    use counter_rng::CounterRng;
+    use radiance::{Architecture, Ray, Trainer};
     use scene::{Bounds, Frustum, Space};
 
     use super::*;
 
-    /// Groups of four rays through the middle, of which each should have a colour of its own: in the mean.
+    /// Bundles of four rays through the middle, of which each should have a colour of its own: in the mean.
     struct Painted {
         seen: Vec<f32>,
     }
 
-    impl Supervision for Painted {
-        fn rays_per_group(&self) -> usize {
+    impl Supervisor for Painted {
+        fn rays_per_bundle(&self) -> usize {
             4
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
-            let mut draws = Draws::new(1, 2, group);
+        fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+            let mut rng = CounterRng::new(1, 2, bundle);
             // White, or like the fog before it.
-            let background = [[1.0; 3], [0.5; 3]][group as usize % 2];
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * draws.uniform() - 1.0));
+            let background = [[1.0; 3], [0.5; 3]][bundle as usize % 2];
+            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             for ray in rays {
                 let (from, to) = (around(0.3), around(0.7));
                 let origin = [from[0], from[1], from[2] + 4.0];
@@ -331,12 +332,12 @@ mod tests {
             }
         }
 
-        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
             let share = 1.0 / colours.len() as f32;
             let mut loss = 0.0;
             for c in 0..3 {
                 let mean = colours.iter().map(|x| x[c]).sum::<f32>() * share;
-                let off = mean - [0.2, 0.5, 0.8][(group as usize + c) % 3];
+                let off = mean - [0.2, 0.5, 0.8][(bundle as usize + c) % 3];
                 loss += f64::from(off * off);
                 gradients.iter_mut().for_each(|g| g[c] = 2.0 * off * share);
             }
@@ -426,7 +427,7 @@ mod tests {
                 let rays: Vec<Ray> = (0..50)
                     .flat_map(|g| {
                         let mut rays = [Ray::default(); 4];
-                        mine.cast(g, &mut rays);
+                        mine.sample_rays(g, &mut rays);
                         rays
                     })
                     .collect();

@@ -2,7 +2,7 @@
 //!
 //! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020): positional encoding, a coarse and a fine
 //!   network of eight layers, stratified and importance sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
-//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervision`] as the fast field's.
+//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervisor`] as the fast field's.
 //!
 //! * [`TorchGrid`], [`GridTrainer`]: the fast field of `radiance` and its training, on the same numbers: their judge, and their way to CUDA.
 //!
@@ -21,7 +21,6 @@
 //! ```
 
 mod composite;
-mod course;
 mod encoding;
 #[cfg(test)]
 mod goldens;
@@ -30,6 +29,7 @@ mod grid_trainer;
 mod mlp;
 mod mlp_trainer;
 mod network;
+mod ray_maps;
 mod sampling;
 mod schedule;
 mod step;

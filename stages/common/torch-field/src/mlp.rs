@@ -1,15 +1,16 @@
 use std::path::Path;
 
-use radiance::{Draws, MlpArchitecture, Pixel, Ray, RayField};
+use counter_rng::CounterRng;
+use radiance::{MlpArchitecture, Pixel, Ray, RayField};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
 use crate::composite::{Composite, composite};
-use crate::course::Courses;
 use crate::encoding::encode;
-use crate::network::{Network, normal};
+use crate::network::{MlpNetwork, normal};
+use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};
 
 /// The paper's field: a coarse network that says where to look and a fine one that is looked at. In a box, positions are scene units, as
@@ -19,8 +20,8 @@ use crate::sampling::{importance, middles, stratified};
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
     pub(crate) bounds: Bounds,
-    pub(crate) coarse: Network,
-    pub(crate) fine: Network,
+    pub(crate) coarse: MlpNetwork,
+    pub(crate) fine: MlpNetwork,
     pub(crate) device: Device,
 }
 
@@ -42,7 +43,7 @@ pub(crate) struct Batch {
     pub(crate) direction: Tensor,
     pub(crate) background: Tensor,
     /// How they run where the field's space isn't a box.
-    pub(crate) courses: Option<Courses>,
+    pub(crate) maps: Option<RayMaps>,
 }
 
 /// What both networks see, and where the fine one looked: distances in scene units.
@@ -62,22 +63,26 @@ impl SampleDraws {
     /// Those of the rays `first..first + n` of a training.
     pub(crate) fn new(field: &Mlp, seed: u64, first: u64, n: usize, noise: f64) -> Result<Self, TchError> {
         let (coarse, fine) = (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
-        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut Draws) -> f32| {
+        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut CounterRng) -> f32| {
             let row = |ray: u64| {
-                let mut draws = Draws::new(seed, purpose, ray);
-                (0..width).map(|_| draw(&mut draws)).collect::<Vec<_>>()
+                let mut rng = CounterRng::new(seed, purpose, ray);
+                (0..width).map(|_| draw(&mut rng)).collect::<Vec<_>>()
             };
             let values: Vec<f32> = (first..first + n as u64).flat_map(row).collect();
             Tensor::f_from_slice(&values)?.f_reshape([n as i64, width as i64])?.f_to_device(field.device)
         };
-        let scaled = |draws: &mut Draws| (noise * normal(draws)) as f32;
+        let scaled = |rng: &mut CounterRng| (noise * normal(rng)) as f32;
         let noise = if noise > 0.0 {
             let all = rows(NOISE, 2 * coarse + fine, &scaled)?;
             Some([all.f_narrow(1, 0, coarse as i64)?, all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?])
         } else {
             None
         };
-        Ok(Self { coarse: rows(STRATIFIED, coarse, &Draws::uniform)?, fine: rows(IMPORTANCE, fine, &Draws::uniform)?, noise })
+        Ok(Self {
+            coarse: rows(STRATIFIED, coarse, &CounterRng::uniform)?,
+            fine: rows(IMPORTANCE, fine, &CounterRng::uniform)?,
+            noise,
+        })
     }
 }
 
@@ -93,7 +98,7 @@ impl Batch {
             origin: rows(&|r| r.origin)?,
             direction: rows(&|r| r.direction)?,
             background: rows(&|r| r.background)?,
-            courses: (bounds.space != Space::Box).then(|| Courses::new(&bounds, rays, device, ndc_directions)).transpose()?,
+            maps: (bounds.space != Space::Box).then(|| RayMaps::new(&bounds, rays, device, ndc_directions)).transpose()?,
         })
     }
 }
@@ -101,7 +106,7 @@ impl Batch {
 impl Mlp {
     /// A field before training, drawn from a seed.
     pub fn new(architecture: MlpArchitecture, bounds: Bounds, seed: u64, device: Device) -> Result<Self, TorchFieldError> {
-        let network = |index| Network::new(architecture, seed, index, device);
+        let network = |index| MlpNetwork::new(architecture, seed, index, device);
         Ok(Self { architecture, bounds, coarse: network(0)?, fine: network(1)?, device })
     }
 
@@ -109,10 +114,10 @@ impl Mlp {
     pub fn read(path: &Path, architecture: MlpArchitecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
         architecture.check().map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
         let weights = nets::Weights::read(path)?;
-        let network = |prefix: &str| -> Result<Network, TorchFieldError> {
-            let read = Network::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
+        let network = |prefix: &str| -> Result<MlpNetwork, TorchFieldError> {
+            let read = MlpNetwork::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
             let finite = |t: &Tensor| -> Result<bool, TchError> { Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0) };
-            for (parameter, (name, _)) in read.parameters.iter().zip(Network::names(&architecture)) {
+            for (parameter, (name, _)) in read.parameters.iter().zip(MlpNetwork::names(&architecture)) {
                 if !finite(parameter)? {
                     let reason = format!("tensor {prefix}.{name} is not finite");
                     return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
@@ -131,8 +136,8 @@ impl Mlp {
 
     /// All parameters by name.
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        let names = || Network::names(&self.architecture).map(|(name, _)| name);
-        let named = |prefix: &'static str, network: &Network| {
+        let names = || MlpNetwork::names(&self.architecture).map(|(name, _)| name);
+        let named = |prefix: &'static str, network: &MlpNetwork| {
             names().zip(network.share().parameters).map(move |(name, t)| (format!("{prefix}.{name}"), t)).collect::<Vec<_>>()
         };
         named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
@@ -168,9 +173,9 @@ impl Mlp {
     pub(crate) fn see(&self, batch: &Batch, draws: Option<&SampleDraws>) -> Result<Seen, TchError> {
         let n = batch.origin.size()[0];
         let like = |value: f64| Tensor::f_full([n, 1], value, (batch.origin.kind(), self.device));
-        let (near, far) = match &batch.courses {
+        let (near, far) = match &batch.maps {
             None => (like(self.bounds.near)?, like(self.bounds.far)?),
-            Some(courses) => (courses.enter.shallow_clone(), courses.leave.shallow_clone()),
+            Some(maps) => (maps.enter.shallow_clone(), maps.leave.shallow_clone()),
         };
         let count = i64::from(self.architecture.coarse_samples);
         let direction = encode(&batch.direction, self.architecture.direction_octaves)?;
@@ -189,9 +194,9 @@ impl Mlp {
         let finer = importance(&middles(&t)?, &inner, &shares)?;
         let t = Tensor::f_cat(&[&t, &finer], 1)?.f_sort(1, false)?.0;
         let fine = self.look(&self.fine, batch, &direction, &t, noise(1))?;
-        let distances = match &batch.courses {
+        let distances = match &batch.maps {
             None => t,
-            Some(courses) => courses.distances(&t)?,
+            Some(maps) => maps.distances(&t)?,
         };
         Ok(Seen { coarse, fine, distances })
     }
@@ -199,16 +204,16 @@ impl Mlp {
     /// What one network sees at t.
     fn look(
         &self,
-        network: &Network,
+        network: &MlpNetwork,
         batch: &Batch,
         direction: &Tensor,
         t: &Tensor,
         noise: Option<&Tensor>,
     ) -> Result<Composite, TchError> {
         let (n, m) = (t.size()[0], t.size()[1]);
-        let positions = match &batch.courses {
+        let positions = match &batch.maps {
             None => t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?.f_add(&batch.origin.f_unsqueeze(1)?)?,
-            Some(courses) => courses.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
+            Some(maps) => maps.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
         };
         let positions = positions.f_reshape([n * m, 3])?;
         let code = encode(&positions, self.architecture.position_octaves)?;
@@ -249,7 +254,7 @@ impl Mlp {
         let tame: Vec<Ray> =
             rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
         let batch = Batch::new(&tame, self)?;
-        let hits = batch.courses.as_ref().map(|c| host(&c.hits()?)).transpose()?;
+        let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
         let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
             let seen = self.see(&batch, None)?;
@@ -316,8 +321,8 @@ mod tests {
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
             let seen = no_grad(|| field.see(&Batch::new(&rays, &field).unwrap(), None)).unwrap();
             for (i, distances) in host(&seen.distances).unwrap().chunks_exact(24).enumerate() {
-                let course = clip(&bounds, &rays[i]);
-                let ends = [course.distance(course.enter), course.distance(course.leave)];
+                let ray = clip(&bounds, &rays[i]);
+                let ends = [ray.distance(ray.enter), ray.distance(ray.leave)];
                 let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
                 assert!(close(distances[0], ends[0]) && close(distances[23], ends[1]), "{distances:?} {ends:?}");
                 assert!(distances.is_sorted() && distances[12] < 0.5 * (ends[0] + ends[1]), "{distances:?}");

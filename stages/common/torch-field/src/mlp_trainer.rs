@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use nets::Adam;
-use radiance::{StepReport, Supervision, Tally};
+use radiance::{StepReport, Supervisor, Tally};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
@@ -59,14 +59,14 @@ const WALL: f64 = 0.9;
 
 /// What a network makes of a step's rays, all together.
 #[derive(Clone, Copy, Default)]
-struct Stopped {
+struct StoppedLight {
     /// Light that is stopped.
     all: f64,
     /// Light that the first sample stops.
     first: f64,
 }
 
-impl Stopped {
+impl StoppedLight {
     fn by(weights: &Tensor) -> Result<Self, TchError> {
         let sum = |of: &Tensor| of.f_sum(Kind::Double)?.f_double_value(&[]);
         Ok(Self { all: sum(weights)?, first: sum(&weights.f_narrow(1, 0, 1)?)? })
@@ -87,12 +87,12 @@ impl Stopped {
 }
 
 /// What a piece of a step leaves.
-struct Piece {
+struct MlpPiece {
     gradients: Vec<Tensor>,
     colours: Vec<[f32; 3]>,
     loss: f64,
     /// By the coarse and the fine network.
-    stopped: [Stopped; 2],
+    stopped: [StoppedLight; 2],
 }
 
 impl MlpTrainer {
@@ -118,17 +118,17 @@ impl MlpTrainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervision) -> Result<Option<StepReport>, TorchFieldError> {
+    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TorchFieldError> {
         let done = self.tally.done(self.options.rays);
-        supervision.begin(done);
-        let group = supervision.rays_per_group();
-        let Some(groups) = self.tally.groups_of_step(self.options.rays, self.options.batch, group) else { return Ok(None) };
-        let step = Step::new(&self.tally, groups, group);
+        supervision.set_progress(done);
+        let bundle = supervision.rays_per_bundle();
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, self.options.batch, bundle) else { return Ok(None) };
+        let step = Step::new(&self.tally, bundles, bundle);
         let pieces = self.pieces(&*supervision, step)?;
-        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / groups as f64;
-        let rays = groups * group;
-        let stopped = [0, 1].map(|i| pieces.iter().map(|p| p.stopped[i]).fold(Stopped::default(), Stopped::add));
-        self.tally.cast(groups, group);
+        let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
+        let rays = bundles * bundle;
+        let stopped = [0, 1].map(|i| pieces.iter().map(|p| p.stopped[i]).fold(StoppedLight::default(), StoppedLight::add));
+        self.tally.count(bundles, bundle);
         let mut gradients = Vec::new();
         let mut colours = Vec::with_capacity(pieces.len());
         for piece in pieces {
@@ -159,15 +159,15 @@ impl MlpTrainer {
     }
 
     /// Forward and backward: on the CPU in shards, in parallel; on a GPU in as few pieces as its memory allows.
-    fn pieces(&self, supervision: &impl Supervision, step: Step) -> Result<Vec<Piece>, TorchFieldError> {
-        let plan = Plan { step, seed: self.options.seed, noise: self.options.noise };
+    fn pieces(&self, supervision: &impl Supervisor, step: Step) -> Result<Vec<MlpPiece>, TorchFieldError> {
+        let plan = StepContext { step, seed: self.options.seed, noise: self.options.noise };
         if self.field.device != Device::Cpu {
             return step.in_pieces(|range| plan.run(&self.field, supervision, range));
         }
-        let (groups, count) = (step.groups, shards(step.groups * step.group));
+        let (bundles, count) = (step.bundles, shards(step.bundles * step.bundle));
         let shards: Vec<(Mlp, std::ops::Range<usize>)> =
-            (0..count).map(|i| (self.field.share(), groups * i / count..groups * (i + 1) / count)).collect();
-        let pieces: Result<Vec<Option<Piece>>, TchError> =
+            (0..count).map(|i| (self.field.share(), bundles * i / count..bundles * (i + 1) / count)).collect();
+        let pieces: Result<Vec<Option<MlpPiece>>, TchError> =
             shards.into_par_iter().map(|(field, range)| plan.run_all(&field, supervision, range)).collect();
         Ok(pieces?.into_iter().flatten().collect())
     }
@@ -180,8 +180,8 @@ impl MlpTrainer {
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let [steps, groups, rays, scale, fault] = self.tally.counters();
-        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, groups, rays, scale, fault, self.stuck_steps])?)
+        let [steps, bundles, rays, scale, fault] = self.tally.counters();
+        Ok(self.adam.write_checkpoint(path, self.field.named(), &[steps, bundles, rays, scale, fault, self.stuck_steps])?)
     }
 
     /// The step a checkpoint was written at.
@@ -200,23 +200,23 @@ impl MlpTrainer {
 
 /// What a piece of a step needs to know of the whole.
 #[derive(Clone, Copy)]
-struct Plan {
+struct StepContext {
     step: Step,
     seed: u64,
     noise: f64,
 }
 
-impl Plan {
+impl StepContext {
     /// A shard in chunks, one after the other.
     fn run_all(
         self,
         field: &Mlp,
-        supervision: &impl Supervision,
+        supervision: &impl Supervisor,
         range: std::ops::Range<usize>,
-    ) -> Result<Option<Piece>, TchError> {
+    ) -> Result<Option<MlpPiece>, TchError> {
         let samples = (field.architecture.coarse_samples + field.architecture.fine_samples) as usize;
-        let chunk = (CHUNK_SAMPLES / (samples * self.step.group)).max(1);
-        let mut whole: Option<Piece> = None;
+        let chunk = (CHUNK_SAMPLES / (samples * self.step.bundle)).max(1);
+        let mut whole: Option<MlpPiece> = None;
         for start in range.clone().step_by(chunk) {
             let piece = self.run(field, supervision, start..(start + chunk).min(range.end))?;
             whole = Some(match whole {
@@ -235,17 +235,17 @@ impl Plan {
         Ok(whole)
     }
 
-    /// Some groups forward and back, at once.
-    fn run(self, field: &Mlp, supervision: &impl Supervision, range: std::ops::Range<usize>) -> Result<Piece, TchError> {
-        let rays = self.step.cast(supervision, &range);
+    /// Some bundles forward and back, at once.
+    fn run(self, field: &Mlp, supervision: &impl Supervisor, range: std::ops::Range<usize>) -> Result<MlpPiece, TchError> {
+        let rays = self.step.sample_rays(supervision, &range);
         let draws = SampleDraws::new(field, self.seed, self.step.first_ray(&range), rays.len(), self.noise)?;
         let seen = field.see(&Batch::new(&rays, field)?, Some(&draws))?;
-        let coarse = self.step.judge(supervision, &range, &seen.coarse.colour)?;
-        let fine = self.step.judge(supervision, &range, &seen.fine.colour)?;
+        let coarse = self.step.loss_and_gradient(supervision, &range, &seen.coarse.colour)?;
+        let fine = self.step.loss_and_gradient(supervision, &range, &seen.fine.colour)?;
         let parameters: Vec<Tensor> = field.parameters().collect();
         let gradients = Tensor::f_run_backward(&[coarse.towards.f_add(&fine.towards)?], &parameters, false, false)?;
-        let stopped = [Stopped::by(&seen.coarse.weights)?, Stopped::by(&seen.fine.weights)?];
-        Ok(Piece { gradients, colours: fine.colours, loss: coarse.loss + fine.loss, stopped })
+        let stopped = [StoppedLight::by(&seen.coarse.weights)?, StoppedLight::by(&seen.fine.weights)?];
+        Ok(MlpPiece { gradients, colours: fine.colours, loss: coarse.loss + fine.loss, stopped })
     }
 }
 
@@ -255,23 +255,23 @@ mod tests {
     use scene::Bounds;
 
     use super::*;
-    use crate::network::Network;
+    use crate::network::MlpNetwork;
 
     /// Rays side by side, every other of which should be dark.
     struct Stripes;
 
-    impl Supervision for Stripes {
-        fn rays_per_group(&self) -> usize {
+    impl Supervisor for Stripes {
+        fn rays_per_bundle(&self) -> usize {
             1
         }
 
-        fn cast(&self, group: u64, rays: &mut [Ray]) {
-            let across = 0.2 * (group % 4) as f32;
+        fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
+            let across = 0.2 * (bundle % 4) as f32;
             rays[0] = Ray { origin: [across, 0.0, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] };
         }
 
-        fn judge(&self, group: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
-            let off = colours[0].map(|x| x - (group % 2) as f32);
+        fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+            let off = colours[0].map(|x| x - (bundle % 2) as f32);
             gradients[0] = off.map(|x| 2.0 * x);
             off.iter().map(|&x| f64::from(x * x)).sum()
         }
@@ -292,9 +292,9 @@ mod tests {
             noise: 0.0,
             seed: 0,
         };
-        let raw_density = Network::layers(&architecture).iter().position(|(name, ..)| name == "sigma").unwrap();
+        let raw_density = MlpNetwork::layers(&architecture).iter().position(|(name, ..)| name == "sigma").unwrap();
         // A training of which one network's raw densities are shifted.
-        let train = |network: fn(&Mlp) -> &Network, shift: f64| {
+        let train = |network: fn(&Mlp) -> &MlpNetwork, shift: f64| {
             let field = Mlp::new(architecture, bounds, 1, Device::Cpu).unwrap();
             let _ = no_grad(|| network(&field).parameters[2 * raw_density + 1].shallow_clone().f_add_scalar_(shift)).unwrap();
             let mut trainer = MlpTrainer::new(field, options).unwrap();
@@ -309,7 +309,7 @@ mod tests {
         assert_eq!(train(|f| &f.fine, 0.5), None);
         for (network, shift, said) in [
             (
-                (|f| &f.coarse) as fn(&Mlp) -> &Network,
+                (|f| &f.coarse) as fn(&Mlp) -> &MlpNetwork,
                 -300.0,
                 "the coarse network has collapsed: it sees nothing but the background",
             ),

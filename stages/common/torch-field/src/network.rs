@@ -1,15 +1,16 @@
 use std::sync::LazyLock;
 
-use radiance::{Draws, MlpArchitecture};
+use counter_rng::CounterRng;
+use radiance::MlpArchitecture;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::TorchFieldError;
 use crate::encoding::encoded;
 
 /// One of the two networks: position → density and a feature, that and direction → colour. Parameters are weight and bias of
-/// each layer, in the order of [`Network::layers`].
+/// each layer, in the order of [`MlpNetwork::layers`].
 #[derive(Debug)]
-pub(crate) struct Network {
+pub(crate) struct MlpNetwork {
     architecture: MlpArchitecture,
     pub(crate) parameters: Vec<Tensor>,
 }
@@ -20,7 +21,7 @@ type Layer = (String, i64, i64);
 /// The encoded position joins in again at this layer, counted from 0.
 const SKIP: u32 = 4;
 
-impl Network {
+impl MlpNetwork {
     /// Layers from front to back.
     pub(crate) fn layers(architecture: &MlpArchitecture) -> Vec<Layer> {
         let width = i64::from(architecture.width);
@@ -53,11 +54,11 @@ impl Network {
 
     /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells the networks of a seed apart.
     pub(crate) fn new(architecture: MlpArchitecture, seed: u64, index: u64, device: Device) -> Result<Self, TchError> {
-        let mut draws = Draws::new(seed, WEIGHTS, index);
+        let mut rng = CounterRng::new(seed, WEIGHTS, index);
         let mut parameters = Vec::new();
         for (_, inputs, outputs) in Self::layers(&architecture) {
             let deviation = (2.0 / inputs as f64).sqrt();
-            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut draws)) as f32).collect();
+            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut rng)) as f32).collect();
             parameters.push(Tensor::f_from_slice(&values)?.f_reshape([outputs, inputs])?);
             parameters.push(Tensor::f_zeros([outputs], (Kind::Float, Device::Cpu))?);
         }
@@ -126,7 +127,7 @@ fn by_onednn(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchEr
 const WEIGHTS: u64 = 200;
 
 /// A standard normal draw (Box and Muller 1958).
-pub(crate) fn normal(draws: &mut Draws) -> f64 {
-    let radius = (-2.0 * (1.0 - f64::from(draws.uniform())).ln()).sqrt();
-    radius * (std::f64::consts::TAU * f64::from(draws.uniform())).cos()
+pub(crate) fn normal(rng: &mut CounterRng) -> f64 {
+    let radius = (-2.0 * (1.0 - f64::from(rng.uniform())).ln()).sqrt();
+    radius * (std::f64::consts::TAU * f64::from(rng.uniform())).cos()
 }

@@ -1,24 +1,24 @@
 use std::ops::Range;
 
-use radiance::{Ray, Supervision, Tally};
+use radiance::{Ray, Supervisor, Tally};
 use tch::{TchError, Tensor};
 
 use crate::TorchFieldError;
 use crate::mlp::host;
 
-/// A step of a training: so many groups of rays, counted on from what was cast before.
+/// A step of a training: so many bundles of rays, counted on from what was cast before.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Step {
-    first_group: u64,
+    first_bundle: u64,
     first_ray: u64,
-    pub(crate) groups: usize,
-    /// Rays in a group.
-    pub(crate) group: usize,
+    pub(crate) bundles: usize,
+    /// Rays in a bundle.
+    pub(crate) bundle: usize,
 }
 
 /// What a colour image adds to a step.
 pub(crate) struct Judged {
-    /// Sum over its groups.
+    /// Sum over its bundles.
     pub(crate) loss: f64,
     pub(crate) colours: Vec<[f32; 3]>,
     /// A number whose gradient is that of the step's mean loss.
@@ -26,50 +26,55 @@ pub(crate) struct Judged {
 }
 
 impl Step {
-    pub(crate) fn new(tally: &Tally, groups: usize, group: usize) -> Self {
-        Self { first_group: tally.groups, first_ray: tally.rays, groups, group }
+    pub(crate) fn new(tally: &Tally, bundles: usize, bundle: usize) -> Self {
+        Self { first_bundle: tally.bundles, first_ray: tally.rays, bundles, bundle }
     }
 
-    /// Number of the first ray of some of its groups, over the whole training.
+    /// Number of the first ray of some of its bundles, over the whole training.
     pub(crate) fn first_ray(self, range: &Range<usize>) -> u64 {
-        self.first_ray + (range.start * self.group) as u64
+        self.first_ray + (range.start * self.bundle) as u64
     }
 
-    /// The rays of some of its groups.
-    pub(crate) fn cast(self, supervision: &impl Supervision, range: &Range<usize>) -> Vec<Ray> {
-        let mut rays = vec![Ray::default(); range.len() * self.group];
-        for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.group)) {
-            supervision.cast(self.first_group + g as u64, rays);
+    /// The rays of some of its bundles.
+    pub(crate) fn sample_rays(self, supervision: &impl Supervisor, range: &Range<usize>) -> Vec<Ray> {
+        let mut rays = vec![Ray::default(); range.len() * self.bundle];
+        for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.bundle)) {
+            supervision.sample_rays(self.first_bundle + g as u64, rays);
         }
         rays
     }
 
     /// Judges their colours (n × 3).
-    pub(crate) fn judge(self, supervision: &impl Supervision, range: &Range<usize>, colour: &Tensor) -> Result<Judged, TchError> {
+    pub(crate) fn loss_and_gradient(
+        self,
+        supervision: &impl Supervisor,
+        range: &Range<usize>,
+        colour: &Tensor,
+    ) -> Result<Judged, TchError> {
         let colours = host(colour)?.as_chunks::<3>().0.to_vec();
         let mut gradients = vec![[0.0f32; 3]; colours.len()];
-        let pairs = colours.chunks_exact(self.group).zip(gradients.chunks_exact_mut(self.group));
-        let judge = |(g, (colours, gradients))| supervision.judge(self.first_group + g as u64, colours, gradients);
+        let pairs = colours.chunks_exact(self.bundle).zip(gradients.chunks_exact_mut(self.bundle));
+        let judge = |(g, (colours, gradients))| supervision.loss_and_gradient(self.first_bundle + g as u64, colours, gradients);
         let loss = range.clone().zip(pairs).map(judge).sum();
-        let scaled: Vec<f32> = gradients.as_flattened().iter().map(|g| g / self.groups as f32).collect();
+        let scaled: Vec<f32> = gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
         let gradients = Tensor::f_from_slice(&scaled)?.f_reshape([colours.len() as i64, 3])?.f_to_device(colour.device())?;
         Ok(Judged { loss, colours, towards: colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)? })
     }
 
     /// Lets supervision keep what was seen.
-    pub(crate) fn remember<'a>(self, supervision: &mut impl Supervision, colours: impl Iterator<Item = &'a [[f32; 3]]>) {
-        let groups = colours.flat_map(|c| c.chunks_exact(self.group));
-        (self.first_group..).zip(groups).for_each(|(group, colours)| supervision.remember(group, colours));
+    pub(crate) fn remember<'a>(self, supervision: &mut impl Supervisor, colours: impl Iterator<Item = &'a [[f32; 3]]>) {
+        let bundles = colours.flat_map(|c| c.chunks_exact(self.bundle));
+        (self.first_bundle..).zip(bundles).for_each(|(bundle, colours)| supervision.remember(bundle, colours));
     }
 
-    /// Goes through its groups in as few pieces as memory allows: where there isn't enough, the next ones are smaller.
+    /// Goes through its bundles in as few pieces as memory allows: where there isn't enough, the next ones are smaller.
     pub(crate) fn in_pieces<T>(
         self,
         mut run: impl FnMut(Range<usize>) -> Result<T, TchError>,
     ) -> Result<Vec<T>, TorchFieldError> {
-        let (mut pieces, mut next, mut size) = (Vec::new(), 0, self.groups);
-        while next < self.groups {
-            let range = next..(next + size).min(self.groups);
+        let (mut pieces, mut next, mut size) = (Vec::new(), 0, self.bundles);
+        while next < self.bundles {
+            let range = next..(next + size).min(self.bundles);
             match run(range.clone()) {
                 Ok(piece) => {
                     pieces.push(piece);
@@ -87,7 +92,7 @@ impl Step {
 mod tests {
     use super::*;
 
-    /// Memory that holds three groups at most: nothing is lost, nothing done twice.
+    /// Memory that holds three bundles at most: nothing is lost, nothing done twice.
     #[test]
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&Tally::default(), 17, 4);

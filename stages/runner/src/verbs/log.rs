@@ -56,7 +56,7 @@ fn attempt_log(store: &Store, key: &str) -> PathBuf {
 }
 
 /// A stage's run.
-struct Run {
+struct StageRun {
     /// When it ended, or last said something.
     unix: u64,
     label: String,
@@ -64,15 +64,18 @@ struct Run {
 }
 
 /// The last run of a stage, finished or not, whatever it was run with.
-fn last_of(store: &Store, stage: &str) -> Result<Option<Run>, StoreError> {
+fn last_of(store: &Store, stage: &str) -> Result<Option<StageRun>, StoreError> {
     let finished = store.records()?.into_iter().map(|record| {
         let unix = record.started_unix + record.seconds as u64;
-        (record.stage.clone(), Run { unix, label: label(&record.stage, &record.point), path: store.action(&record.key(), "log") })
+        (
+            record.stage.clone(),
+            StageRun { unix, label: label(&record.stage, &record.point), path: store.action(&record.key(), "log") },
+        )
     });
     let unfinished = store.partials()?.into_iter().filter_map(|key| {
         let (action, path) = (store.unfinished(&key)?, attempt_log(store, &key));
         let unix = std::fs::metadata(&path).ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()?.as_secs();
-        Some((action.stage.clone(), Run { unix, label: label(&action.stage, &action.point), path }))
+        Some((action.stage.clone(), StageRun { unix, label: label(&action.stage, &action.point), path }))
     });
     let of_stage = finished.chain(unfinished).filter(|(name, run)| name == stage && run.path.is_file());
     Ok(of_stage.map(|(_, run)| run).max_by_key(|run| run.unix))

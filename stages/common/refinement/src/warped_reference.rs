@@ -1,3 +1,5 @@
+//! Reference-based refinement: HR references brought over to a view by its depth, and the confidence in what they show there.
+
 use std::ops::Range;
 
 use pixels::Picture;
@@ -6,7 +8,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::align::align;
-use crate::refiner::{GUIDED_INPUTS, INPUTS};
+use crate::refiner::{INPUTS, REFERENCE_INPUTS};
 use crate::sums::{AROUND, Sums};
 use crate::view::{KnownView, Rendered};
 
@@ -27,17 +29,17 @@ impl Default for Guidance {
     }
 }
 
-/// What references know of some rows of a view: how the colour they show there differs from the rendered one; how far they can be trusted,
+/// What references know of some rows of a view: how the colour they show there differs from the rendered one; the confidence in them,
 /// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered); and what their own rendered views
 /// lack there, which is of use even where they show a surface a little aside, or in another light.
 #[derive(Debug)]
-struct Guide {
+struct ReferenceFeatures {
     known: Vec<[f32; KNOWN]>,
     uses: Vec<Use>,
 }
 
 /// Channels of what references know.
-const KNOWN: usize = GUIDED_INPUTS - INPUTS;
+const KNOWN: usize = REFERENCE_INPUTS - INPUTS;
 
 /// What of a view a reference was of use for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -45,41 +47,43 @@ pub struct Use {
     /// Pixels that it sees.
     pub seen: usize,
     /// Sum over them of how well it sees them, by angle and size.
-    pub sight: f64,
-    /// Sum over them of how far it is trusted: less where it looks otherwise than what is rendered.
-    pub trust: f64,
+    #[serde(rename = "sight")]
+    pub visibility: f64,
+    /// Sum over them of the confidence in it: less where it looks otherwise than what is rendered.
+    #[serde(rename = "confidence")]
+    pub confidence: f64,
 }
 
 impl Use {
-    /// Share of what it sees that it is trusted with.
-    pub fn trusted(&self) -> f64 {
-        if self.sight > 0.0 { self.trust / self.sight } else { 1.0 }
+    /// Confidence in what it sees, a share of its visibility.
+    pub fn confidence_share(&self) -> f64 {
+        if self.visibility > 0.0 { self.confidence / self.visibility } else { 1.0 }
     }
 
     /// Adds what another part makes of the same reference.
     pub fn add(&mut self, other: &Self) {
         self.seen += other.seen;
-        self.sight += other.sight;
-        self.trust += other.trust;
+        self.visibility += other.visibility;
+        self.confidence += other.confidence;
     }
 }
 
 /// A view with what references know of it.
 #[derive(Clone, Debug)]
-pub struct Guided {
-    /// As a guided refiner takes it: colour, opacity, difference to the references, their confidence, and what their own views lack.
+pub struct ConditionedView {
+    /// As a reference-based refiner takes it: colour, opacity, difference to the references, their confidence, and what their own views lack.
     pub view: Picture,
     /// What each reference was of use for.
     pub uses: Vec<Use>,
 }
 
-/// A mean difference that halves the trust, twice; and how far, in pixels, a reference may jump between neighbours before it does.
+/// A mean difference that halves the confidence, twice; and how far, in pixels, a reference may jump between neighbours before it does.
 const DIFFERENT: f32 = 0.1;
 const JUMP: f32 = 1.0;
 
 /// What one reference shows of a pixel.
 #[derive(Clone, Copy, Default)]
-pub(crate) struct Shown {
+pub(crate) struct WarpedReference {
     /// Difference to what is rendered.
     pub(crate) difference: [f32; 3],
     /// Difference to what is rendered for the reference.
@@ -87,42 +91,46 @@ pub(crate) struct Shown {
     /// Where in the reference, in pixels.
     pub(crate) place: [f32; 2],
     /// By angle and size; 0 where it shows nothing.
-    pub(crate) sight: f32,
+    pub(crate) visibility: f32,
     /// The same, less where it looks otherwise than what is rendered.
-    pub(crate) trust: f32,
+    pub(crate) confidence: f32,
 }
 
-impl Shown {
+impl WarpedReference {
     /// What a reference shows at a place of it, for a pixel as rendered.
-    pub(crate) fn new(reference: &KnownView, place: [f32; 2], sight: f32, pixel: &[f32]) -> Self {
+    pub(crate) fn new(reference: &KnownView, place: [f32; 2], visibility: f32, pixel: &[f32]) -> Self {
         let (colour, theirs) = (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
         let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
         // A picture with a hole in it shows nothing there.
         let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
-        if is_shown { Self { difference, lacking, place, sight, trust: sight } } else { Self::default() }
+        if is_shown { Self { difference, lacking, place, visibility, confidence: visibility } } else { Self::default() }
     }
 }
 
-impl Guide {
+impl ReferenceFeatures {
     /// What references know of rows.
     fn new(rendered: &Rendered, references: &[&KnownView], rows: Range<usize>, guidance: Guidance) -> Self {
         let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
         let mut uses = Vec::new();
         for reference in references {
-            let trusted = trusted(rendered, reference, &rows, guidance);
+            let warped = warp(rendered, reference, &rows, guidance);
             let mut of_use = Use::default();
-            for ((sum, lacks, weights, confidence), Shown { difference, lacking, sight, trust, .. }) in
-                sums.iter_mut().zip(trusted)
+            for ((sum, lacks, weights, best), WarpedReference { difference, lacking, visibility, confidence, .. }) in
+                sums.iter_mut().zip(warped)
             {
-                of_use.add(&Use { seen: usize::from(sight > 0.0), sight: f64::from(sight), trust: f64::from(trust) });
-                // The best counts most. What isn't trusted fades, as if it weren't seen.
-                let weight = trust.powi(4);
-                let agrees = trust / sight.max(f32::MIN_POSITIVE);
+                of_use.add(&Use {
+                    seen: usize::from(visibility > 0.0),
+                    visibility: f64::from(visibility),
+                    confidence: f64::from(confidence),
+                });
+                // The best counts most. What has no confidence fades, as if it weren't seen.
+                let weight = confidence.powi(4);
+                let agrees = confidence / visibility.max(f32::MIN_POSITIVE);
                 (0..3).for_each(|c| sum[c] += weight * agrees * difference[c]);
                 (0..3).for_each(|c| lacks[c] += weight * agrees * lacking[c]);
                 *weights += weight;
-                *confidence = confidence.max(trust);
+                *best = best.max(confidence);
             }
             uses.push(of_use);
         }
@@ -134,56 +142,56 @@ impl Guide {
     }
 }
 
-/// What a reference shows of rows, with less trust where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
+/// What a reference shows of rows, with less confidence where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
 /// highlight) or comes from here and there (noisy depth, an edge).
-fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidance: Guidance) -> Vec<Shown> {
+fn warp(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidance: Guidance) -> Vec<WarpedReference> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     // What is looked at around a pixel was itself moved by what lies around it.
     let around = if guidance.alignment { 2 * AROUND } else { AROUND };
-    let high = rows.start.saturating_sub(around)..(rows.end + around).min(height);
+    let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
     let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
     let show = |column: usize, row: usize| {
-        let sight = if guidance.occlusion {
-            surface.sight(column, row, &theirs)
+        let visibility = if guidance.occlusion {
+            surface.visibility(column, row, &theirs)
         } else {
-            surface.sight_through(column, row, theirs.camera)
+            surface.visibility_through(column, row, theirs.camera)
         };
-        let Some(sight) = sight else { return Shown::default() };
-        let well = sight.cosine.max(0.0) * sight.detail.min(1.0);
-        Shown::new(reference, sight.place, well, &rendered.view.data[(row * width + column) * INPUTS..])
+        let Some(visibility) = visibility else { return WarpedReference::default() };
+        let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
+        WarpedReference::new(reference, visibility.place, well, &rendered.view.data[(row * width + column) * INPUTS..])
     };
-    let mut shown: Vec<Shown> =
-        high.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
+    let mut warped: Vec<WarpedReference> =
+        near.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
     if guidance.alignment {
-        shown = align(&shown, rendered, reference, high.start);
+        warped = align(&warped, rendered, reference, near.start);
     }
-    let terms = |pixel: &Shown| {
+    let terms = |pixel: &WarpedReference| {
         let [r, g, b] = pixel.difference.map(f64::from);
-        if pixel.trust > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
+        if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
     };
-    let sums = Sums::new(width, &shown.iter().map(terms).collect::<Vec<_>>());
+    let sums = Sums::new(width, &warped.iter().map(terms).collect::<Vec<_>>());
     let mean = |x: usize, y: usize| {
         let [r, g, b, count] = sums.around(x, y);
         [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
     };
     let mut all = Vec::with_capacity(width * rows.len());
     for row in rows.clone() {
-        let y = row - high.start;
+        let y = row - near.start;
         for x in 0..width {
-            let mut own = shown[y * width + x];
-            if own.trust > 0.0 {
+            let mut own = warped[y * width + x];
+            if own.confidence > 0.0 {
                 let apart = mean(x, y) / DIFFERENT;
                 let neighbour = |dx: isize, dy: isize| {
                     let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
-                    let other = (x < width && y < high.len()).then(|| shown[y * width + x])?;
-                    (other.trust > 0.0).then_some(other.place)
+                    let other = (x < width && y < near.len()).then(|| warped[y * width + x])?;
+                    (other.confidence > 0.0).then_some(other.place)
                 };
-                let bend = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+                let jump = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
                     let (Some(a), Some(b)) = (a, b) else { return 0.0 };
                     (0..2).map(|i| (a[i] + b[i] - 2.0 * own.place[i]).powi(2)).sum::<f32>()
                 };
-                let bent = bend(neighbour(-1, 0), neighbour(1, 0)) + bend(neighbour(0, -1), neighbour(0, 1));
-                own.trust *= (1.0 + apart * apart).powi(-2) / (1.0 + bent / (JUMP * JUMP));
+                let jumped = jump(neighbour(-1, 0), neighbour(1, 0)) + jump(neighbour(0, -1), neighbour(0, 1));
+                own.confidence *= (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (JUMP * JUMP));
             }
             all.push(own);
         }
@@ -191,24 +199,24 @@ fn trusted(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guid
     all
 }
 
-/// A view with what references know of it, as a guided refiner takes it: with its [`crate::Architecture::guidance`].
-pub fn guided(rendered: &Rendered, references: &[&KnownView], guidance: Guidance) -> Guided {
+/// A view with what references know of it, as a reference-based refiner takes it: with its [`crate::Architecture::guidance`].
+pub fn with_references(rendered: &Rendered, references: &[&KnownView], guidance: Guidance) -> ConditionedView {
     let (width, height) = (rendered.view.width, rendered.view.height);
-    let mut data = vec![0.0; width * height * GUIDED_INPUTS];
+    let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
     let band = |(i, out): (usize, &mut [f32])| {
         let rows = i * BAND..(i * BAND + BAND).min(height);
-        let guide = Guide::new(rendered, references, rows.clone(), guidance);
-        let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&guide.known);
-        for (out, (pixel, known)) in out.chunks_exact_mut(GUIDED_INPUTS).zip(pixels) {
+        let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
+        let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&features.known);
+        for (out, (pixel, known)) in out.chunks_exact_mut(REFERENCE_INPUTS).zip(pixels) {
             out[..INPUTS].copy_from_slice(pixel);
             out[INPUTS..].copy_from_slice(known);
         }
-        guide.uses
+        features.uses
     };
-    let uses: Vec<Vec<Use>> = data.par_chunks_mut(width * BAND * GUIDED_INPUTS).enumerate().map(band).collect();
+    let uses: Vec<Vec<Use>> = data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate().map(band).collect();
     let mut sums = vec![Use::default(); references.len()];
     uses.iter().for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
-    Guided { view: Picture::new(width, height, GUIDED_INPUTS, data), uses: sums }
+    ConditionedView { view: Picture::new(width, height, REFERENCE_INPUTS, data), uses: sums }
 }
 
 /// Rows of a view that are looked at together: memory is bounded, whatever its size.
@@ -216,7 +224,7 @@ const BAND: usize = 32;
 
 #[cfg(test)]
 mod tests {
-    use radiance::uniform;
+    use counter_rng::uniform;
     use scene::{Camera, Intrinsics};
 
     use super::*;
@@ -255,37 +263,37 @@ mod tests {
         KnownView { rendered, truth: Picture::new(WIDTH, HEIGHT, 3, truth) }
     }
 
-    /// Share of the view that is known of, trust there, and how far what is shown there is from the truth, weighted by the trust.
+    /// Share of the view that is known of, confidence there, and how far what is shown there is from the truth, weighted by the confidence.
     fn judged(view: &KnownView, reference: &KnownView, guidance: Guidance) -> (f64, f64, f64) {
-        let Guided { view: guided, uses } = guided(&view.rendered, &[reference], guidance);
-        let (seen, trust) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].trust / uses[0].seen.max(1) as f64);
+        let ConditionedView { view: conditioned, uses } = with_references(&view.rendered, &[reference], guidance);
+        let (seen, confidence) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].confidence / uses[0].seen.max(1) as f64);
         let (mut sum, mut all) = (0.0, 0.0);
-        for (pixel, truth) in guided.data.chunks_exact(GUIDED_INPUTS).zip(view.truth.data.chunks_exact(3)) {
+        for (pixel, truth) in conditioned.data.chunks_exact(REFERENCE_INPUTS).zip(view.truth.data.chunks_exact(3)) {
             let off = (0..3).map(|c| f64::from(pixel[c] + pixel[4 + c] - truth[c]).abs()).sum::<f64>() / 3.0;
             sum += off * f64::from(pixel[7]);
             all += f64::from(pixel[7]);
         }
-        (seen, trust, sum / f64::max(all, 1e-9))
+        (seen, confidence, sum / f64::max(all, 1e-9))
     }
 
     #[test]
-    fn what_looks_otherwise_than_rendered_is_not_trusted() {
+    fn confidence_falls_where_it_looks_otherwise_than_rendered() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
-        let (seen, trust, off) = judged(&view, &reference, Guidance::default());
-        assert!((0.7..0.8).contains(&seen) && trust > 0.85 && off < 0.01, "right: {seen} {trust} {off}");
+        let (seen, confidence, off) = judged(&view, &reference, Guidance::default());
+        assert!((0.7..0.8).contains(&seen) && confidence > 0.85 && off < 0.01, "right: {seen} {confidence} {off}");
         // A plane a third too far away: the reference shows what lies eight pixels to the side.
-        let (_, trust, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), Guidance::default());
-        assert!(trust < 0.5, "shifted: {trust}");
+        let (_, confidence, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), Guidance::default());
+        assert!(confidence < 0.5, "shifted: {confidence}");
         // Depths with noise within what counts as the same surface, seen from far aside.
         let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
         let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), Guidance::default());
-        let (_, trust, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
-        assert!(trust < 0.8 * calm, "noisy: {trust} of {calm}");
+        let (_, confidence, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
+        assert!(confidence < 0.8 * calm, "noisy: {confidence} of {calm}");
         // A reference of something else.
         let mut other = wall(24, |_| 2.0);
         other.truth.data.iter_mut().for_each(|v| *v = 1.0 - *v);
-        let (_, trust, _) = judged(&view, &other, Guidance::default());
-        assert!(trust < 0.5, "other: {trust}");
+        let (_, confidence, _) = judged(&view, &other, Guidance::default());
+        assert!(confidence < 0.5, "other: {confidence}");
         // One that looks away.
         assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
     }
@@ -312,7 +320,7 @@ mod tests {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
         let seen = |occlusion: bool| {
             let guidance = Guidance { occlusion, ..Guidance::default() };
-            guided(&view.rendered, &[&reference], guidance).uses[0].seen
+            with_references(&view.rendered, &[&reference], guidance).uses[0].seen
         };
         let hidden = (seen(false) - seen(true)) as f64 / (WIDTH * HEIGHT) as f64;
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
@@ -323,10 +331,10 @@ mod tests {
     fn bands_are_those_of_the_whole() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         for guidance in [Guidance::default(), Guidance { alignment: true, ..Guidance::default() }] {
-            let whole = guided(&view.rendered, &[&reference], guidance).view;
-            let band = Guide::new(&view.rendered, &[&reference], 7..41, guidance);
+            let whole = with_references(&view.rendered, &[&reference], guidance).view;
+            let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, guidance);
             assert_eq!(band.known.len(), 34 * WIDTH);
-            let expected = whole.data[7 * WIDTH * GUIDED_INPUTS..].chunks_exact(GUIDED_INPUTS);
+            let expected = whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
             for (found, expected) in band.known.iter().zip(expected) {
                 assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
             }

@@ -1,10 +1,10 @@
-use radiance::{Course, Ray, UnitRay, clip};
+use radiance::{NormalizedRay, Ray, RayMap, clip};
 use scene::{Bounds, Space};
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 
-/// How rays run through the unit cube, as tensors: `radiance`'s [`UnitRay`]s, which it clips in f64 and on the host.
+/// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips in f64 and on the host.
 #[derive(Debug)]
-pub(crate) struct Courses {
+pub(crate) struct RayMaps {
     origin: Tensor,
     direction: Tensor,
     /// What colours depend on: n × 3. The direction in the world, of unit length, or that in NDC, of which z goes from -1 to 1.
@@ -12,29 +12,29 @@ pub(crate) struct Courses {
     /// Where they enter and leave, by their parameter t: n × 1. Equal where they meet nothing.
     pub(crate) enter: Tensor,
     pub(crate) leave: Tensor,
-    /// Distance where t is 0, its growth, and its bend or its reach: n × 1 each.
+    /// Distance where t is 0, its growth, and its perspective or its radii: n × 1 each.
     distance: [Tensor; 3],
     contracted: bool,
 }
 
-impl Courses {
+impl RayMaps {
     pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device, ndc_directions: bool) -> Result<Self, TchError> {
-        let rays: Vec<UnitRay> = rays.iter().map(|r| clip(bounds, r)).collect();
-        let columns = |width: i64, of: &dyn Fn(&UnitRay, &mut Vec<f32>)| {
+        let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
+        let columns = |width: i64, of: &dyn Fn(&NormalizedRay, &mut Vec<f32>)| {
             let mut values = Vec::with_capacity(rays.len() * width as usize);
             rays.iter().for_each(|r| of(r, &mut values));
             Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, width])?.f_to_device(device)
         };
-        let three = |of: fn(&UnitRay) -> [f32; 3]| columns(3, &|r, to| to.extend(of(r)));
-        let one = |of: &dyn Fn(&UnitRay) -> f32| columns(1, &|r, to| to.push(of(r)));
-        let of_course = |k: usize| {
-            one(&|r| match r.course {
-                Course::Straight { start, scale, bend } => [start, scale, bend][k],
-                Course::Contracted { start, scale, reach } => [start, scale, reach][k],
+        let three = |of: fn(&NormalizedRay) -> [f32; 3]| columns(3, &|r, to| to.extend(of(r)));
+        let one = |of: &dyn Fn(&NormalizedRay) -> f32| columns(1, &|r, to| to.push(of(r)));
+        let of_map = |k: usize| {
+            one(&|r| match r.map {
+                RayMap::Straight { start, scale, perspective } => [start, scale, perspective][k],
+                RayMap::Contracted { start, scale, radii } => [start, scale, radii][k],
             })
         };
         let is_ndc = ndc_directions && matches!(bounds.space, Space::Ndc(_));
-        let in_ndc = |r: &UnitRay| r.direction.map(|d| 2.0 * d / r.direction[2]);
+        let in_ndc = |r: &NormalizedRay| r.direction.map(|d| 2.0 * d / r.direction[2]);
         // What isn't finite meets nothing; its view must not spoil the others' sums.
         let tame = |v: [f32; 3]| if v.iter().all(|x| x.is_finite()) { v } else { [0.0; 3] };
         Ok(Self {
@@ -43,7 +43,7 @@ impl Courses {
             view: columns(3, &|r, to| to.extend(tame(if is_ndc { in_ndc(r) } else { r.view })))?,
             enter: one(&|r| r.enter)?,
             leave: one(&|r| r.leave.max(r.enter))?,
-            distance: [of_course(0)?, of_course(1)?, of_course(2)?],
+            distance: [of_map(0)?, of_map(1)?, of_map(2)?],
             contracted: bounds.space == Space::Contraction,
         })
     }
@@ -64,11 +64,11 @@ impl Courses {
 
     /// Distances in scene units at t (n × m).
     pub(crate) fn distances(&self, t: &Tensor) -> Result<Tensor, TchError> {
-        let [start, scale, bend] = &self.distance;
+        let [start, scale, perspective] = &self.distance;
         if self.contracted {
             return sinh4(t)?.f_mul(scale)?.f_add(start);
         }
-        t.f_mul(scale)?.f_div(&t.f_mul(bend)?.f_neg()?.f_add_scalar(1.0)?)?.f_add(start)
+        t.f_mul(scale)?.f_div(&t.f_mul(perspective)?.f_neg()?.f_add_scalar(1.0)?)?.f_add(start)
     }
 
     /// Which rays meet the cube: n.
@@ -104,8 +104,8 @@ mod tests {
         let (origin, direction) = (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
         let ray = Ray { origin: origin.as_vec3().to_array(), direction: direction.as_vec3().to_array(), background: [1.0; 3] };
         let view = |ndc: bool| {
-            let courses = Courses::new(&bounds, &[ray], Device::Cpu, ndc).unwrap();
-            [0, 1, 2].map(|i| courses.view.double_value(&[0, i]))
+            let maps = RayMaps::new(&bounds, &[ray], Device::Cpu, ndc).unwrap();
+            [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
         };
         // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W / 2) is 1 / 0.5, which our NDC, as wide as high, has
         // for y, too.

@@ -4,8 +4,8 @@ use scene::{Camera, Photograph, Views};
 
 use crate::Rendered;
 
-/// LR photographs that some of the views' own cameras took: those that a field was trained on.
-pub struct OwnPhotographs<'a> {
+/// LR observations by the views' own cameras, those that a field was trained on: refined views are made consistent with them.
+pub struct LrObservations<'a> {
     input: &'a GivenInput,
     views: Views,
     filter: Filter,
@@ -14,14 +14,14 @@ pub struct OwnPhotographs<'a> {
 /// LR pixels that the nearest picture looks at on each side.
 const REACH: usize = 12;
 
-impl<'a> OwnPhotographs<'a> {
+impl<'a> LrObservations<'a> {
     /// Those of a scene's training views, with the kernel that made them.
     pub fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
         let degradation: Degradation = input.read_json(DEGRADATION_FILE)?;
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
 
-    /// Whether each of some cameras took one.
+    /// Whether there is one of each of some cameras.
     pub fn are_of_all(&self, cameras: &Views) -> bool {
         cameras.views.iter().all(|view| self.views.taken_by(&view.camera).is_some())
     }
@@ -35,16 +35,16 @@ impl<'a> OwnPhotographs<'a> {
         Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
     }
 
-    /// A rendered view that agrees with its own photograph, where there is one.
-    pub fn agreeing(&self, rendered: Rendered) -> anyhow::Result<Rendered> {
+    /// A rendered view that is consistent with its own LR observation, where there is one.
+    pub fn make_consistent(&self, rendered: Rendered) -> anyhow::Result<Rendered> {
         let Some(photograph) = self.of(&rendered.camera)? else { return Ok(rendered) };
-        let colours = self.agree(&rendered.colours(), &photograph);
+        let colours = self.project(&rendered.colours(), &photograph);
         Ok(rendered.with_colours(&colours))
     }
 
     /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
     /// photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
-    pub fn agree(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
+    pub fn project(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
         let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
         let mut residual = kernel.apply(refined);
         for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
@@ -69,34 +69,35 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_agrees_stays_and_what_does_not_is_moved_to_agree() {
-        for (filter, wide, narrow) in [(Filter::Lanczos, 48, 24), (Filter::Box, 45, 30), (Filter::Bicubic, 48, 12)] {
-            let size = (wide, wide * 2 / 3);
-            let low_size = (narrow, narrow * 2 / 3);
-            let level =
-                |i: usize, c: usize| 0.5 + 0.3 * ((i % wide * (c + 3)) as f32 * 0.08).sin() * ((i / wide) as f32 * 0.21).cos();
-            let data = (0..size.0 * size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
-            let truth = Picture::new(size.0, size.1, 3, data);
-            let kernel = Resampling::new(filter, size, low_size);
-            let low = Photograph::from(kernel.apply(&truth));
+    fn what_is_consistent_stays_and_what_is_not_is_moved() {
+        for (filter, hr_width, lr_width) in [(Filter::Lanczos, 48, 24), (Filter::Box, 45, 30), (Filter::Bicubic, 48, 12)] {
+            let hr_size = (hr_width, hr_width * 2 / 3);
+            let lr_size = (lr_width, lr_width * 2 / 3);
+            let level = |i: usize, c: usize| {
+                0.5 + 0.3 * ((i % hr_width * (c + 3)) as f32 * 0.08).sin() * ((i / hr_width) as f32 * 0.21).cos()
+            };
+            let data = (0..hr_size.0 * hr_size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
+            let truth = Picture::new(hr_size.0, hr_size.1, 3, data);
+            let kernel = Resampling::new(filter, hr_size, lr_size);
+            let lr = Photograph::from(kernel.apply(&truth));
             let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
-            let photographs = OwnPhotographs { input: &input, views, filter };
+            let observations = LrObservations { input: &input, views, filter };
             let error = |a: &Picture, b: &Picture| {
                 let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
                 (squares.sum::<f64>() / a.data.len() as f64).sqrt()
             };
-            assert!(error(&photographs.agree(&truth, &low), &truth) < 1e-5, "{filter:?}");
+            assert!(error(&observations.project(&truth, &lr), &truth) < 1e-5, "{filter:?}");
             let softer = Picture { data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(), ..truth.clone() };
-            let agreed = photographs.agree(&softer, &low);
-            let (off, was) = (error(&kernel.apply(&agreed), &low.picture), error(&kernel.apply(&softer), &low.picture));
+            let projected = observations.project(&softer, &lr);
+            let (off, was) = (error(&kernel.apply(&projected), &lr.picture), error(&kernel.apply(&softer), &lr.picture));
             assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
-            let (off, was) = (error(&agreed, &truth), error(&softer, &truth));
+            let (off, was) = (error(&projected, &truth), error(&softer, &truth));
             assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");
-            let none = pixels::Mask { width: low_size.0, height: low_size.1, counts: vec![false; low_size.0 * low_size.1] };
-            let low = Photograph { mask: Some(none), ..low };
-            assert!(error(&photographs.agree(&softer, &low), &softer) < 1e-7, "{filter:?}: what doesn't count moves nothing");
+            let none = pixels::Mask { width: lr_size.0, height: lr_size.1, counts: vec![false; lr_size.0 * lr_size.1] };
+            let lr = Photograph { mask: Some(none), ..lr };
+            assert!(error(&observations.project(&softer, &lr), &softer) < 1e-7, "{filter:?}: what doesn't count moves nothing");
         }
     }
 }
