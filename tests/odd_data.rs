@@ -238,7 +238,7 @@ stages:
     parameters: {lr: 16, scale: 2}
   train-ss:
     inputs: {scene: prep/train, references: prep/references}
-    parameters: {rays: 20000, levels: 4, finest: 32, log2_entries: 11, hidden: 16, steps: 128, batch: 1024, samples: 8192}
+    parameters: {rays: 8000, levels: 4, finest: 32, log2_entries: 11, hidden: 16, steps: 128, batch: 1024, samples: 8192}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:
@@ -259,7 +259,7 @@ fn a_reference_has_the_exposure_of_its_own_lr_photograph() {
     }
 }
 
-/// So few rays say nothing of poses: cameras wander off, photographs are met worse, and the field is the one with the given poses.
+/// So few rays say nothing of poses: cameras wander off, photographs don't meet their neighbours, and the field is the one with the given poses.
 #[test]
 fn poses_stay_where_refined_ones_are_no_better() {
     let project = Project::new(TRAINED);
@@ -274,7 +274,7 @@ fn poses_stay_where_refined_ones_are_no_better() {
     let (given, said, training, page) = weights("pose_refinement=false");
     assert!(!said.contains("warning: ") && training.get("warnings").is_none() && !page.contains("id=\"warnings\""), "{said}");
     let (kept, said, training, page) = weights("pose_refinement=true");
-    let words = "the given poses stay: photographs are met no better with refined ones";
+    let words = "the given poses stay: photographs meet their neighbours no better with refined poses";
     assert!(said.contains(&format!("warning: {words}")), "{said}");
     assert!(training["warnings"][0].as_str().unwrap().starts_with(words), "{training}");
     assert!(page.contains("id=\"warnings\"") && page.contains(words));

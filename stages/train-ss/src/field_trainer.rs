@@ -91,6 +91,20 @@ pub(crate) fn start(
     }
 }
 
+/// A field from weights that a training wrote.
+pub(crate) fn read(model: FieldModel, bounds: Bounds, weights: &Path, device: &str) -> anyhow::Result<Box<dyn RayField>> {
+    match model {
+        FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
+        #[cfg(feature = "torch")]
+        FieldModel::Mlp(architecture) => {
+            let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
+            Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
+        }
+        #[cfg(not(feature = "torch"))]
+        FieldModel::Mlp(_) => anyhow::bail!("a field of networks can't be read for {device}: there is no libtorch"),
+    }
+}
+
 /// Makes trained weights the mean of those and of the ones that the training went on from: what either makes up evens out, as if both fields were rendered,
 /// and little is lost of what was known before.
 pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &Path) -> anyhow::Result<()> {

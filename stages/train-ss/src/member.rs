@@ -49,6 +49,16 @@ impl<'a> Member<'a> {
         &self.params
     }
 
+    /// Where messages go, and where to compute.
+    pub(crate) fn context(&self) -> &Context {
+        self.context
+    }
+
+    /// What is trained.
+    pub(crate) fn model(&self) -> FieldModel {
+        self.model
+    }
+
     /// Where its weights go.
     pub(crate) fn output(&self) -> &Path {
         &self.output

@@ -2,7 +2,7 @@
 //!
 //! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
 //! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
-//! * [`Moved`]: how far cameras have gone, in words for a log.
+//! * [`Moved`]: how far cameras have gone, in words for a log; [`disagreement`]: whether that was for the better.
 //! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
 //!
 //! A photograph's own gradient says how each of its pixels would change if what it shows moved in the picture, and the rendered depth how
@@ -27,6 +27,8 @@
 //! assert!(found == camera && before == after);
 //! ```
 
+mod agreement;
+
 use std::error::Error;
 use std::fmt;
 
@@ -35,6 +37,8 @@ use nalgebra::{Matrix6, Vector6};
 use pixels::{Filter, Picture, Resampling};
 use radiance::{Ray, RayField};
 use scene::Camera;
+
+pub use agreement::{Shot, disagreement};
 
 /// A photograph at several sizes.
 #[derive(Clone, Debug)]
@@ -195,21 +199,13 @@ impl Equations {
         options: &Options,
     ) -> Result<Self, Box<dyn Error + Send + Sync>> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let cast = |pixel: &Telling| camera.ray(pixel.x as f64 + 0.5, pixel.y as f64 + 0.5);
-        let rays: Vec<Ray> = level
-            .telling
-            .iter()
-            .map(|pixel| {
-                let ray = cast(pixel);
-                let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
-                Ray { origin, direction, background: [options.background; 3] }
-            })
-            .collect();
+        let cast = |pixel: &Telling| cast(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], options.background);
+        let rays: Vec<Ray> = level.telling.iter().map(|pixel| cast(pixel).1).collect();
         let rendered = field.render(&rays)?;
         let depths: Vec<Option<f64>> = (level.telling.iter().zip(&rendered))
             .map(|(pixel, seen)| {
                 let distance = if seen.opacity > 0.5 { seen.median_depth } else { seen.depth };
-                let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel));
+                let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel).0);
                 (seen.opacity > THIN && depth.is_finite() && depth > 0.0).then_some(depth)
             })
             .collect();
@@ -252,6 +248,13 @@ impl Equations {
         };
         (motion.turn.is_finite() && motion.shift.is_finite()).then_some(motion)
     }
+}
+
+/// The ray through a position in the picture, exact and as fields take it.
+fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::Ray, Ray) {
+    let ray = camera.ray(x, y);
+    let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
+    (ray, Ray { origin, direction, background: [background; 3] })
 }
 
 fn huber(error: f64) -> f64 {

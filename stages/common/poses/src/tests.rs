@@ -198,3 +198,29 @@ fn common_motion_is_taken_back() {
     let found = between(&cameras);
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
 }
+
+/// By the true surfaces photographs agree from where they were taken, and not from beside; exposures that are known are no difference.
+#[test]
+fn photographs_agree_from_where_they_were_taken() {
+    let cameras: Vec<Camera> = (0..6).map(camera).collect();
+    let mut photographs: Vec<Picture> = cameras.iter().map(photograph).collect();
+    photographs[2].data.iter_mut().for_each(|v| *v *= 0.5);
+    photographs[3].data[..64 * 3].fill(f32::NAN);
+    let exposure = |i: usize| if i == 2 { [2.0; 3] } else { [1.0; 3] };
+    let judged = |cameras: &[Camera], exposure: &dyn Fn(usize) -> [f32; 3]| {
+        let shots = cameras.iter().zip(&photographs).enumerate();
+        let shots: Vec<Shot> =
+            shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
+        disagreement(&BallAndWall, &shots, 1.0).unwrap()
+    };
+    let right = judged(&cameras, &exposure).unwrap();
+    assert!(right < 3e-4, "{right}");
+    let off: Vec<Camera> = (0..6)
+        .map(|i| motion([0.01 * (i as f64).sin(), 0.01 * (i as f64).cos(), 0.0], [0.0; 3]).applied_to(&cameras[i]))
+        .collect();
+    let wrong = judged(&off, &exposure).unwrap();
+    assert!(wrong > 5.0 * right, "{wrong} {right}");
+    assert!(judged(&cameras, &|_| [1.0; 3]).unwrap() > 5.0 * right);
+    // One alone has nobody to agree with.
+    assert_eq!(judged(&cameras[..1], &exposure), None);
+}
