@@ -5,7 +5,7 @@ use pixels::Picture;
 use radiance::RayField;
 use scene::Camera;
 
-use crate::{Level, cast, huber};
+use crate::{PyramidLevel, cast, huber};
 
 /// A photograph, and the camera that took it.
 #[derive(Clone, Copy, Debug)]
@@ -59,7 +59,7 @@ struct Place {
 
 /// Where a photograph's telling pixels show surfaces.
 fn surfaces(field: &dyn RayField, shot: &Shot<'_>, background: f32) -> Result<Vec<Place>, Box<dyn Error + Send + Sync>> {
-    let telling = Level::new(shot.photograph).telling;
+    let telling = PyramidLevel::new(shot.photograph).telling;
     let every = telling.len().div_ceil(PIXELS).max(1);
     let pixels: Vec<_> = telling.into_iter().step_by(every).collect();
     let places = pixels.iter().map(|pixel| [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5]);

@@ -251,7 +251,7 @@ impl Equations {
 }
 
 /// The ray through a position in the picture, exact and as fields take it.
-fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::Ray, Ray) {
+fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::CameraRay, Ray) {
     let ray = camera.ray(x, y);
     let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
     (ray, Ray { origin, direction, background: [background; 3] })
