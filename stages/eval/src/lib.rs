@@ -218,7 +218,7 @@ impl ScoringJob<'_> {
         let read_true = |file: &Option<String>| -> anyhow::Result<Option<Picture>> {
             file.as_ref().map(|f| read_view(truth_in, true_view, f, truth.background)).transpose()
         };
-        let (mut expected, mut low) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
+        let (mut expected, mut lr) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
         let wanted = (true_view.camera.intrinsics.width as usize, true_view.camera.intrinsics.height as usize);
         if wanted != (found.width, found.height) {
             let message = format!(
@@ -233,8 +233,8 @@ impl ScoringJob<'_> {
                 format!("view {name}: its picture has {}×{} pixels, its camera others", expected.width, expected.height);
             return Err(Failure::BadInput(message).into());
         }
-        let shrunk = low.as_ref().map(|low| {
-            let mut shrunk = Resampling::new(self.filter, size(&found), size(low)).apply(&found);
+        let shrunk = lr.as_ref().map(|lr| {
+            let mut shrunk = Resampling::new(self.filter, size(&found), size(lr)).apply(&found);
             // As 8 bits would: a kernel with negative lobes overshoots.
             shrunk.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
             shrunk
@@ -243,10 +243,10 @@ impl ScoringJob<'_> {
         let of_mask = |picture: &Picture| -> anyhow::Result<Option<Mask>> {
             true_view.read_mask(truth_in, size(picture)).bad_input(format!("view {name}"))
         };
-        let mask = expected.as_ref().or(low.as_ref()).map(of_mask).transpose()?.flatten();
+        let mask = expected.as_ref().or(lr.as_ref()).map(of_mask).transpose()?.flatten();
         let mut counted = [0.0; 2];
         if let Some(mask) = &mask {
-            let pairs = [(expected.as_mut(), Some(&found)), (low.as_mut(), shrunk.as_ref())];
+            let pairs = [(expected.as_mut(), Some(&found)), (lr.as_mut(), shrunk.as_ref())];
             for (decibels, (truth, found)) in counted.iter_mut().zip(pairs) {
                 if let (Some(truth), Some(found)) = (truth, found) {
                     let mask = mask.resized(size(truth), 0);
@@ -259,9 +259,9 @@ impl ScoringJob<'_> {
                 }
             }
         }
-        let (shown, against) = match (&expected, &shrunk, &low) {
+        let (shown, against) = match (&expected, &shrunk, &lr) {
             (Some(expected), ..) => (&found, expected),
-            (None, Some(shrunk), Some(low)) => (shrunk, low),
+            (None, Some(shrunk), Some(lr)) => (shrunk, lr),
             _ => return Err(Failure::BadInput(format!("truth: view {name} has no picture at all")).into()),
         };
         let error_map = format!("errors/{name}.png");
@@ -281,8 +281,8 @@ impl ScoringJob<'_> {
             warp: warped.as_ref().map(|(score, _)| *score),
             low_resolution: shrunk
                 .iter()
-                .zip(&low)
-                .map(|(shrunk, low)| LowScores { psnr: psnr(shrunk, low) + counted[1], ssim: ssim(shrunk, low).reflected })
+                .zip(&lr)
+                .map(|(shrunk, lr)| LowScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
@@ -411,8 +411,8 @@ fn summary(metrics: &Metrics) -> String {
         parts.push(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") });
     }
     parts.extend(mean.depth.map(|d| format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)));
-    if let (Some(low), None) = (mean.low_resolution, mean.psnr) {
-        parts.push(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", low.psnr, low.ssim));
+    if let (Some(lr), None) = (mean.low_resolution, mean.psnr) {
+        parts.push(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", lr.psnr, lr.ssim));
     }
     parts.push(artifact::counted(metrics.views.len(), "view"));
     parts.join(" · ")

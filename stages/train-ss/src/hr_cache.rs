@@ -54,10 +54,10 @@ impl HrCache {
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
     fn block(&self, view: usize, x: usize, y: usize) -> [usize; 2] {
         let view = &self.views[view];
-        let first = |i: usize, at: usize, fine: usize, coarse: usize| {
-            let scale = fine as f64 / coarse as f64;
+        let first = |i: usize, at: usize, hr: usize, lr: usize| {
+            let scale = hr as f64 / lr as f64;
             let start = (at as f64 + 0.5).mul_add(scale, -0.5 * self.side[i] as f64).round().max(0.0) as usize;
-            start.min(fine.saturating_sub(self.side[i]))
+            start.min(hr.saturating_sub(self.side[i]))
         };
         [first(0, x, view.width, view.kernel.operator.x.outputs()), first(1, y, view.height, view.kernel.operator.y.outputs())]
     }
@@ -248,21 +248,21 @@ mod tests {
     /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole pictures, at any scale, also where the block is news.
     #[test]
     fn back_projections_are_the_operators_own() {
-        for (low, high) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
-            let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
-            let operator = Resampling::new(Filter::Lanczos, high, low);
+        for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
+            let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
+            let operator = Resampling::new(Filter::Lanczos, hr, lr);
             let inverse = operator.inverse(HrCache::REACH);
-            let fine = picture(high.0, high.1);
-            let targets = picture(low.0, low.1);
+            let image = picture(hr.0, hr.1);
+            let targets = picture(lr.0, lr.1);
             let mut cache = HrCache::new(side);
-            cache.add(&fine, Arc::new(KernelOperator::new(operator.clone())));
-            for y in 0..low.1 {
-                for x in 0..low.0 {
+            cache.add(&image, Arc::new(KernelOperator::new(operator.clone())));
+            for y in 0..lr.1 {
+                for x in 0..lr.0 {
                     let [i, j] = cache.block(0, x, y);
-                    let mut hybrid = fine.clone();
+                    let mut hybrid = image.clone();
                     let fresh: Vec<[f32; 3]> =
                         (0..side[0] * side[1]).map(|k| [0.2 + 0.1 * k as f32 / side[0] as f32, 0.5, 0.7]).collect();
-                    let at = |k: usize| 3 * ((j + k / side[0]) * high.0 + i + k % side[0]);
+                    let at = |k: usize| 3 * ((j + k / side[0]) * hr.0 + i + k % side[0]);
                     fresh.iter().enumerate().for_each(|(k, f)| hybrid.data[at(k)..at(k) + 3].copy_from_slice(f));
                     let mut residual = operator.apply(&hybrid);
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
@@ -270,9 +270,9 @@ mod tests {
                     let mut back_projected = vec![[9.0; 3]; fresh.len()];
                     let own = cache.back_project(0, [x, y], &fresh, &targets, |_, p, t| p - t, &mut back_projected);
                     for c in 0..3 {
-                        assert!((own[c] - residual.data[3 * (y * low.0 + x) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y})");
+                        assert!((own[c] - residual.data[3 * (y * lr.0 + x) + c]).abs() < 1e-5, "{lr:?} {hr:?} ({x}, {y})");
                         for (k, projection) in back_projected.iter().enumerate() {
-                            assert!((projection[c] - expected.data[at(k) + c]).abs() < 1e-5, "{low:?} {high:?} ({x}, {y}) {k}");
+                            assert!((projection[c] - expected.data[at(k) + c]).abs() < 1e-5, "{lr:?} {hr:?} ({x}, {y}) {k}");
                         }
                     }
                 }
@@ -297,19 +297,18 @@ mod tests {
     /// What the kernel makes follows what is cached, at any scale and also at the edges.
     #[test]
     fn projected_pixels_follow() {
-        for (low, high) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((20, 13), (21, 14))]
-        {
+        for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((20, 13), (21, 14))] {
             for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
-                let side = [high.0 as f64 / low.0 as f64, high.1 as f64 / low.1 as f64].map(|s| s.ceil() as usize);
+                let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
                 let mut cache = HrCache::new(side);
-                cache.add(&picture(high.0, high.1), Arc::new(KernelOperator::new(Resampling::new(filter, high, low))));
-                for k in 0..low.0 * low.1 {
+                cache.add(&picture(hr.0, hr.1), Arc::new(KernelOperator::new(Resampling::new(filter, hr, lr))));
+                for k in 0..lr.0 * lr.1 {
                     let colours: Vec<[f32; 3]> = (0..side[0] * side[1]).map(|i| [(i * 7 + k) as f32 % 1.0, 0.3, 1.0]).collect();
-                    cache.remember(0, k % low.0, k / low.0, &colours);
+                    cache.remember(0, k % lr.0, k / lr.0, &colours);
                 }
                 let followed = cache.views[0].projected.clone();
                 cache.views[0].project();
-                assert_eq!(cache.views[0].projected, followed, "{filter:?} {low:?} {high:?}");
+                assert_eq!(cache.views[0].projected, followed, "{filter:?} {lr:?} {hr:?}");
             }
         }
     }
@@ -317,14 +316,14 @@ mod tests {
     /// Every HR pixel belongs to some block, so none is left unseen.
     #[test]
     fn blocks_cover_the_picture() {
-        for (low, high) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
-            let side = (high as f64 / low as f64).ceil() as usize;
+        for (lr, hr) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
+            let side = (hr as f64 / lr as f64).ceil() as usize;
             let mut cache = HrCache::new([side, side]);
-            let operator = Resampling::new(Filter::Lanczos, (high, high), (low, low));
-            cache.add(&picture(high, high), Arc::new(KernelOperator::new(operator)));
-            let mut seen = vec![false; high];
-            (0..low).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
-            assert!(seen.iter().all(|s| *s), "{low} {high}");
+            let operator = Resampling::new(Filter::Lanczos, (hr, hr), (lr, lr));
+            cache.add(&picture(hr, hr), Arc::new(KernelOperator::new(operator)));
+            let mut seen = vec![false; hr];
+            (0..lr).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
+            assert!(seen.iter().all(|s| *s), "{lr} {hr}");
         }
     }
 }

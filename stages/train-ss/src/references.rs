@@ -103,12 +103,12 @@ mod tests {
 
     #[test]
     fn exposures_are_taken_back_and_other_pictures_are_left_out() {
-        let low = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
+        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
         let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
             let said = std::cell::RefCell::new(String::new());
             let mut picture = fine();
             picture.data.iter_mut().for_each(|v| *v = change(*v));
-            let kept = checked(photographs(name, picture), &low(), Filter::Lanczos, &|text| said.borrow_mut().push_str(&text));
+            let kept = checked(photographs(name, picture), &lr(), Filter::Lanczos, &|text| said.borrow_mut().push_str(&text));
             (kept.pictures.into_iter().next().map(|p| p.picture), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);
@@ -137,8 +137,8 @@ mod tests {
                 let lr = pixels::resize_pillow(&hr, size / 2, size / 2, filter);
                 let [hr, lr] = [&hr, &lr].map(Picture::premultiplied);
                 let said = std::cell::RefCell::new(String::new());
-                let low = photographs("a", lr.clone());
-                let kept = checked(photographs("a", hr.clone()), &low, filter, &|text| said.borrow_mut().push_str(&text));
+                let given = photographs("a", lr.clone());
+                let kept = checked(photographs("a", hr.clone()), &given, filter, &|text| said.borrow_mut().push_str(&text));
                 assert_eq!(said.into_inner(), "", "{size} {filter:?}");
                 assert_eq!(kept.pictures[0].picture, hr);
                 let alike = alikeness(&shrunk_as_stored(&hr, &lr, filter), &lr);

@@ -52,7 +52,7 @@ pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
     /// How many of them are LR photographs.
-    low: usize,
+    lr_views: usize,
     pixels: u64,
     background: Background,
     /// Sub-rays along x and y, when all are cast and now.
@@ -72,7 +72,7 @@ struct TrainingView {
     /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
     picture: Picture,
     /// A reference's own pixels.
-    fine: Option<Picture>,
+    hr: Option<Picture>,
     /// How many numbers the pixels of the views before this one have.
     before: u64,
     intrinsics: Intrinsics,
@@ -84,16 +84,16 @@ struct TrainingView {
 }
 
 impl TrainingView {
-    fn new(picture: Picture, fine: Option<Picture>, before: u64, camera: &Camera) -> Self {
+    fn new(picture: Picture, hr: Option<Picture>, before: u64, camera: &Camera) -> Self {
         let (intrinsics, none) = (camera.intrinsics, [0.0; 3]);
-        let mut view = Self { picture, fine, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
+        let mut view = Self { picture, hr, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
         view.place(camera);
         view
     }
 
     /// The photograph at its own size.
     fn photograph(&self) -> &Picture {
-        self.fine.as_ref().unwrap_or(&self.picture)
+        self.hr.as_ref().unwrap_or(&self.picture)
     }
 
     /// Has its rays cast from where a camera is.
@@ -148,16 +148,16 @@ const SATURATED: f32 = 254.5 / 255.0;
 impl Supersampling {
     /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are neither drawn nor compared with.
     pub fn new(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Self {
-        let (background, low) = (photographs.views.background, photographs.pictures.len());
-        let low_pixels: u64 = photographs.pictures.iter().map(|p| (p.picture.width * p.picture.height) as u64).sum();
-        let fine = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
+        let (background, lr_views) = (photographs.views.background, photographs.pictures.len());
+        let lr_pixels: u64 = photographs.pictures.iter().map(|p| (p.picture.width * p.picture.height) as u64).sum();
+        let hr_length = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
         let operator = |picture: &Picture| {
-            let (low, high) = ((picture.width, picture.height), (fine(picture.width, 0), fine(picture.height, 1)));
-            (Resampling::new(Filter::Lanczos, low, high), Resampling::new(options.filter, high, low))
+            let (lr, hr) = ((picture.width, picture.height), (hr_length(picture.width, 0), hr_length(picture.height, 1)));
+            (Resampling::new(Filter::Lanczos, lr, hr), Resampling::new(options.filter, hr, lr))
         };
         let smallest = |i: usize, length: fn(&Picture) -> usize| {
-            let low = photographs.pictures.iter().map(|p| fine(length(&p.picture), i));
-            low.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
+            let lr = photographs.pictures.iter().map(|p| hr_length(length(&p.picture), i));
+            lr.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
         };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
@@ -171,7 +171,7 @@ impl Supersampling {
         for (view, Photograph { mut picture, mask }) in all.flat_map(|p| p.views.views.into_iter().zip(p.pictures)) {
             match options.supervision {
                 // References are what they are: nothing has shrunk them.
-                _ if ready.len() >= low => {}
+                _ if ready.len() >= lr_views => {}
                 Supervision::Average => {}
                 Supervision::Refiltered => {
                     let (enlarge, shrink) = operator(&picture);
@@ -188,21 +188,21 @@ impl Supersampling {
             let before = pixels;
             let (whole, known) = (picture.clone(), Photograph { picture, mask }.known());
             // What the kernel needs to know of pixels around those that don't count stays: what was photographed, since it blurred into its neighbours.
-            let (whole, picture, fine) = if ready.len() < low {
+            let (whole, picture, hr) = if ready.len() < lr_views {
                 (whole, known, None)
             } else {
                 (block_means(&whole, full), block_means(&known, full), Some(known))
             };
             let count = (picture.width * picture.height) as u64;
             // Each block of a reference has so many numbers.
-            let draws = if fine.is_none() { 1 } else { (REFERENCE_DRAWS * low_pixels / (low as u64 * count)).max(1) };
+            let draws = if hr.is_none() { 1 } else { (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1) };
             if options.detail > 1.0 {
                 let counts = |pixel: &usize| !picture.data[pixel * picture.channels].is_nan();
                 let detailed: Vec<usize> = detailed(&whole).filter(counts).collect();
                 with_detail.extend((0..draws).flat_map(|k| detailed.iter().map(move |&pixel| before + k * count + pixel as u64)));
             }
             pixels += draws * count;
-            ready.push(TrainingView::new(picture, fine, before, &view.camera));
+            ready.push(TrainingView::new(picture, hr, before, &view.camera));
             cameras.push(view.camera);
         }
         let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
@@ -212,7 +212,7 @@ impl Supersampling {
         let side = full;
         Self {
             views: ready,
-            low,
+            lr_views,
             pixels,
             background,
             full,
@@ -235,7 +235,7 @@ impl Supersampling {
 
     /// The cache, where the kernel is what counts for a view by now.
     fn kernel(&self, view: usize) -> Option<&HrCache> {
-        self.cache.as_ref().filter(|_| self.side == self.full && view < self.low)
+        self.cache.as_ref().filter(|_| self.side == self.full && view < self.lr_views)
     }
 
     /// What it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
@@ -296,18 +296,18 @@ impl Supersampling {
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<Moved>> {
         let Some(moving) = &self.moving else { return Ok(None) };
-        let moved = moving.moved(&*field()?, self.low, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
+        let moved = moving.moved(&*field()?, self.lr_views, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
         Ok(Some(moved))
     }
 
     /// Where the photographs were taken from, where that was asked for.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.low])
+        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
-        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.low])
+        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
     }
 
     /// The view and pixel that a bundle trains on.
@@ -376,10 +376,10 @@ fn unclipped_residual(prediction: f32, target: f32, back: f32) -> f32 {
 
 /// The picture as averaging would have made it: y + (A - K)·Uy, with A the average over LR pixels.
 fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> Picture {
-    let fine = enlarge.apply(picture);
-    let average = Resampling::new(Filter::Box, (fine.width, fine.height), (picture.width, picture.height));
-    let mut out = average.apply(&fine);
-    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&fine).data) {
+    let hr = enlarge.apply(picture);
+    let average = Resampling::new(Filter::Box, (hr.width, hr.height), (picture.width, picture.height));
+    let mut out = average.apply(&hr);
+    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&hr).data) {
         *value += y - ky;
     }
     out
@@ -433,10 +433,10 @@ impl radiance::Supervisor for Supersampling {
         let background = self.behind(bundle);
         let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
         // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
-        let (start, apart) = match (self.kernel(index), &view.fine) {
+        let (start, apart) = match (self.kernel(index), &view.hr) {
             (Some(cache), _) => cache.block_in_pixels(index, x, y),
-            (None, Some(fine)) => {
-                let start = [block_start(x, self.full[0], fine.width), block_start(y, self.full[1], fine.height)];
+            (None, Some(hr)) => {
+                let start = [block_start(x, self.full[0], hr.width), block_start(y, self.full[1], hr.height)];
                 (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
             }
             (None, None) => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
@@ -473,12 +473,12 @@ impl radiance::Supervisor for Supersampling {
             _ => back[c] * sample[c],
         };
         let mut loss = 0.0;
-        if let Some(fine) = self.views[index].fine.as_ref().filter(|_| self.side == self.full) {
-            let left = block_start(pixel % picture.width, self.full[0], fine.width);
-            let top = block_start(pixel / picture.width, self.full[1], fine.height);
+        if let Some(hr) = self.views[index].hr.as_ref().filter(|_| self.side == self.full) {
+            let left = block_start(pixel % picture.width, self.full[0], hr.width);
+            let top = block_start(pixel / picture.width, self.full[1], hr.height);
             for (k, (colour, gradient)) in colours.iter().zip(gradients).enumerate() {
-                let at = (top + k / self.full[0]) * fine.width + left + k % self.full[0];
-                let sample = &fine.data[at * fine.channels..][..fine.channels];
+                let at = (top + k / self.full[0]) * hr.width + left + k % self.full[0];
+                let sample = &hr.data[at * hr.channels..][..hr.channels];
                 for c in 0..3 {
                     let residual = residual(colour[c], target(sample, c));
                     loss += f64::from(weight * share) * f64::from(residual) * f64::from(residual) / 3.0;
@@ -511,7 +511,7 @@ impl radiance::Supervisor for Supersampling {
             let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
-        let is_cached = self.side == self.full && index < self.low;
+        let is_cached = self.side == self.full && index < self.lr_views;
         if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {
             cache.remember(index, pixel % picture.width, pixel / picture.width, colours);
         }
@@ -571,7 +571,7 @@ mod tests {
         for (kind, scale) in cases {
             let (supersampling, camera) = example(kind, scale, None);
             let size = [(5.0 * scale[0]).round(), (4.0 * scale[1]).round()];
-            let fine = camera.resized(size[0] as u32, size[1] as u32);
+            let hr = camera.resized(size[0] as u32, size[1] as u32);
             let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
             let mut seen = vec![false; (size[0] * size[1]) as usize];
             for bundle in 0..200 {
@@ -579,7 +579,7 @@ mod tests {
                 for ray in &rays {
                     let pixel = (0..seen.len()).find(|i| {
                         let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
-                        let expected = fine.ray(x, y).direction.as_vec3().to_array();
+                        let expected = hr.ray(x, y).direction.as_vec3().to_array();
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
                     seen[pixel.unwrap_or_else(|| panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray"))] = true;
@@ -635,9 +635,9 @@ mod tests {
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
         let truth = fine_picture(10, 8);
-        let low = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
+        let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
         let worst = |kind| {
-            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(low.clone()));
+            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
             let mut worst = (0.0f64, 0.0f32);
             for bundle in 0..800 {
                 let pixel = supersampling.pixel(bundle).1;

@@ -100,22 +100,22 @@ impl Stage for Upsample {
                 let place = || format!("view {}", camera.name);
                 let photograph =
                     view.read_photograph(input).bad_input(place())?.with_context(|| format!("{}: it has no picture", place()));
-                let Photograph { picture: low, mask } = photograph.bad_input("input views")?.over(views.background.shown());
-                let large = enlarge(network.as_deref(), &low, camera).with_context(place)?;
-                write(context, &camera.name, &large, mask.map(|mask| mask.resized((large.width, large.height), 0)))?;
+                let Photograph { picture: lr, mask } = photograph.bad_input("input views")?.over(views.background.shown());
+                let hr = enlarge(network.as_deref(), &lr, camera).with_context(place)?;
+                write(context, &camera.name, &hr, mask.map(|mask| mask.resized((hr.width, hr.height), 0)))?;
                 progress.add(1);
             }
             Ok(())
         });
         work.collect::<anyhow::Result<Vec<_>>>()?;
-        let large = pairs.iter().map(|(view, camera)| {
+        let hr = pairs.iter().map(|(view, camera)| {
             let image = Some(format!("images/{}.exr", camera.name));
             View { image, mask: view.mask.as_ref().map(|_| mask_file(&camera.name)), ..View::camera_only((*camera).clone()) }
         });
-        let large = Views { hull: None, ..Views::new(views.background, views.bounds, large.collect()) };
-        context.write_json(VIEWS_FILE, &large)?;
+        let hr = Views { hull: None, ..Views::new(views.background, views.bounds, hr.collect()) };
+        context.write_json(VIEWS_FILE, &hr)?;
         let name = format!("{:?}", params.method).to_lowercase();
-        context.write_summary(&format!("{}, by {name}", artifact::counted(large.views.len(), "view")))
+        context.write_summary(&format!("{}, by {name}", artifact::counted(hr.views.len(), "view")))
     }
 }
 
@@ -141,8 +141,8 @@ fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a
 /// A network for each thread, none for what needs none.
 fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
     let widths = pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
-    let (low, high) = widths.unwrap_or((1, 1));
-    let scale = (f64::from(high) / f64::from(low)).round();
+    let (lr, hr) = widths.unwrap_or((1, 1));
+    let scale = (f64::from(hr) / f64::from(lr)).round();
     let (default, read): (String, Read) = match params.method {
         Method::Bicubic => return Ok((0..context.threads).map(|_| None).collect()),
         Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| Ok(Box::new(imdn::Imdn::read(weights)?))),
@@ -155,19 +155,19 @@ fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> a
     let networks = networks.bad_input("input weights")?;
     let scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {
-        let [low, high] = [&view.camera, *camera].map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        fit(scale, low, high).map_err(|reason| Failure::BadInput(format!("view {}: {file} {reason}", camera.name)))?;
+        let [lr, hr] = [&view.camera, *camera].map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
+        fit(scale, lr, hr).map_err(|reason| Failure::BadInput(format!("view {}: {file} {reason}", camera.name)))?;
     }
     Ok(networks)
 }
 
-/// Whether a network of that scale makes the high size of the low one; what is wrong otherwise.
-fn fit(scale: Option<i64>, low: [i64; 2], high: [i64; 2]) -> Result<(), String> {
-    match scale.filter(|by| low.map(|size| size * by) != high) {
+/// Whether a network of that scale makes the HR size of the LR one; what is wrong otherwise.
+fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), String> {
+    match scale.filter(|by| lr.map(|size| size * by) != hr) {
         None => Ok(()),
         Some(by) => Err(format!(
             "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, or bicubic or liif",
-            high[0], high[1], low[0], low[1]
+            hr[0], hr[1], lr[0], lr[1]
         )),
     }
 }
@@ -185,15 +185,15 @@ fn open(input: &GivenInput, file: &str) -> anyhow::Result<Weights> {
 }
 
 /// A picture at the size of a camera.
-fn enlarge(network: Option<&dyn Network>, low: &Picture, camera: &Camera) -> anyhow::Result<Picture> {
+fn enlarge(network: Option<&dyn Network>, lr: &Picture, camera: &Camera) -> anyhow::Result<Picture> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let Some(network) = network else {
-        let large = resize_pillow(&low.to_rgba8(), width as usize, height as usize, Filter::Bicubic);
-        return Ok(Picture::premultiplied(&large).over(0.0));
+        let hr = resize_pillow(&lr.to_rgba8(), width as usize, height as usize, Filter::Bicubic);
+        return Ok(Picture::premultiplied(&hr).over(0.0));
     };
     let size = [i64::from(height), i64::from(width)];
-    let large = no_grad(|| network.enlarge(&nets::tensor_of(low)?, size))?.f_clamp(0.0, 1.0)?;
-    Ok(nets::picture_of(&large)?)
+    let hr = no_grad(|| network.enlarge(&nets::tensor_of(lr)?, size))?.f_clamp(0.0, 1.0)?;
+    Ok(nets::picture_of(&hr)?)
 }
 
 fn mask_file(name: &str) -> String {
@@ -201,19 +201,19 @@ fn mask_file(name: &str) -> String {
 }
 
 /// A view's files: opaque colours, a preview, and what counts of them.
-fn write(context: &Context, name: &str, large: &Picture, mask: Option<Mask>) -> anyhow::Result<()> {
+fn write(context: &Context, name: &str, hr: &Picture, mask: Option<Mask>) -> anyhow::Result<()> {
     if let Some(mask) = mask {
         write_png(&context.output_path(&mask_file(name))?, &mask.to_rgba8())?;
     }
     let channels = &VIEW_CHANNELS[..4];
     let path = context.output_path(&format!("images/{name}.exr"))?;
-    write_exr(&path, (large.width, large.height), channels, VIEW_NOTE, |first, rows, samples| {
-        let pixels = large.data[first * large.width * 3..(first + rows) * large.width * 3].chunks_exact(3);
+    write_exr(&path, (hr.width, hr.height), channels, VIEW_NOTE, |first, rows, samples| {
+        let pixels = hr.data[first * hr.width * 3..(first + rows) * hr.width * 3].chunks_exact(3);
         for (sample, pixel) in samples.chunks_exact_mut(4).zip(pixels) {
             sample[..3].copy_from_slice(pixel);
             sample[3] = 1.0;
         }
         Ok::<(), PixelError>(())
     })?;
-    Ok(write_png(&context.output_path(&format!("previews/{name}.png"))?, &large.to_rgba8())?)
+    Ok(write_png(&context.output_path(&format!("previews/{name}.png"))?, &hr.to_rgba8())?)
 }
