@@ -71,10 +71,10 @@ fn a_block_follows_the_one_it_extends() {
     let project = project();
     let parameters = |stage: &str, name: &str, more: &[&str]| -> Vec<String> {
         project.ok(&[&["run", "refined"], more].concat());
-        let run: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(project.path(".nerf-sr/sinks/refined/run/run.json")).unwrap()).unwrap();
-        let nodes = run["nodes"].as_array().unwrap().iter().filter(|n| n["stage"] == stage);
-        nodes.map(|n| n["parameters"][name].to_string()).collect()
+        let rows: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
+        let refined = rows.as_array().unwrap().iter().filter(|row| row["stage"] == "eval-refined");
+        refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
     };
     assert_eq!(parameters("downscaled-field", "levels", &[]), ["4"]);
     let both = ["-p", "supersample=1,2", "-p", "rays=50000"];

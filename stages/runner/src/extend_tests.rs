@@ -190,6 +190,12 @@ fn shipped() -> (Pipeline, Vec<String>) {
     (Pipeline::read(&root.join("pipeline.yaml")).unwrap(), names)
 }
 
+/// Whether a file's names are there and its stages have an order.
+fn holds_together(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
+    crate::check::names(pipeline)?;
+    crate::check::order(pipeline).map(drop)
+}
+
 #[test]
 fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
     let (pipeline, names) = shipped();
@@ -197,11 +203,11 @@ fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
     assert_eq!(names, ["hr-finetune", "paper-refine", "reference-refine", "refined", "registered", "sisr-fuse", "video"]);
     let (all, blocks) = targets::find(&pipeline, &names).unwrap();
     assert_eq!(blocks, names);
-    crate::check::structure(&all).unwrap();
+    holds_together(&all).unwrap();
     for name in &names {
         let (of_file, _) = targets::find(&pipeline, std::slice::from_ref(name)).unwrap();
         assert_eq!(&of_file.default, std::slice::from_ref(name));
-        crate::check::structure(&of_file).unwrap();
+        holds_together(&of_file).unwrap();
         // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say otherwise.
         assert!(pipeline.stages.keys().all(|stage| pipeline.has_same(&of_file, stage)), "{name}");
     }
@@ -223,7 +229,7 @@ fn old_names_are_told_the_new_ones() {
             (format!("default: [{old}]\nstages:\n  a: {{}}"), 1),
         ] {
             let pipeline = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap();
-            let error = crate::check::structure(&pipeline).unwrap_err().to_string();
+            let error = holds_together(&pipeline).unwrap_err().to_string();
             assert!(error.starts_with(&format!("p.yaml:{line}: ")), "{error}");
             assert!(error.contains(&format!("it is called {new} now")) || error.contains(&said), "{error}");
         }

@@ -156,8 +156,8 @@ mod tests {
                 };
                 let hr = Picture::premultiplied(&hr);
                 let said = std::cell::RefCell::new(String::new());
-                let low = photographs("a", lr.clone());
-                let kept = checked(photographs("a", hr.clone()), &low, kernel, &|text| said.borrow_mut().push_str(&text));
+                let given = photographs("a", lr.clone());
+                let kept = checked(photographs("a", hr.clone()), &given, kernel, &|text| said.borrow_mut().push_str(&text));
                 assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
                 assert_eq!(kept.pictures[0].picture, hr);
                 let [shrunk, own] = compared(&hr, &lr, kernel);
