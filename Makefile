@@ -76,7 +76,7 @@ list = $(subst $() $(),$(comma),$(strip $(1)))
 DEMO_SIZE = $(shell python3 -c 'print(round(max(map(float, "$(LR)".split())) * max(map(float, "$(SCALE)".split()))))')
 sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE="2 4" LR="100 200" DATASET=DIR (default: the demo scene)
 	@$(NERF_SR) run --out out/sweep $(if $(DATASET),-i dataset=$(DATASET),-p demo-scene.size=$(DEMO_SIZE)) \
-	  -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr=$(call list,$(LR))
+	  -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr_width=$(call list,$(LR))
 
 SCENES ?= lego chair
 PROTOCOLS ?= 100x2 100x4 200x2 200x4
@@ -117,7 +117,7 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@rm -rf out/bench && mkdir -p out/bench
 	@if [ -d $(DATA)/nerf_synthetic/lego ]; then ln -s $(abspath $(DATA))/nerf_synthetic/lego out/bench/data; \
 	  else target/release/demo-scene --output out/bench/data; fi
-	@echo '{"lr": 100, "scale": 2, "test_views": 10}' > out/bench/prep.json
+	@echo '{"lr_width": 100, "scale": 2, "test_views": 10}' > out/bench/prep.json
 	@target/release/prep --params out/bench/prep.json --input dataset=out/bench/data --output $(BENCH_SCENE)
 	@SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) cargo bench --quiet -p train-ss --bench bench
 

@@ -19,28 +19,28 @@ import cells
 PARTS = [
     ("as it is", []),
     ("supervision: average", ["supervision=average"]),
-    ("all pixels drawn alike", ["detail=1"]),
+    ("all pixels drawn alike", ["pixel_importance=1"]),
     ("no supersampling", ["supersample=1"]),
-    ("all sub-rays from the start", ["coarse=0"]),
-    ("no weight averaging", ["averaging=0"]),
-    ("one ray a rendered pixel", ["sub_rays=1"]),
-    ("networks 32 wide", ["hidden=32"]),
-    ("two fields, half the rays each", ["members=2"]),
+    ("all sub-rays from the start", ["supersample_warmup=0"]),
+    ("no weight averaging", ["ema_decay=0"]),
+    ("one ray a rendered pixel", ["render-depth.samples_per_axis=1"]),
+    ("networks 32 wide", ["hidden_dim=32"]),
+    ("two fields, half the rays each", ["ensemble=2"]),
     ("supervision: refiltered", ["supervision=refiltered"]),
-    ("detail drawn 30 times as often", ["detail=30"]),
+    ("detail drawn 30 times as often", ["pixel_importance=30"]),
     ("3×3 sub-rays", ["supersample=3"]),
-    ("3×3 rays a rendered pixel", ["sub_rays=3"]),
-    ("tables of 2^15", ["log2_entries=15"]),
-    ("tables of 2^19", ["log2_entries=19"]),
-    ("finest level 512", ["finest=512"]),
-    ("grid rate 1e-2", ["rate=0.01"]),
-    ("network rate 4e-2", ["network_rate=0.04"]),
-    ("32,768 samples a step", ["train-ss.samples=32768"]),
-    ("131,072 samples a step", ["train-ss.samples=131072", "batch=8192"]),
-    ("256 steps along the diagonal", ["train-ss.steps=256"]),
-    ("no averaging, final rate 0.02", ["averaging=0", "final_rate=0.02"]),
+    ("3×3 rays a rendered pixel", ["render-depth.samples_per_axis=3"]),
+    ("tables of 2^15", ["log2_hashmap_size=15"]),
+    ("tables of 2^19", ["log2_hashmap_size=19"]),
+    ("finest level 512", ["max_resolution=512"]),
+    ("grid rate 1e-2", ["learning_rate=0.01"]),
+    ("network rate 4e-2", ["mlp_learning_rate=0.04"]),
+    ("32,768 samples a step", ["samples_per_step=32768"]),
+    ("131,072 samples a step", ["samples_per_step=131072", "max_rays_per_step=8192"]),
+    ("256 steps along the diagonal", ["march_steps=256"]),
+    ("no averaging, final rate 0.02", ["ema_decay=0", "learning_rate_decay=0.02"]),
     ("distortion loss 0.01", ["distortion=0.01"]),
-    ("no haze loss", ["haze=0"]),
+    ("no haze loss", ["floater_loss=0"]),
     ("all levels' rates alike", ["level_rate=1"]),
     ("no weight decay", ["network_decay=0"]),
     ("alpha supervision, averaged", ["background=alpha"]),
@@ -61,7 +61,7 @@ parser.add_argument("--nerf-sr", default="target/release/nerf-sr")
 options = parser.parse_args()
 
 lr, scale = options.protocol.split("x")
-base = [f"lr={lr}", f"prep.scale={scale}"]
+base = [f"lr_width={lr}", f"prep.scale={scale}"]
 if options.table == "ablation":
     variants = [(name, [*base, f"rays={options.rays}", *settings]) for name, settings in PARTS]
 elif options.table == "tradeoff":

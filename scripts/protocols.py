@@ -19,9 +19,9 @@ def settings(protocol: str, supervision: str, refined: bool) -> dict:
     rays, members = BUDGET.get(protocol, OTHER_BUDGET)
     rays = round(rays * AVERAGE_RAYS) if supervision == "average" else rays
     # Far above the trained resolution the field is smooth within a pixel, and one ray shows it all.
-    sub_rays = 2 if float(scale) < 3 else 1
-    chosen = {"lr": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "members": members}
-    chosen["sub_rays"] = sub_rays
+    samples_per_axis = 2 if float(scale) < 3 else 1
+    chosen = {"lr_width": lr, "prep.scale": scale, "supervision": supervision, "rays": rays, "ensemble": members}
+    chosen["render-depth.samples_per_axis"] = samples_per_axis
     if refined:
         as_many = round(rays / float(scale) ** 2)
         chosen["downscaled-field.rays"] = as_many // 2 if protocol in PHOTOGRAPHS else max(DOWNSCALED_RAYS, as_many)

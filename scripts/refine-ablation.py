@@ -20,18 +20,18 @@ import cells
 import protocols
 
 # A part, and the parameters that take it away or put something else in its place.
-ONE = "train-refine.references=1"
+ONE = "train-refine.references_per_view=1"
 PARTS = [
     ("one reference", [ONE]),
-    ("no reference", ["train-refine.references=0"]),
+    ("no reference", ["train-refine.references_per_view=0"]),
     ("one reference, no occlusion test", [ONE, "train-refine.occlusion=false"]),
     ("one reference, aligned", [ONE, "train-refine.alignment=true"]),
     ("one reference, expected depth", [ONE, "downscaled-views.depth=expected"]),
     ("one reference, lens ignored", [ONE, "prep.lens=ignore"]),
-    ("two references", ["train-refine.references=2"]),
-    ("four references", ["train-refine.references=4"]),
-    ("eight references", ["train-refine.references=8"]),
-    ("one reference, 16 features", [ONE, "train-refine.channels=16"]),
+    ("two references", ["train-refine.references_per_view=2"]),
+    ("four references", ["train-refine.references_per_view=4"]),
+    ("eight references", ["train-refine.references_per_view=8"]),
+    ("one reference, 16 features", [ONE, "train-refine.features=16"]),
     ("one reference, two blocks", [ONE, "train-refine.blocks=2"]),
 ]
 # The same of the paper's network, with or without the perceptual loss; and its size, unless --set says another.
@@ -41,7 +41,7 @@ PAPER_PARTS = [
     ("L1 alone, no perceptual loss", [], False),
     ("one reference patch", ["train-paper.patches=1"], True),
 ]
-PAPER_SIZE = {"train-paper.channels": 32, "train-paper.batch": 8}
+PAPER_SIZE = {"train-paper.features": 32, "train-paper.batch": 8}
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True, help="folder with nerf_llff_data/SCENE, nerf_synthetic/SCENE (or SCENE)")
@@ -64,7 +64,7 @@ def trained(scene: str, settings: list[str]) -> dict:
     chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
     wanted = ["train-refine", "-i", f"dataset={cells.dataset(options.data, scene)}"]
     # Those of the field that isn't trained here mean nothing.
-    wanted += [word for name, value in chosen.items() if name not in ("rays", "members") for word in ("-p", f"{name}={value}")]
+    wanted += [word for name, value in chosen.items() if name not in ("rays", "ensemble") for word in ("-p", f"{name}={value}")]
     cells.call([options.nerf_sr, "run", *wanted])
     status = subprocess.run([options.nerf_sr, "status", *map(str, wanted)], check=True, capture_output=True, text=True).stdout
     line = next(line for line in status.splitlines() if line.split()[:1] == ["train-refine"])
@@ -76,7 +76,7 @@ def trained(scene: str, settings: list[str]) -> dict:
 def paper_refined(scene: str, settings: list[str], perceptual: bool) -> tuple[dict, dict]:
     """Figures of the test views as rendered, and as the paper's network redraws them."""
     chosen = protocols.settings(options.protocol, "kernel", refined=False) | PAPER_SIZE
-    chosen |= {"prep.references": 1, "train-paper.steps": options.paper_steps}
+    chosen |= {"prep.hr_references": 1, "train-paper.steps": options.paper_steps}
     chosen |= {"split": options.split} if options.split else {}
     chosen |= dict(setting.split("=", 1) for setting in [*options.set, *settings])
     settings = [f"{name}={value}" for name, value in chosen.items() if not name.startswith("downscaled")]

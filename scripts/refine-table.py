@@ -31,8 +31,9 @@ def cell(scene: str, protocol: str, references: int) -> list[dict]:
     """Rows of what is rendered, refined without references, and with so many."""
     page = options.out.parent / "refine-table" / f"{scene}-{protocol}-{references}"
     chosen = protocols.settings(protocol, "kernel", refined=True)
-    chosen |= {"prep.references": max(options.references)}
-    chosen |= {f"{stage}.references": references for stage in ("finetuned-field", "train-reference", "refine-reference")}
+    chosen |= {"prep.hr_references": max(options.references)}
+    chosen |= {f"{stage}.max_references": references for stage in ("finetuned-field", "refine-reference")}
+    chosen["train-reference.references_per_view"] = references
     chosen |= {"split": options.split} if options.split else {}
     given = dict(setting.split("=", 1) for setting in options.set)
     # Half of what the field has, so that all that references need takes less time than the field.

@@ -79,7 +79,7 @@ parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="
 options = parser.parse_args()
 weights = options.weights or options.data / "weights"
 further = dict(setting.split("=", 1) for setting in options.set)
-# Sub-rays of a pixel in our supersampling: train-ss's default is 2 a side.
+# Sub-pixel rays of a pixel in our supersampling: train-ss's default is 2 a side.
 sub_rays = math.ceil(float(further.get("supersample", 2))) ** 2
 
 
@@ -94,7 +94,7 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
 
     def field(name: str, parameters: dict, scene: str = "prep/train") -> dict:
         # Plain NeRF has a ray a pixel in training and in rendering.
-        rendering = {"sub_rays": 1} if name.startswith("nerf") else {}
+        rendering = {"samples_per_axis": 1} if name.startswith("nerf") else {}
         return {
             f"field-{name}": {"extends": "train-ss", "inputs": {"scene": scene}, "parameters": parameters},
             f"views-{name}": {"extends": "render-depth", "inputs": {"field": f"field-{name}", "cameras": "prep/cameras"}, "parameters": rendering},
@@ -107,14 +107,14 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
     if method == "ss":
         return score | field(method, average)
     if method == "hr":
-        prep = {"extends": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr": round(int(lr) * float(scale)), "scale": 1}}
+        prep = {"extends": "prep", "inputs": {"dataset": "demo-scene"}, "parameters": {"lr_width": round(int(lr) * float(scale)), "scale": 1}}
         return score | {"prep-hr": prep} | field(method, plain, "prep-hr/train")
     if method in ("mlp", "mlp-nerf"):
-        paper = {"field": "mlp", "rays": options.mlp_rays, "members": 1, "supervision": "average"}
+        paper = {"field": "mlp", "rays": options.mlp_rays, "ensemble": 1, "supervision": "average"}
         return score | field(method, paper | {"supersample": 1 if method == "mlp-nerf" else 2})
     if method in ("bicubic", *NETWORKS):
         low = {"extends": "render-depth", "inputs": {"field": "field-nerf", "cameras": "prep/cameras"}}
-        low["parameters"] = {"size": int(lr), "sub_rays": 1}
+        low["parameters"] = {"size": int(lr), "samples_per_axis": 1}
         enlarged = {"run": "upsample", "inputs": {"views": "views-low", "cameras": "prep/cameras"}, "parameters": {"method": method}}
         if method in NETWORKS:
             enlarged["inputs"]["weights"] = f"{weights.resolve()}"
@@ -123,7 +123,7 @@ def blocks(method: str, protocol: str, rays: int) -> dict:
 
 
 # Blocks that others extend, which therefore may be meant without being run themselves.
-OF = {"supervision": "train-ss", "rays": "train-ss", "members": "train-ss", "sub_rays": "render-depth"}
+OF = {"supervision": "train-ss", "rays": "train-ss", "ensemble": "train-ss"}
 
 
 def missing(method: str, protocol: str) -> str | None:

@@ -10,7 +10,7 @@ use common::{Project, TINY, stage};
 /// A data set made once, copied and damaged by each test.
 fn dataset(project: &Project) -> std::path::PathBuf {
     let folder = project.path("data");
-    let made = stage("demo-scene", r#"{"size": 32, "train": 4, "test": 2, "samples": 1}"#, &[], &folder, &[]);
+    let made = stage("demo-scene", r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#, &[], &folder, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     folder
@@ -21,7 +21,7 @@ default: [prep]
 stages:
   prep:
     inputs: {dataset: ./data}
-    parameters: {lr: 16, scale: 2}
+    parameters: {lr_width: 16, scale: 2}
 ";
 
 /// Damages a data set, runs prep through the runner, expects an error and an empty store.
@@ -87,8 +87,8 @@ fn datasets_that_cannot_be_used() {
 
 #[test]
 fn sizes_that_cannot_be() {
-    refused(|_, _| {}, &["-p", "lr=64", "-p", "scale=1"], 2, &["lr = 64", "larger than", "32"]);
-    refused(|_, _| {}, &["-p", "lr=0"], 2, &["stage prep", "parameter lr", "minimum"]);
+    refused(|_, _| {}, &["-p", "lr_width=64", "-p", "scale=1"], 2, &["lr_width = 64", "larger than", "32"]);
+    refused(|_, _| {}, &["-p", "lr_width=0"], 2, &["stage prep", "parameter lr_width", "minimum"]);
     refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
     refused(|_, _| {}, &["-p", "near=5", "-p", "far=3"], 2, &["near", "far = 3"]);
 }
@@ -101,8 +101,8 @@ fn output_that_cannot_be_written() {
     project.write("taken", "");
     project.run(&["run", "--store", "taken/store"]).fails(1, &["cannot open the store", "--store"]);
     let inputs = [("dataset", folder.as_path())];
-    stage("prep", r#"{"lr": 16}"#, &inputs, &project.path("taken/out"), &[]).fails(2, &["--params"]);
-    project.write("p.json", r#"{"lr": 16}"#);
+    stage("prep", r#"{"lr_width": 16}"#, &inputs, &project.path("taken/out"), &[]).fails(2, &["--params"]);
+    project.write("p.json", r#"{"lr_width": 16}"#);
     let output = std::process::Command::new(common::bin("prep"))
         .args(["--params", "p.json", "--output", "taken/out", "--input", "dataset=data"])
         .current_dir(project.path("."))
@@ -183,9 +183,9 @@ fn pipelines_that_cannot_be_used() {
         ),
         ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
         ("{dataset: demo-scene}", "{dataset: render-depth}", 7, "takes dataset, but render-depth is views"),
-        ("lr: 24", "lr: twenty", 8, "parameter lr"),
-        ("lr: 24", "lr: -3", 8, "parameter lr"),
-        ("lr: 24", "ir: 24", 8, "parameter ir: unknown"),
+        ("lr_width: 24", "lr_width: twenty", 8, "parameter lr_width"),
+        ("lr_width: 24", "lr_width: -3", 8, "parameter lr_width"),
+        ("lr_width: 24", "lr_widht: 24", 8, "parameter lr_widht: unknown"),
         ("default: [eval]", "default: [all]", 0, "named in `default`"),
         ("  eval:\n", "  eval:\n    run: ./nowhere\n", 0, "set `run:`"),
         ("default: [eval]", "default: [eval", 0, ""),
@@ -221,9 +221,10 @@ fn command_lines_that_cannot_be_used() {
     ] {
         project.run(arguments).fails(2, &[words]);
     }
-    stage("prep", r#"{"lr": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
+    stage("prep", r#"{"lr_width": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
         .fails(2, &["parameter x", "unknown"]);
-    stage("prep", r#"{"lr": 16"#, &[("dataset", Path::new("."))], &project.path("o"), &[]).fails(2, &["--params", "line 1"]);
+    stage("prep", r#"{"lr_width": 16"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
+        .fails(2, &["--params", "line 1"]);
     stage("prep", "{}", &[], &project.path("o"), &[]).fails(2, &["input dataset is missing"]);
     stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[]).fails(2, &["--input data", "known: dataset"]);
     stage("prep", "{}", &[("dataset", Path::new("/nowhere"))], &project.path("o"), &[]).fails(3, &["/nowhere", "no such folder"]);

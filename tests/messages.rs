@@ -203,7 +203,7 @@ fn a_stage_does_not_need_somebody_to_talk_to() {
         let mut command = Command::new(bin("prep"));
         command.args(arguments).current_dir(project.path(".")).stdout(closed()).stderr(closed());
         if arguments.len() > 2 {
-            project.write("params.json", r#"{"lr": 24}"#);
+            project.write("params.json", r#"{"lr_width": 24}"#);
             command.args(["--params", "params.json", "--progress", progress]);
         }
         assert_eq!(command.status().unwrap().code(), Some(code), "{progress} {arguments:?}");
@@ -257,8 +257,7 @@ fn more_threads_than_a_machine_can_use_are_not_started() {
 fn a_terminal_that_goes_away_leaves_a_checkpoint() {
     let project = Project::tiny();
     let train = demo_train(&project, 8);
-    let params =
-        r#"{"rays": 900000000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "batch": 2048, "samples": 16384}"#;
+    let params = r#"{"rays": 900000000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
     let (output, work) = (project.path("out"), project.path("work"));
     let stage = stage_command("train-ss", params, &[("scene", &train)], &output, &["--work", work.to_str().unwrap()]);
     // With nohup, under which this test may run, it is to go on.

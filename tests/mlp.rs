@@ -9,8 +9,8 @@ use std::time::Duration;
 use common::{Project, demo_train, manifest, stage, stage_command};
 
 /// All of the published shape, in miniature; long enough to be stopped on the way.
-const PARAMS: &str = r#"{"field": "mlp", "hidden": 16, "layers": 5, "position_octaves": 4, "direction_octaves": 1, "coarse_samples": 8,
-    "fine_samples": 8, "batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1}"#;
+const PARAMS: &str = r#"{"field": "mlp", "hidden_dim": 16, "layers": 5, "position_frequencies": 4, "direction_frequencies": 1, "coarse_samples": 8,
+    "fine_samples": 8, "max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1}"#;
 
 /// Equal bytes at one and two threads, and after an interruption.
 #[test]
@@ -37,10 +37,10 @@ fn trains_to_the_same_bytes_however_it_is_run() {
 
     // What goes on from it stands beside it, or their mean does.
     let (beside, averaged) = (project.path("beside"), project.path("averaged"));
-    let inputs = [("scene", train.as_path()), ("field", one.as_path())];
+    let inputs = [("scene", train.as_path()), ("init", one.as_path())];
     let on = PARAMS.replace("40000", "2000");
     assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
-    assert_eq!(stage("train-ss", &on.replace('{', r#"{"begun": "averaged", "#), &inputs, &averaged, &[]).code, 0);
+    assert_eq!(stage("train-ss", &on.replace('{', r#"{"combine": "average_weights", "#), &inputs, &averaged, &[]).code, 0);
     let weights = |folder: &std::path::Path, member: u32| std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok();
     let [begun, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
     assert!(weights(&beside, 0) == begun && weights(&averaged, 1).is_none());
@@ -59,9 +59,10 @@ fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let run = |name: &str, seed: u64, restarts: u32| {
-        let more = format!(r#""rate": 0.03, "seed": {seed}, "restarts": {restarts}, "batch": 16"#);
-        let params = PARAMS.replace(r#""batch": 128, "rays": 40000, "crop_steps": 20, "noise": 0.1"#, &more);
-        let params = params.replace(r#""rate""#, r#""rays": 4000, "crop_steps": 0, "rate""#);
+        let more = format!(r#""learning_rate": 0.03, "seed": {seed}, "restarts": {restarts}, "max_rays_per_step": 16"#);
+        let params =
+            PARAMS.replace(r#""max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1"#, &more);
+        let params = params.replace(r#""learning_rate""#, r#""rays": 4000, "precrop_steps": 0, "learning_rate""#);
         stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
     };
     let alone = |seed: u64| run(&format!("alone-{seed}"), seed, 0);
@@ -86,6 +87,7 @@ fn mistakes_are_one_line() {
     if on_gpu.code != 0 {
         on_gpu.fails(2, &["--device cuda:0", "leave --device away"]);
     }
-    stage("train-ss", r#"{"field": "mlp", "levels": 4}"#, &inputs, &out, &[]).fails(2, &["parameter levels", "other field"]);
-    stage("train-ss", r#"{"noise": 1.0}"#, &inputs, &out, &[]).fails(2, &["parameter noise", "other field"]);
+    stage("train-ss", r#"{"field": "mlp", "n_levels": 4}"#, &inputs, &out, &[]).fails(2, &["parameter n_levels", "other field"]);
+    stage("train-ss", r#"{"density_noise_std": 1.0}"#, &inputs, &out, &[])
+        .fails(2, &["parameter density_noise_std", "other field"]);
 }

@@ -24,7 +24,7 @@ stages:
 fn project(size: u32, train: u32) -> (Project, PathBuf) {
     let project = Project::new(FROM_FOLDER);
     let folder = project.path("data");
-    let params = format!(r#"{{"size": {size}, "train": {train}, "test": 2, "samples": 1}}"#);
+    let params = format!(r#"{{"size": {size}, "train": {train}, "test": 2, "samples_per_axis": 1}}"#);
     let made = stage("demo-scene", &params, &[], &folder, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
@@ -232,13 +232,13 @@ const TRAINED: &str = "
 default: [report]
 stages:
   demo-scene:
-    parameters: {size: 32, train: 8, test: 2, samples: 2}
+    parameters: {size: 32, train: 8, test: 2, samples_per_axis: 2}
   prep:
     inputs: {dataset: demo-scene}
-    parameters: {lr: 16, scale: 2}
+    parameters: {lr_width: 16, scale: 2}
   train-ss:
     inputs: {scene: prep/train, references: prep/references}
-    parameters: {rays: 8000, levels: 4, finest: 32, log2_entries: 11, hidden: 16, steps: 128, batch: 1024, samples: 8192}
+    parameters: {rays: 8000, n_levels: 4, max_resolution: 32, log2_hashmap_size: 11, hidden_dim: 16, march_steps: 128, max_rays_per_step: 1024, samples_per_step: 8192}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:

@@ -17,7 +17,7 @@ const ANGLE: f64 = 0.691_111_2;
 fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let data = project.path("data");
     if !data.exists() {
-        let params = format!(r#"{{"size": {WIDTH}, "train": 20, "test": 1, "samples": 2}}"#);
+        let params = format!(r#"{{"size": {WIDTH}, "train": 20, "test": 1, "samples_per_axis": 2}}"#);
         assert_eq!(stage("demo-scene", &params, &[], &data, &[]).code, 0);
     }
     let text = std::fs::read_to_string(data.join("transforms_train.json")).unwrap();
@@ -120,7 +120,7 @@ fn every_form_gives_the_same_cameras_and_pictures() {
     let mut scenes = Vec::new();
     for (i, folder) in folders.iter().enumerate() {
         let scene = project.path(&format!("scene-{i}"));
-        let made = stage("prep", r#"{"degrade": "none", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
+        let made = stage("prep", r#"{"lr_source": "photographs", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
         assert_eq!(made.code, 0, "{}", made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
         for words in ["17 views to train on, 3 others for testing", "as if made by box; HR is 48×48", "20 photographs"] {
@@ -181,7 +181,7 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     let copy = project.path("colmap/images/r_3.png");
     let small = pixels::resize_pillow(&pixels::read_png(&copy).unwrap(), 20, 20, pixels::Filter::Box);
     pixels::write_png(&copy, &small).unwrap();
-    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("default: [eval]", "default: [report]");
     project.replace("  eval:", "  report:\n    inputs: {run: eval}\n  eval:");
     project.replace("rays: 60000", "rays: 500000");
@@ -213,7 +213,7 @@ fn exposures_are_found() {
         }
         pixels::write_png(&path, &picture).unwrap();
     }
-    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
     let scored = |exposure: &str| {
         let settings = ["-i", "dataset=./transforms", "-p", exposure];
@@ -257,7 +257,7 @@ fn lenses_are_followed_or_undone() {
         };
         pixels::write_png(&path, &pixels::Rgba8::new(size, size, (0..size * size).flat_map(seen).collect())).unwrap();
     }
-    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 400000");
     let psnr = |lens: &str| {
         let settings = ["-i", "dataset=./transforms", "-p", lens];
@@ -302,7 +302,7 @@ fn poses_are_refined_and_test_views_registered() {
         frame["transform_matrix"] = json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]);
     }
     std::fs::write(&file, transforms.to_string()).unwrap();
-    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 300000");
     let scored = |refined: &str| {
         let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
@@ -344,7 +344,7 @@ fn what_masks_leave_out_is_not_learnt() {
         pixels::write_png(&folder.join("masks").join(&name), &mask).unwrap();
         frame["mask_path"] = json!(format!("masks/{name}"));
     }
-    project.replace("    parameters: {lr: 24, scale: 2}\n", "");
+    project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 300000");
     let mut scored = |masked: bool| {
         for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !masked) {
@@ -357,7 +357,7 @@ fn what_masks_leave_out_is_not_learnt() {
     };
     let masked = scored(true);
     // With HR truth: PSNR is that of the pixels that count.
-    let small = ["-i", "dataset=./transforms", "-p", "lr=16", "-p", "train-ss.rays=20000"];
+    let small = ["-i", "dataset=./transforms", "-p", "lr_width=16", "-p", "train-ss.rays=20000"];
     project.ok(&[&["run", "eval"], &small[..]].concat());
     let object = |stage: &str| project.artifact(stage, &small);
     let (rendered, truth) = (object("render-depth"), object("prep").join("truth"));
@@ -391,10 +391,9 @@ fn contradictions_are_refused() {
     let folder = as_transforms(&project);
     let out = project.path("out");
     let refused = |params: &str, words: &[&str]| stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
-    refused(r#"{"degrade": "none", "lr": 16}"#, &["parameter lr", "leave lr out"]);
-    refused(r#"{"degrade": "none", "kernel": "average"}"#, &["parameter kernel", "choose box"]);
-    refused(r#"{"degrade": "box", "kernel": "lanczos"}"#, &["parameter kernel", "give one of them"]);
-    refused(r#"{"degrade": "none", "hr": 16}"#, &["32", "larger than", "16"]);
+    refused(r#"{"lr_source": "photographs", "lr_width": 16}"#, &["parameter lr_width", "leave lr_width out"]);
+    refused(r#"{"lr_source": "photographs", "kernel": "average"}"#, &["parameter kernel", "choose box"]);
+    refused(r#"{"lr_source": "photographs", "hr_width": 16}"#, &["32", "larger than", "16"]);
 }
 
 /// The paper's split: all views for training and all but the references for testing.
@@ -403,7 +402,7 @@ fn the_papers_split_leaves_references_out() {
     let project = Project::tiny();
     let folder = as_llff(&project);
     let scene = project.path("scene");
-    let made = stage("prep", r#"{"split": "paper", "references": 3}"#, &[("dataset", &folder)], &scene, &[]);
+    let made = stage("prep", r#"{"split": "paper", "hr_references": 3}"#, &[("dataset", &folder)], &scene, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
     let names =

@@ -15,7 +15,7 @@ fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
     assert!(project.ok(&["run"]).contains("nothing to run"));
     // A comment, another order of keys, another number of threads, another place.
     project.replace("default: [eval]", "# a comment\ndefault: [eval]");
-    project.replace("{lr: 24, scale: 2}", "{scale: 2, lr: 24}");
+    project.replace("{lr_width: 24, scale: 2}", "{scale: 2, lr_width: 24}");
     assert!(project.ok(&["run", "--threads", "1"]).contains("nothing to run"));
     let moved = Project::new(&std::fs::read_to_string(project.path("pipeline.yaml")).unwrap());
     std::fs::rename(project.path(".nerf-sr"), moved.path(".nerf-sr")).unwrap();
@@ -37,7 +37,7 @@ fn why_names_the_changed_parameter_and_equal_output_cuts_off() {
     assert!(plan.lines().any(|l| l.starts_with("demo-scene") && l.contains("cached")), "{plan}");
     assert!(plan.lines().any(|l| l.starts_with("eval") && l.contains("waits for")), "{plan}");
     // The same sizes said otherwise: prep runs, its output is equal, all else stays cached.
-    let run = project.ok(&["run", "-p", "hr=48"]);
+    let run = project.ok(&["run", "-p", "hr_width=48"]);
     assert!(run.contains("1 of 5 stages ran, 4 were cached"), "{run}");
     // And with the other kernel everything after demo-scene runs.
     let run = project.ok(&["run", "-p", "kernel=box"]);
@@ -196,16 +196,29 @@ fn every_option_goes_through() {
         &["-p", "background=alpha"][..],
         &["-p", "background=black", "-p", "kernel=bicubic"],
         &["-p", "hull=alpha"],
-        &["-p", "kernel=average", "-p", "coarse=0.2"],
+        &["-p", "kernel=average", "-p", "supersample_warmup=0.2"],
         &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
-        &["-p", "lr=20", "-p", "scale=1.5", "-p", "prep.references=2", "-p", "test_views=2"],
-        &["-p", "lr=24", "-p", "scale=1", "-p", "supersample=1"],
+        &["-p", "lr_width=20", "-p", "scale=1.5", "-p", "prep.hr_references=2", "-p", "test_views=2"],
+        &["-p", "lr_width=24", "-p", "scale=1", "-p", "supersample=1"],
         &["-p", "supervision=refiltered"],
         &["-p", "supervision=kernel"],
-        &["-p", "lr=32", "-p", "scale=1.5", "-p", "supersample=1.5", "-p", "supervision=kernel"],
-        &["-p", "lr=16", "-p", "scale=3", "-p", "supersample=3", "-p", "kernel=bicubic", "-p", "supervision=kernel"],
-        &["-p", "lr=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "supervision=kernel"],
-        &["-p", "lr=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "kernel=box", "-p", "sub_rays=1", "-p", "averaging=0"],
+        &["-p", "lr_width=32", "-p", "scale=1.5", "-p", "supersample=1.5", "-p", "supervision=kernel"],
+        &["-p", "lr_width=16", "-p", "scale=3", "-p", "supersample=3", "-p", "kernel=bicubic", "-p", "supervision=kernel"],
+        &["-p", "lr_width=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "supervision=kernel"],
+        &[
+            "-p",
+            "lr_width=17",
+            "-p",
+            "scale=2.7",
+            "-p",
+            "supersample=2.7",
+            "-p",
+            "kernel=box",
+            "-p",
+            "render-depth.samples_per_axis=1",
+            "-p",
+            "ema_decay=0",
+        ],
     ] {
         let run = project.ok(&[&["run"], options].concat());
         let psnr: f64 = run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
@@ -219,7 +232,7 @@ fn every_option_goes_through() {
 fn members_are_fields_of_their_own_and_average() {
     let project = Project::tiny();
     let of = |stage: &str, more: &[&str]| project.artifact(stage, more);
-    let both = ["-p", "train-ss.seed=4", "-p", "members=2", "-p", "rays=60000"];
+    let both = ["-p", "train-ss.seed=4", "-p", "ensemble=2", "-p", "rays=60000"];
     let singles = [["-p", "train-ss.seed=4", "-p", "rays=30000"], ["-p", "train-ss.seed=5", "-p", "rays=30000"]];
     project.ok(&[&["run"], &both[..]].concat());
     let views = of("render-depth", &both);

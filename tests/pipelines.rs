@@ -18,7 +18,7 @@ fn every_verb_finds_a_target_of_its_own_file() {
     for (arguments, words) in [
         (&["plan", "refined"][..], &["downscaled-field", "eval-refined", "refined"][..]),
         (&["plan", "eval-refined"], &["downscaled-field", "eval-refined"]),
-        (&["plan", "reference-refine", "-p", "prep.references=2"], &["finetuned-field", "refine-reference"]),
+        (&["plan", "reference-refine", "-p", "prep.hr_references=2"], &["finetuned-field", "refine-reference"]),
         (&["plan", "hr-finetune"], &["finetuned-views"]),
         (&["plan", "sisr-fuse", "-p", "upsample.method=bicubic"], &["refine-sisr"]),
         (&["plan", "paper-refine"], &["train-paper"]),

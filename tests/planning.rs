@@ -71,7 +71,7 @@ fn only_run_starts_a_foreign_program() {
     project.write("pipeline.yaml", "default: [demo-scene]\nstages:\n  demo-scene: {}\n  mine: {run: ./new.sh}\n");
     install(&project.path("script"), &project.path("new.sh"));
     let before = started();
-    project.ok(&["run", "-p", "size=4", "-p", "train=1", "-p", "test=1", "-p", "samples=1"]);
+    project.ok(&["run", "-p", "size=4", "-p", "train=1", "-p", "test=1", "-p", "demo-scene.samples_per_axis=1"]);
     assert_eq!(started(), before);
 }
 
@@ -117,8 +117,8 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
     run(&["plan"]).fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
     // The rest of the file is checked, needed or not.
-    project.replace("lr: 24", "ir: 24");
-    run(&["plan", "demo-secne"]).fails(2, &["pipeline.yaml:8: stage prep: parameter ir: unknown; did you mean hr?"]);
+    project.replace("lr_width: 24", "ir_width: 24");
+    run(&["plan", "demo-secne"]).fails(2, &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean hr_width?"]);
 }
 
 /// What can't go well is refused before anything runs, in the plan as in the run.
@@ -130,7 +130,6 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         (&["upsample"][..], "stage upsample: input weights is missing: methods imdn, liif and swinir"),
         (&["upsample", "-p", "method=bicubic,liif"], "stage upsample [method=liif]: input weights is missing"),
         (&["-p", "prep.scale=2.7", "-p", "kernel=average"], "stage prep: parameter kernel: average needs a whole scale"),
-        (&["-p", "prep.scale=2.7", "-p", "degrade=average"], "stage prep: parameter degrade: average needs a whole scale"),
         (&["-p", "hull=alpha", "-p", "space=ndc"], "stage prep: parameter hull: alpha carves a box"),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
@@ -182,20 +181,20 @@ fn sinks_are_part_of_the_picture() {
 #[test]
 fn a_run_does_what_the_plan_says() {
     let project = Project::tiny();
-    project.replace("{lr: 24, scale: 2}", "{lr: 24, scale: 2, kernel: box}");
+    project.replace("{lr_width: 24, scale: 2}", "{lr_width: 24, scale: 2, kernel: box}");
     let actions = || project.store_listing().iter().filter(|name| name.ends_with(".json")).count();
     for (arguments, runs) in [
         (&[][..], 2),
         (&[], 0),
         // Said otherwise, or said where it is so by default.
-        (&["-p", "prep.scale=2.0", "-p", "lr=24.0", "-p", "demo-scene.size=48e0", "-p", "demo-scene.seed=0"], 0),
+        (&["-p", "prep.scale=2.0", "-p", "lr_width=24.0", "-p", "demo-scene.size=48e0", "-p", "demo-scene.seed=0"], 0),
         (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
         // Equal output ends what waits.
         (&["-p", "hr=48"], 1),
         (&["-p", "demo-scene.train=11", "-p", "demo-scene.train=12"], 0),
         (&["-p", "kernel=box,bicubic"], 1),
-        (&["-p", "demo-scene.samples=1", "-p", "kernel=box,bicubic"], 3),
-        (&["-p", "demo-scene.samples=1,2", "-p", "kernel=box,bicubic"], 0),
+        (&["-p", "demo-scene.samples_per_axis=1", "-p", "kernel=box,bicubic"], 3),
+        (&["-p", "demo-scene.samples_per_axis=1,2", "-p", "kernel=box,bicubic"], 0),
     ] {
         let arguments = [&["prep"], arguments].concat();
         let plan = project.ok(&[&["plan"], &arguments[..]].concat());

@@ -14,15 +14,15 @@ const REFINED: &str = "
   downscaled-field:
     parameters: {rays: 40000}
   train-refine:
-    parameters: {steps: 60, batch: 4, square: 16, channels: 8, blocks: 1}
+    parameters: {steps: 60, batch: 4, patch_size: 16, features: 8, blocks: 1}
   upsample:
     parameters: {method: bicubic}
   finetuned-field:
     parameters: {rays: 60000}
   train-reference:
-    parameters: {references: 2}
+    parameters: {references_per_view: 2}
   train-paper:
-    parameters: {steps: 3, batch: 2, square: 16, channels: 4}
+    parameters: {steps: 3, batch: 2, patch_size: 16, features: 4}
 ";
 
 fn project() -> Project {
@@ -56,7 +56,7 @@ fn refined_views_stand_beside_rendered_ones() {
     // Nothing of what the network predicts is nothing at all, but for half precision.
     let none = project.path("none");
     let inputs = [("views", rendered.as_path()), ("refiner", &folder("train-refine"))];
-    assert_eq!(stage("refine", r#"{"strength": 0}"#, &inputs, &none, &[]).code, 0);
+    assert_eq!(stage("refine", r#"{"residual_weight": 0}"#, &inputs, &none, &[]).code, 0);
     let file = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap().file_name();
     let green = |folder: &Path| pixels::read_exr(&folder.join("images").join(&file)).unwrap().channel("G").unwrap().to_vec();
     assert!(green(&none).iter().zip(green(&rendered)).all(|(a, b)| (a - b).abs() < 2e-3));
@@ -221,9 +221,12 @@ fn seen_from_the_front() -> (Project, Vec<&'static str>) {
     project.replace("train: 12", "train: 30");
     project.replace("rays: 60000", "rays: 300000");
     project.replace("rays: 40000", "rays: 200000");
-    project.replace("parameters: {references: 2}", "parameters: {references: 2, steps: 600, channels: 16, blocks: 2}");
+    project.replace(
+        "parameters: {references_per_view: 2}",
+        "parameters: {references_per_view: 2, steps: 600, features: 16, blocks: 2}",
+    );
     let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
-    (project, [&["refine-reference", "-p", "prep.references=2"], &from_the_front[..]].concat())
+    (project, [&["refine-reference", "-p", "prep.hr_references=2"], &from_the_front[..]].concat())
 }
 
 /// A copy of a folder with its files of a kind changed.
@@ -388,7 +391,7 @@ fn references_join_a_training() {
     inputs: {views: joined-views, truth: prep/truth}
 ";
     let project = Project::shipped(&["hr-finetune"], joined);
-    let arguments = ["eval", "eval-joined", "-p", "prep.references=6", "-p", "train-ss.rays=200000"];
+    let arguments = ["eval", "eval-joined", "-p", "prep.hr_references=6", "-p", "train-ss.rays=200000"];
     project.ok(&[&["run"], &arguments[..]].concat());
     let psnr = |stage: &str| {
         let metrics = project.json(stage, "metrics.json", &arguments);
@@ -399,20 +402,20 @@ fn references_join_a_training() {
     // Half as many rays do, where the training goes on from what LR pictures gave and both fields, or their weights' mean, are kept. Few rays, or one
     // reference alone, lose nothing of that.
     let first = project.artifact("train-ss", &arguments);
-    for begun in ["beside", "averaged"] {
+    for combine in ["ensemble", "average_weights"] {
         let on = |rays: &str, references: &str| {
-            let given = [("rays", rays), ("references", references), ("begun", begun)]
+            let given = [("rays", rays), ("max_references", references), ("combine", combine)]
                 .map(|(name, value)| format!("finetuned-field.{name}={value}"));
             let more =
-                ["-p", "prep.references=6", "-p", "train-ss.rays=200000", "-p", &given[0], "-p", &given[1], "-p", &given[2]];
+                ["-p", "prep.hr_references=6", "-p", "train-ss.rays=200000", "-p", &given[0], "-p", &given[1], "-p", &given[2]];
             let arguments = [&["eval-finetuned"], &more[..]].concat();
             project.ok(&[&["run"], &arguments[..]].concat());
             let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
             println!("{on:.2} dB, {given:?}");
             let field = project.artifact("finetuned-field", &arguments);
             let weights = |field: &Path, member: u32| std::fs::read(field.join(format!("field-{member}.safetensors"))).ok();
-            assert_eq!(weights(&field, 1).is_some(), begun == "beside");
-            assert_eq!(weights(&field, 0) == weights(&first, 0), begun == "beside", "the field begun from is the first member");
+            assert_eq!(weights(&field, 1).is_some(), combine == "ensemble");
+            assert_eq!(weights(&field, 0) == weights(&first, 0), combine == "ensemble", "the initial field is the first member");
             on
         };
         assert!(on("100000", "6") > psnr("eval") + 0.2);
@@ -420,7 +423,7 @@ fn references_join_a_training() {
         assert!(on("100000", "1") > psnr("eval") - 0.02);
     }
     // None of them, and all is as without.
-    let none = [&arguments[..], &["-p", "joined-field.references=0"]].concat();
+    let none = [&arguments[..], &["-p", "joined-field.max_references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
     let weights = |stage: &str| std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap();
     assert!(weights("joined-field") == weights("train-ss"));
@@ -435,25 +438,26 @@ fn other_fields_are_not_gone_on_from() {
     let (scene, field) = (folder("prep").join("train"), folder("train-ss"));
     let file = std::fs::read_to_string(field.join("field.json")).unwrap();
     let fails = |parameters: &str, field: &Path, words: &[&str]| {
-        stage("train-ss", parameters, &[("scene", scene.as_path()), ("field", field)], &project.path("no"), &[]).fails(3, words);
+        stage("train-ss", parameters, &[("scene", scene.as_path()), ("init", field)], &project.path("no"), &[]).fails(3, words);
         assert!(!project.path("no").exists());
     };
-    fails("{}", &field, &["input field: it is made of something else than the parameters ask for"]);
+    fails("{}", &field, &["input init: it is made of something else than the parameters ask for"]);
     let with = |name: &str, file: &str| {
         let field = changed(&project, name, &field, "none", &|_| ());
         std::fs::write(field.join("field.json"), file).unwrap();
         field
     };
-    let own = r#"{"rays": 8000, "levels": 4, "finest": 64, "log2_entries": 12, "hidden": 16, "steps": 128}"#;
-    fails(own, &with("black", &file.replace("\"white\"", "\"black\"")), &["input field: it has another background"]);
-    fails(own, &with("far", &file.replace("\"far\": ", "\"far\": 1")), &["input field: it lies elsewhere"]);
+    let own =
+        r#"{"rays": 8000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
+    fails(own, &with("black", &file.replace("\"white\"", "\"black\"")), &["input init: it has another background"]);
+    fails(own, &with("far", &file.replace("\"far\": ", "\"far\": 1")), &["input init: it lies elsewhere"]);
     let cut = with("cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
     fails(own, &cut, &["input field", "field-0.safetensors"]);
     // Nor can more than sixteen be kept.
-    let many = own.replace('{', r#"{"members": 16, "#);
-    stage("train-ss", &many, &[("scene", scene.as_path()), ("field", field.as_path())], &project.path("no"), &[])
-        .fails(2, &["parameter members: members = 17 is not in 1..=16 with those of input field beside", "begun averaged"]);
+    let many = own.replace('{', r#"{"ensemble": 16, "#);
+    stage("train-ss", &many, &[("scene", scene.as_path()), ("init", field.as_path())], &project.path("no"), &[])
+        .fails(2, &["parameter ensemble: members = 17 is not in 1..=16 with those of input init", "combine to average_weights"]);
 }
 
 /// Rendered downscaled views and their truth, and parameters of a training of a few seconds.
@@ -463,7 +467,7 @@ fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'sta
     (
         folder("downscaled-views"),
         folder("prep").join("train"),
-        r#"{"steps": 600, "batch": 8, "square": 24, "channels": 32, "blocks": 2}"#,
+        r#"{"steps": 600, "batch": 8, "patch_size": 24, "features": 32, "blocks": 2}"#,
     )
 }
 
@@ -472,7 +476,7 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
     let project = project();
     let (views, truth, params) = training(&project);
     // With references: which of them what views are shown with now isn't in the checkpoint, and must be found again.
-    let params = &params.replace('{', r#"{"references": 1, "#);
+    let params = &params.replace('{', r#"{"references_per_view": 1, "#);
     let inputs = [("views", views.as_path()), ("truth", truth.as_path())];
     let (whole, output, work) = (project.path("whole"), project.path("killed"), project.path("work"));
     assert_eq!(stage("train-refine", params, &inputs, &whole, &["--threads", "1"]).code, 0);
@@ -494,8 +498,8 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
 #[test]
 fn views_that_were_finished_are_kept() {
     let project = project();
-    project.ok(&["run", "refine-reference", "-p", "prep.references=2"]);
-    let folder = |stage: &str| project.artifact(stage, &["refine-reference", "-p", "prep.references=2"]);
+    project.ok(&["run", "refine-reference", "-p", "prep.hr_references=2"]);
+    let folder = |stage: &str| project.artifact(stage, &["refine-reference", "-p", "prep.hr_references=2"]);
     let (prep, field, rendered) = (folder("prep"), folder("train-ss"), folder("reference-views"));
     let (cameras, references, refiner) = (prep.join("train"), prep.join("references"), folder("train-reference"));
     let views = project.path("render-depth-whole");
@@ -508,7 +512,7 @@ fn views_that_were_finished_are_kept() {
     };
     for (name, inputs, params, other) in [
         ("render-depth", &render[..], r#"{"size": 120}"#, r#"{"size": 40}"#),
-        ("refine", &refine, r#"{"turns": 8}"#, r#"{"turns": 1}"#),
+        ("refine", &refine, r#"{"self_ensemble": 8}"#, r#"{"self_ensemble": 1}"#),
     ] {
         let (work, output, whole) =
             (project.path(&format!("{name}-work")), project.path(name), project.path(&format!("{name}-whole")));
@@ -564,7 +568,7 @@ fn wrong_views_are_refused_in_a_line() {
     let train = |params: &str, views: &Path, truth: &Path| {
         stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
     };
-    train(r#"{"square": 15}"#, &views, &truth).fails(2, &["parameter square: 15 is odd"]);
+    train(r#"{"patch_size": 15}"#, &views, &truth).fails(2, &["parameter patch_size: 15 is odd"]);
     train("{}", &views, &truth.with_file_name("downscaled")).fails(3, &["24×24 pixels where its picture has 12×12"]);
     train("{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has a picture, by name and pose, in input truth"]);
@@ -575,7 +579,7 @@ fn wrong_views_are_refused_in_a_line() {
 fn the_paper_s_network_refines_by_references() {
     let project = project();
     project.replace("parameters: {size: 48,", "parameters: {size: 72,");
-    project.replace("{lr: 24, scale: 2}", "{lr: 36, scale: 2}");
+    project.replace("{lr_width: 24, scale: 2}", "{lr_width: 36, scale: 2}");
     project.ok(&["run", "eval-paper"]);
     let folder = |stage: &str| project.artifact(stage, &["eval-paper"]);
     let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
@@ -590,7 +594,7 @@ fn the_paper_s_network_refines_by_references() {
         std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
     }
     let parts = ["--scenes", "demo", "--protocol", "36x2", "--variants", "0", "--paper-steps", "2", "--out", "out/paper.json"];
-    let small = ["--set", "rays=60000", "train-paper.channels=4", "train-paper.batch=2"];
+    let small = ["--set", "rays=60000", "train-paper.features=4", "train-paper.batch=2"];
     let made = project.script("refine-ablation.py", &[&parts[..], &small].concat());
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(made.stdout.contains("| patches side by side |"), "{}", made.stdout);
@@ -612,6 +616,6 @@ fn the_paper_s_network_refines_by_references() {
         stage("train-refine", params, &inputs, &output, &[]).fails(code, words);
     };
     fails(r#"{"net": "paper", "steps": 1}"#, Some(&scene), 3, &["input weights", "vgg19.safetensors"]);
-    fails(r#"{"net": "paper", "square": 96}"#, None, 3, &["smaller than a patch of 96×96"]);
-    fails(r#"{"net": "paper", "square": 20}"#, None, 3, &["multiple of 8"]);
+    fails(r#"{"net": "paper", "patch_size": 96}"#, None, 3, &["smaller than a patch of 96×96"]);
+    fails(r#"{"net": "paper", "patch_size": 20}"#, None, 3, &["multiple of 8"]);
 }

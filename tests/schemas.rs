@@ -5,32 +5,37 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use artifact::Stage;
+use artifact::{Description, Named, RENAMES, Rename, Schema, Stage};
 use schemars::{JsonSchema, schema_for};
 
 fn of<T: JsonSchema>() -> serde_json::Value {
     schema_for!(T).to_value()
 }
 
-fn parameters<S: Stage>(all: &mut BTreeMap<String, serde_json::Value>) {
-    all.insert(format!("parameters/{}.json", S::NAME), of::<S::Params>());
+/// What all stages say of themselves.
+fn descriptions() -> Vec<Description> {
+    vec![
+        demo_scene::DemoScene::describe("", ""),
+        prep::Prep::describe("", ""),
+        train_ss::TrainSs::describe("", ""),
+        render_depth::RenderDepth::describe("", ""),
+        eval::Eval::describe("", ""),
+        report::Report::describe("", ""),
+        camera_path::CameraPath::describe("", ""),
+        video::Video::describe("", ""),
+        register::Register::describe("", ""),
+        train_refine::TrainRefine::describe("", ""),
+        refine::Refine::describe("", ""),
+        upsample::Upsample::describe("", ""),
+    ]
 }
 
 #[test]
 fn schemas_are_current() {
     let mut all = BTreeMap::new();
-    parameters::<demo_scene::DemoScene>(&mut all);
-    parameters::<prep::Prep>(&mut all);
-    parameters::<train_ss::TrainSs>(&mut all);
-    parameters::<render_depth::RenderDepth>(&mut all);
-    parameters::<eval::Eval>(&mut all);
-    parameters::<report::Report>(&mut all);
-    parameters::<camera_path::CameraPath>(&mut all);
-    parameters::<video::Video>(&mut all);
-    parameters::<register::Register>(&mut all);
-    parameters::<train_refine::TrainRefine>(&mut all);
-    parameters::<refine::Refine>(&mut all);
-    parameters::<upsample::Upsample>(&mut all);
+    for description in descriptions() {
+        all.insert(format!("parameters/{}.json", description.name), description.parameters);
+    }
     for (name, schema) in [
         ("pipeline", of::<runner::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
@@ -63,6 +68,21 @@ fn schemas_are_current() {
     }
     let files = walkdir::WalkDir::new(&folder).into_iter().filter(|e| e.as_ref().unwrap().file_type().is_file()).count();
     assert_eq!(files, all.len(), "schemas/ has a file that no type makes");
+}
+
+/// Every old name is gone, and every new one is there.
+#[test]
+fn renames_lead_to_names_that_are_there() {
+    let descriptions = descriptions();
+    for Rename { program, kind, old, new, .. } in RENAMES {
+        let description = descriptions.iter().find(|d| d.name == *program).expect(program);
+        let schema = Schema::new(program, &description.parameters).unwrap();
+        let names: Vec<&str> = match kind {
+            Named::Parameter => schema.names(),
+            Named::Input => description.inputs.keys().map(String::as_str).collect(),
+        };
+        assert!(names.contains(new) && !names.contains(old), "{program}: {old} → {new}");
+    }
 }
 
 /// What the stages write is what the schemas say.

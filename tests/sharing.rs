@@ -166,10 +166,10 @@ fn somebody_elses_folder_is_not_replaced() {
     project.ok(&["run"]);
     project.write("out/report/notes.txt", "precious");
     assert!(project.ok(&["run"]).contains("up to date"));
-    project.run(&["run", "-p", "sub_rays=2"]).fails(1, &["out/report/notes.txt", "is not nerf-sr's"]);
+    project.run(&["run", "-p", "render-depth.samples_per_axis=2"]).fails(1, &["out/report/notes.txt", "is not nerf-sr's"]);
     assert!(is_whole(&project.path("out/report")));
     std::fs::remove_file(project.path("out/report/notes.txt")).unwrap();
-    project.ok(&["run", "-p", "sub_rays=2"]);
+    project.ok(&["run", "-p", "render-depth.samples_per_axis=2"]);
 }
 
 /// A small tmpfs for the pages: needs root, as CI has; says so where it can't be mounted.
@@ -186,11 +186,11 @@ fn a_full_disk_leaves_the_old_page() {
     project.ok(&["run"]);
     let before = std::fs::read(out.join("report/index.html")).unwrap();
     std::fs::write(out.join("filler"), vec![0; 1 << 20]).unwrap_err();
-    let finished = project.run(&["run", "-p", "sub_rays=2"]);
+    let finished = project.run(&["run", "-p", "render-depth.samples_per_axis=2"]);
     let after = std::fs::read(out.join("report/index.html")).unwrap();
     let names = std::fs::read_dir(&out).unwrap().count();
     std::fs::remove_file(out.join("filler")).unwrap();
-    let again = project.run(&["run", "-p", "sub_rays=2"]);
+    let again = project.run(&["run", "-p", "render-depth.samples_per_axis=2"]);
     Command::new("umount").arg(&out).status().unwrap();
     finished.fails(1, &["No space left on device"]);
     assert!(after == before && names == 2, "the old page is whole");

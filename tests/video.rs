@@ -12,8 +12,8 @@ fn project() -> Project {
 #[test]
 fn a_flight_is_rendered_and_filmed() {
     let project = project();
-    // `sub_rays` is a parameter of two blocks; the film's extends the other.
-    let first = project.run(&["run", "video", "-p", "sub_rays=1"]);
+    // The film's block extends the other.
+    let first = project.run(&["run", "video", "-p", "render-depth.samples_per_axis=1"]);
     assert_eq!(first.code, 0, "{}", first.stderr);
     for i in 0..6 {
         let frame = pixels::read_png(&project.path(&format!("out/video/frames/{i:05}.png"))).unwrap();

@@ -26,13 +26,13 @@ pub const TINY: &str = "
 default: [eval]
 stages:
   demo-scene:
-    parameters: {size: 48, train: 12, test: 3, samples: 2}
+    parameters: {size: 48, train: 12, test: 3, samples_per_axis: 2}
   prep:
     inputs: {dataset: demo-scene}
-    parameters: {lr: 24, scale: 2}
+    parameters: {lr_width: 24, scale: 2}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 60000, levels: 4, finest: 64, log2_entries: 12, hidden: 16, steps: 128, batch: 2048, samples: 16384}
+    parameters: {rays: 60000, n_levels: 4, max_resolution: 64, log2_hashmap_size: 12, hidden_dim: 16, march_steps: 128, max_rays_per_step: 2048, samples_per_step: 16384}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
   eval:
@@ -44,16 +44,16 @@ pub const FAST: &str = "
 default: [report]
 stages:
   demo-scene:
-    parameters: {size: 32, train: 6, test: 2, samples: 1}
+    parameters: {size: 32, train: 6, test: 2, samples_per_axis: 1}
   prep:
     inputs: {dataset: demo-scene}
-    parameters: {lr: 16, scale: 2}
+    parameters: {lr_width: 16, scale: 2}
   train-ss:
     inputs: {scene: prep/train}
-    parameters: {rays: 4000, levels: 2, finest: 32, log2_entries: 10, hidden: 16, steps: 64, batch: 512, samples: 4096}
+    parameters: {rays: 4000, n_levels: 2, max_resolution: 32, log2_hashmap_size: 10, hidden_dim: 16, march_steps: 64, max_rays_per_step: 512, samples_per_step: 4096}
   render-depth:
     inputs: {field: train-ss, cameras: prep/cameras}
-    parameters: {sub_rays: 1}
+    parameters: {samples_per_axis: 1}
   eval:
     inputs: {views: render-depth, truth: prep/truth}
   report:
@@ -251,9 +251,9 @@ pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output:
 /// LR pictures of a small demo scene at half the size.
 pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));
-    let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples": 1}}"#);
+    let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples_per_axis": 1}}"#);
     assert_eq!(stage("demo-scene", &params, &[], &data, &[]).code, 0);
-    assert_eq!(stage("prep", r#"{"lr": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
+    assert_eq!(stage("prep", r#"{"lr_width": 24}"#, &[("dataset", &data)], &scene, &[]).code, 0);
     scene.join("train")
 }
 

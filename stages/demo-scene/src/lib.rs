@@ -43,7 +43,7 @@ pub struct Params {
     pub test: u32,
     /// Rays a pixel along each axis, for anti-aliasing.
     #[schemars(range(min = 1, max = 16))]
-    pub samples: u32,
+    pub samples_per_axis: u32,
     /// Where cameras stand.
     pub layout: Layout,
     /// Puts the things into a world without end: ground, towers far away, a sky.
@@ -54,7 +54,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: 200, train: 80, test: 10, samples: 4, layout: Layout::Around, backdrop: false, seed: 0 }
+        Self { size: 200, train: 80, test: 10, samples_per_axis: 4, layout: Layout::Around, backdrop: false, seed: 0 }
     }
 }
 
@@ -92,7 +92,7 @@ impl Stage for DemoScene {
                 .into_par_iter()
                 .map(|i| {
                     context.check_interrupt()?;
-                    let frame = render::render(&world, &poses[i as usize], CAMERA_ANGLE_X, params.size, params.samples);
+                    let frame = render::render(&world, &poses[i as usize], CAMERA_ANGLE_X, params.size, params.samples_per_axis);
                     write_png(&context.output_path(&format!("{split}/r_{i}.png"))?, &frame.colour)?;
                     if split == "test" {
                         write_depth(&context.output_path(&format!("test/r_{i}_depth.exr"))?, &frame)?;

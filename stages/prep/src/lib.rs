@@ -1,6 +1,6 @@
 //! `prep`: posed images → scene. Makes HR ground truth and, from it, the LR images that training may see.
 //!
-//! * `sizes`: LR and HR size from `lr`, `hr`, `scale`.
+//! * `sizes`: LR and HR size from `lr_width`, `hr_width`, `scale`.
 //! * `degrade`: HR and LR pictures of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see; `hull`: tighter, from alpha, where that is allowed.
 //! * `pose_warnings`: poses that can't be right, or hardly.
@@ -41,17 +41,18 @@ pub use sizes::{SizeError, Sizes, enlarged, sizes};
 pub struct Params {
     /// Width of the LR images, in pixels; the height follows the aspect. Without it: the HR width divided by `scale`.
     #[schemars(range(min = 1))]
-    pub lr: Option<u32>,
-    /// Width of the HR images; without it: `lr` times `scale`, or the data's own width.
+    pub lr_width: Option<u32>,
+    /// Width of the HR images; without it: `lr_width` times `scale`, or the data's own width.
     #[schemars(range(min = 1))]
-    pub hr: Option<u32>,
-    /// HR width over LR width; not needed where `lr` and `hr` are given. Without any of them: 2.
+    pub hr_width: Option<u32>,
+    /// HR width over LR width; not needed where `lr_width` and `hr_width` are given. Without any of them: 2.
     #[schemars(range(min = 1.0, max = 16.0))]
     pub scale: Option<f64>,
-    /// Whether, and how, LR images are made from HR ones. `none`: the photographs are LR images themselves, and there is no HR truth.
-    /// Without it: `none` for COLMAP and transforms.json, people's own photographs, where no `lr` is asked for; else by `kernel`.
-    pub degrade: Option<Degrade>,
-    /// How LR images are made from HR ones; where nothing is made, what is taken to have made them. Without it: `lanczos`, there `box`.
+    /// Where LR images come from: `photographs` as given, without HR truth, or `downscaled` from HR images by `kernel`. Without it:
+    /// `photographs` for COLMAP and transforms.json, people's own photographs, where no `lr_width` is given; else `downscaled`.
+    pub lr_source: Option<LrSource>,
+    /// The kernel that makes LR images from HR ones; with `lr_source: photographs`, the kernel that is assumed to have made them.
+    /// Without it: `lanczos` for downscaled images, `box` for photographs.
     pub kernel: Option<Kernel>,
     /// What is done about lenses that aren't pinholes.
     pub lens: LensHandling,
@@ -74,18 +75,18 @@ pub struct Params {
     /// At most so many test views, spread evenly; without it: all.
     #[schemars(range(min = 1))]
     pub test_views: Option<u32>,
-    /// So many training views are kept at HR, as references for refinement: the first, then each time the one whose camera stands farthest from
-    /// those.
-    pub references: u32,
+    /// Training views that are kept at HR, as references for refinement: the first, then each time the one whose camera stands farthest
+    /// from those.
+    pub hr_references: u32,
 }
 
 impl Default for Params {
     fn default() -> Self {
         Self {
-            lr: None,
-            hr: None,
+            lr_width: None,
+            hr_width: None,
             scale: None,
-            degrade: None,
+            lr_source: None,
             kernel: None,
             lens: LensHandling::Follow,
             background: None,
@@ -95,7 +96,7 @@ impl Default for Params {
             hull: HullSource::None,
             split: None,
             test_views: None,
-            references: 1,
+            hr_references: 1,
         }
     }
 }
@@ -112,33 +113,14 @@ pub enum LensHandling {
     Ignore,
 }
 
-/// How LR images come about.
+/// Where LR images come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
-pub enum Degrade {
-    /// They are what is given.
-    None,
-    /// From HR images, by that kernel.
-    Lanczos,
-    /// From HR images, by that kernel.
-    Bicubic,
-    /// From HR images, by that kernel.
-    Box,
-    /// From HR images, by that kernel.
-    Average,
-}
-
-impl Degrade {
-    /// Its kernel, where there is one.
-    fn kernel(self) -> Option<Kernel> {
-        match self {
-            Self::None => None,
-            Self::Lanczos => Some(Kernel::Lanczos),
-            Self::Bicubic => Some(Kernel::Bicubic),
-            Self::Box => Some(Kernel::Box),
-            Self::Average => Some(Kernel::Average),
-        }
-    }
+pub enum LrSource {
+    /// The photographs as they are given; there is no HR truth.
+    Photographs,
+    /// HR images, made smaller by `kernel`.
+    Downscaled,
 }
 
 /// Where a visual hull comes from.
@@ -221,14 +203,10 @@ impl Stage for Prep {
     }
 
     fn rules() -> Vec<Rule> {
-        let whole = |parameter: &str| {
-            let message = format!("parameter {parameter}: average needs a whole scale; choose box, or another scale");
-            Rule::new(&message).when(parameter, json!({"const": "average"})).must("scale", json!({"multipleOf": 1}))
-        };
+        let whole = Rule::new("parameter kernel: average needs a whole scale; choose box, or another scale");
         let boxed = Rule::new("parameter hull: alpha carves a box; choose space: box, too");
         vec![
-            whole("kernel"),
-            whole("degrade"),
+            whole.when("kernel", json!({"const": "average"})).must("scale", json!({"multipleOf": 1})),
             boxed.when("hull", json!({"const": "alpha"})).must("space", json!({"enum": [null, "box"]})),
         ]
     }
@@ -264,9 +242,9 @@ impl Stage for Prep {
         let native = (first.width, first.height);
         let making = Making::new(&set, params).map_err(Failure::Usage)?;
         let sizes = if making.has_truth {
-            sizes(native, params.lr, params.hr, params.scale)
+            sizes(native, params.lr_width, params.hr_width, params.scale)
         } else {
-            enlarged(native, params.hr, params.scale)
+            enlarged(native, params.hr_width, params.scale)
         };
         let job = Job { context, params, making, sizes: sizes.usage("parameters")?, native };
         let notes: Vec<String> = set.notes.iter().cloned().chain([job.choice(&split)]).chain(warnings).collect();
@@ -314,7 +292,7 @@ fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
-            let most = (params.references as usize).min(count.saturating_sub(1));
+            let most = (params.hr_references as usize).min(count.saturating_sub(1));
             let chosen = references::choose(set.frames.iter().map(|f| f.camera().centre()), most);
             split.test.retain(|i| !chosen.contains(i));
             Ok(split)
@@ -332,22 +310,20 @@ struct Making {
 impl Making {
     fn new(set: &Dataset, params: &Params) -> Result<Self, String> {
         let is_benchmark = matches!(set.format, Format::Blender | Format::Llff);
-        let has_truth = match params.degrade {
-            Some(degrade) => degrade != Degrade::None,
-            None => is_benchmark || params.lr.is_some(),
+        let has_truth = match params.lr_source {
+            Some(source) => source == LrSource::Downscaled,
+            None => is_benchmark || params.lr_width.is_some(),
         };
-        let by_degrade = params.degrade.and_then(Degrade::kernel);
-        if let (Some(one), Some(other)) = (by_degrade, params.kernel.filter(|k| by_degrade.is_some_and(|d| d != *k))) {
-            return Err(format!("parameter kernel: {other:?} where degrade is {one:?}; give one of them"));
-        }
-        if !has_truth && params.lr.is_some() {
-            return Err("parameter lr: without degradation the photographs' own size is the LR size; leave lr out".to_owned());
+        if !has_truth && params.lr_width.is_some() {
+            return Err(
+                "parameter lr_width: with lr_source photographs their own width is the LR width; leave lr_width out".to_owned()
+            );
         }
         if !has_truth && params.kernel == Some(Kernel::Average) {
             return Err("parameter kernel: average makes LR images and can't be assumed; choose box".to_owned());
         }
         let default = if has_truth { Kernel::Lanczos } else { Kernel::Box };
-        Ok(Self { has_truth, kernel: by_degrade.or(params.kernel).unwrap_or(default) })
+        Ok(Self { has_truth, kernel: params.kernel.unwrap_or(default) })
     }
 }
 
@@ -435,7 +411,7 @@ impl Job<'_> {
         notes.push(space_note(&bounds, background));
         self.context.say(space_note(&bounds, background));
 
-        let count = if self.making.has_truth { self.params.references as usize } else { 0 };
+        let count = if self.making.has_truth { self.params.hr_references as usize } else { 0 };
         let references = references::choose(train_cameras.iter().map(Camera::centre), count);
         let train_pictures = train
             .par_iter()

@@ -18,7 +18,7 @@ impl Sizes {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SizeError {
     /// All three given, and they contradict each other.
-    #[error("lr = {lr}, hr = {hr} and scale = {scale} contradict each other; give two of them")]
+    #[error("lr_width = {lr}, hr_width = {hr} and scale = {scale} contradict each other; give two of them")]
     Contradiction {
         /// LR width.
         lr: u32,
@@ -57,7 +57,7 @@ pub enum SizeError {
     },
 }
 
-/// LR and HR size from what is given of `lr`, `hr` and `scale`. Widths are given; heights follow the data's aspect.
+/// LR and HR size from what is given of `lr_width`, `hr_width` and `scale`. Widths are given; heights follow the data's aspect.
 pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option<f64>) -> Result<Sizes, SizeError> {
     let times = |w: u32, s: f64| (f64::from(w) * s).round() as u32;
     // Where both widths are given, they say the scale.
@@ -78,18 +78,18 @@ pub fn sizes(native: (u32, u32), lr: Option<u32>, hr: Option<u32>, scale: Option
         return Err(SizeError::Unchanged { scale, hr });
     }
     if hr > native.0 {
-        let name = if lr > native.0 { "lr" } else { "hr" };
+        let name = if lr > native.0 { "lr_width" } else { "hr_width" };
         let asked = if lr > native.0 { lr } else { hr };
         return Err(SizeError::TooLarge { name, asked, larger: "the data's images", limit: native.0 });
     }
     if lr > hr {
-        return Err(SizeError::TooLarge { name: "lr", asked: lr, larger: "hr", limit: hr });
+        return Err(SizeError::TooLarge { name: "lr_width", asked: lr, larger: "hr_width", limit: hr });
     }
     let height = |w: u32| ((f64::from(native.1) * f64::from(w) / f64::from(native.0)).round() as u32).max(1);
     Ok(Sizes { lr: (lr, height(lr)), hr: (hr, height(hr)) })
 }
 
-/// LR and HR size where the photographs are the LR images: HR from `hr` or `scale`.
+/// LR and HR size where the photographs are the LR images: HR from `hr_width` or `scale`.
 pub fn enlarged(native: (u32, u32), hr: Option<u32>, scale: Option<f64>) -> Result<Sizes, SizeError> {
     let scale = match (hr, scale) {
         (Some(hr), Some(scale)) if (f64::from(native.0) * scale).round() != f64::from(hr) => {
@@ -99,7 +99,7 @@ pub fn enlarged(native: (u32, u32), hr: Option<u32>, scale: Option<f64>) -> Resu
         (None, scale) => scale.unwrap_or(2.0),
     };
     if scale < 1.0 {
-        return Err(SizeError::TooLarge { name: "lr", asked: native.0, larger: "hr", limit: hr.unwrap_or_default() });
+        return Err(SizeError::TooLarge { name: "lr_width", asked: native.0, larger: "hr_width", limit: hr.unwrap_or_default() });
     }
     let times = |length: u32| (f64::from(length) * scale).round() as u32;
     Ok(Sizes { lr: native, hr: (times(native.0), times(native.1)) })
@@ -134,18 +134,24 @@ mod tests {
             assert_eq!(enlarged((90, 61), hr, scale), Ok(expected));
         }
         assert_eq!(enlarged((90, 61), None, None).map(|s| s.hr), Ok((180, 122)));
-        assert!(matches!(enlarged((90, 61), Some(80), None), Err(SizeError::TooLarge { name: "lr", asked: 90, limit: 80, .. })));
+        assert!(matches!(
+            enlarged((90, 61), Some(80), None),
+            Err(SizeError::TooLarge { name: "lr_width", asked: 90, limit: 80, .. })
+        ));
         assert!(matches!(enlarged((90, 61), Some(200), Some(2.0)), Err(SizeError::Contradiction { .. })));
     }
 
     #[test]
     fn enlarging_and_contradictions_are_refused() {
-        assert!(matches!(sizes((800, 800), Some(900), None, Some(1.0)), Err(SizeError::TooLarge { name: "lr", asked: 900, .. })));
+        assert!(matches!(
+            sizes((800, 800), Some(900), None, Some(1.0)),
+            Err(SizeError::TooLarge { name: "lr_width", asked: 900, .. })
+        ));
         assert!(matches!(
             sizes((800, 800), Some(500), None, Some(2.0)),
-            Err(SizeError::TooLarge { name: "hr", asked: 1000, .. })
+            Err(SizeError::TooLarge { name: "hr_width", asked: 1000, .. })
         ));
-        assert!(matches!(sizes((800, 800), Some(500), Some(400), None), Err(SizeError::TooLarge { larger: "hr", .. })));
+        assert!(matches!(sizes((800, 800), Some(500), Some(400), None), Err(SizeError::TooLarge { larger: "hr_width", .. })));
         assert!(matches!(sizes((800, 800), Some(100), Some(300), Some(2.0)), Err(SizeError::Contradiction { .. })));
         assert!(matches!(sizes((4, 4), None, None, Some(16.0)), Err(SizeError::Nothing { .. })));
         assert_eq!(sizes((1, 1), None, None, None), Err(SizeError::Unchanged { scale: 2.0, hr: 1 }));

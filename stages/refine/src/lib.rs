@@ -29,14 +29,14 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Share of what the network predicts that is added. Without it: what was best for the views that its training left out.
+    /// Share of the predicted residual that is added. Without it: what was best for the views that its training left out.
     #[schemars(range(min = 0.0, max = 2.0))]
-    pub strength: Option<f64>,
+    pub residual_weight: Option<f64>,
     /// At most so many of the references given, the first. Without it: all.
-    pub references: Option<u32>,
+    pub max_references: Option<u32>,
     /// Ways to turn and mirror a view in which our network sees it; the mean of what it adds is taken. Time grows with them.
     #[schemars(range(min = 1, max = 8))]
-    pub turns: u32,
+    pub self_ensemble: u32,
     /// `net: paper`: pixels by which its patches of 64 overlap and are blended.
     #[schemars(range(min = 0, max = 32))]
     pub overlap: u32,
@@ -44,7 +44,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { strength: None, references: None, turns: 4, overlap: OVERLAP as u32 }
+        Self { residual_weight: None, max_references: None, self_ensemble: 4, overlap: OVERLAP as u32 }
     }
 }
 
@@ -85,11 +85,11 @@ impl Stage for Refine {
         let refiner = context.input("refiner")?;
         let file: RefinerFile = refiner.read_json(REFINER_FILE)?;
         let network = AnyRefiner::read(refiner, &file)?;
-        let strength = params.strength.unwrap_or(file.strength) as f32;
+        let strength = params.residual_weight.unwrap_or(file.strength) as f32;
         let input = context.input("views")?;
         let mut views = Views::read(input)?;
         let mut references = references(context, network.takes_references(), views.background)?;
-        references.truncate(params.references.map_or(usize::MAX, |most| most as usize));
+        references.truncate(params.max_references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(LrObservations::read).transpose()?;
         // Those that the network learnt by agreed, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
@@ -103,7 +103,7 @@ impl Stage for Refine {
             background: views.background.shown(),
             network,
             strength,
-            turns: params.turns,
+            turns: params.self_ensemble,
             overlap: params.overlap as usize,
             references,
             photographs,
@@ -157,7 +157,7 @@ fn references(context: &Context, wanted: bool, background: Background) -> anyhow
     };
     if !wanted {
         context
-            .say("the network was trained without references: those given are left out; set train-refine's parameter references");
+            .say("the network was trained without references: those given are left out; set train-refine's parameter references_per_view");
         return Ok(Vec::new());
     }
     let (pictures_list, rendered_list) = (Views::read(pictures)?, Views::read(rendered)?);

@@ -22,10 +22,10 @@ pub struct Params {
     /// Width of the views; heights follow the cameras' aspect. Without it: the cameras' own size.
     #[schemars(range(min = 1, max = 65536))]
     pub size: Option<u32>,
-    /// Sub-rays along each side of a pixel: it shows the mean of their colours, as a camera's pixel does, and a depth that one of
+    /// Rays along each side of a pixel; 2 casts four: it shows the mean of their colours, as a camera's pixel does, and a depth that one of
     /// them has.
     #[schemars(range(min = 1, max = 8))]
-    pub sub_rays: u32,
+    pub samples_per_axis: u32,
     /// Which depth goes into `Z`. The median is a surface's, where the mean lies between that and the haze before it: neighbouring views'
     /// medians agree far more often.
     pub depth: Depth,
@@ -35,7 +35,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: None, sub_rays: 2, depth: Depth::Median, ray_distance: false }
+        Self { size: None, samples_per_axis: 2, depth: Depth::Median, ray_distance: false }
     }
 }
 
@@ -143,7 +143,7 @@ impl RenderJob<'_> {
     fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> anyhow::Result<Vec<u8>> {
         let width = self.camera.intrinsics.width as usize;
         let background = [self.background.shown(); 3];
-        let n = self.params.sub_rays as usize;
+        let n = self.params.samples_per_axis as usize;
         let (rays, to_z): (Vec<Ray>, Vec<f32>) = (0..rows * width * n * n)
             .map(|i| {
                 let (pixel, sub) = (i / (n * n), i % (n * n));

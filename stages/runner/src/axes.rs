@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::known_names;
+use artifact::{Named, known_names, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;
@@ -58,6 +58,13 @@ impl Kind {
         }
     }
 
+    fn named(self) -> Named {
+        match self {
+            Self::Parameter => Named::Parameter,
+            Self::Input => Named::Input,
+        }
+    }
+
     fn names(self, program: &StageProgram) -> Vec<&str> {
         match self {
             Self::Parameter => program.schema.names(),
@@ -105,7 +112,7 @@ impl Scope<'_> {
         let given = format!("{} {text}", kind.flag());
         let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
         let (name, text) = text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
-        let (stage, name) = self.owner(kind, name)?;
+        let (stage, name) = self.owner(kind, name, text)?;
         let program = self.programs.require(&stage)?;
         let values: Vec<AxisValue> = match kind {
             Kind::Parameter => {
@@ -129,12 +136,12 @@ impl Scope<'_> {
 
     /// The stage that a name belongs to, and the name without it. Where several stages have the name, that one is meant that the targets need; a
     /// block that extends another follows that one.
-    fn owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
+    fn owner(&self, kind: Kind, name: &str, value: &str) -> Result<(String, String), PlanError> {
         // A stage's own name may have a point.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
         let stated = splits.find(|(stage, _)| self.pipeline.stages.contains_key(*stage)).or_else(|| name.split_once('.'));
         if let Some((stage, own)) = stated {
-            return self.stated_owner(kind, stage, own);
+            return self.stated_owner(kind, (stage, own), value);
         }
         let has = |stage: &str| self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name));
         let follows = |stage: &str| {
@@ -144,8 +151,14 @@ impl Scope<'_> {
         };
         let with_name: Vec<&String> = self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
         let meant: Vec<&String> = with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
+        // A stage that is needed had the name, and another one has it.
+        if meant.is_empty()
+            && let Some(problem) = self.renamed(kind, self.needed, name, value)
+        {
+            return Err(PlanError::Usage(format!("{} {name}: {problem}", kind.flag())));
+        }
         match if meant.is_empty() { &with_name } else { &meant }[..] {
-            [] => Err(self.unknown(kind, name)),
+            [] => Err(self.unknown(kind, name, value)),
             [stage] => Ok((stage.clone(), name.to_owned())),
             ref several => {
                 let options = several.iter().map(|s| format!("{s}.{name}")).collect::<Vec<_>>().join(", ");
@@ -156,7 +169,7 @@ impl Scope<'_> {
     }
 
     /// The stage that is named itself, which must have such a parameter or input.
-    fn stated_owner(&self, kind: Kind, stage: &str, own: &str) -> Result<(String, String), PlanError> {
+    fn stated_owner(&self, kind: Kind, (stage, own): (&str, &str), value: &str) -> Result<(String, String), PlanError> {
         let usage = |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
         if !self.pipeline.stages.contains_key(stage) {
             let known = known_blocks(stage, self.pipeline.stages.keys().map(String::as_str));
@@ -166,10 +179,29 @@ impl Scope<'_> {
         if names.contains(&own) {
             return Ok((stage.to_owned(), own.to_owned()));
         }
+        if let Some(problem) = self.renamed(kind, [stage], own, value) {
+            return Err(usage(problem));
+        }
         Err(usage(format!("{stage} has no such {}; {}", kind.noun(), known_names(own, names))))
     }
 
-    fn unknown(&self, kind: Kind, name: &str) -> PlanError {
+    /// What to say of a name that one of these stages had once.
+    fn renamed<'s>(
+        &self,
+        kind: Kind,
+        stages: impl IntoIterator<Item = &'s (impl AsRef<str> + ?Sized + 's)>,
+        name: &str,
+        value: &str,
+    ) -> Option<String> {
+        let programs = stages.into_iter().filter_map(|stage| self.programs.get(stage.as_ref()));
+        let programs = programs.map(|program| program.description.name.as_str());
+        renamed_in(kind.named(), programs, name, Some(&Value::from(value)))
+    }
+
+    fn unknown(&self, kind: Kind, name: &str, value: &str) -> PlanError {
+        if let Some(problem) = self.renamed(kind, self.pipeline.stages.keys(), name, value) {
+            return PlanError::Usage(format!("{} {name}: {problem}", kind.flag()));
+        }
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
         let meant = artifact::nearest(name, known).map(|known| format!("did you mean {known}? ")).unwrap_or_default();

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use artifact::{Description, Input, known_names};
+use artifact::{Description, Input, Named, known_names, renamed};
 
 use crate::file::StageBlock;
 use crate::pipeline::{Part, Pipeline, PipelineError, Source};
@@ -73,6 +73,9 @@ fn check_input(description: &Description, input: &str, source: &str, programs: &
     // A sink gets one record of all that it is shown; what its inputs are called is the file's own affair.
     let record = || description.inputs.get("run").filter(|_| description.sink);
     let Some(port) = description.inputs.get(input).or_else(record) else {
+        if let Some(rename) = renamed(Named::Input, &description.name, input) {
+            return Err(format!("input {input}: {}", rename.problem(None)));
+        }
         let known = known_names(input, description.inputs.keys().map(String::as_str));
         return Err(format!("it has no input {input:?}; {known}"));
     };

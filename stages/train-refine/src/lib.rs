@@ -39,24 +39,24 @@ pub struct Params {
     /// Steps of training. Without it: 4,000 for `compact`, 46,875 for `paper`.
     #[schemars(range(min = 1))]
     pub steps: Option<u64>,
-    /// Squares of a view in a step. Without it: 8 for `compact`, 32 for `paper`.
+    /// Patches of views in a step. Without it: 8 for `compact`, 32 for `paper`.
     #[schemars(range(min = 1, max = 4096))]
     pub batch: Option<u32>,
-    /// Pixels along a square's side; a multiple of 2 for `compact`, of 8 for `paper`.
+    /// Pixels along a patch's side; a multiple of 2 for `compact`, of 8 for `paper`.
     #[schemars(range(min = 8, max = 1024))]
-    pub square: u32,
+    pub patch_size: u32,
     /// Highest learning rate. Without it: 0.001 for `compact`, 0.0005 for `paper`.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub rate: Option<f64>,
     /// Features of the network's hidden layers; of the first for `paper`. Without it: 32 for `compact`, 128 for `paper`.
     #[schemars(range(min = 1, max = 512))]
-    pub channels: Option<u32>,
+    pub features: Option<u32>,
     /// `compact`: residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64))]
     pub blocks: u32,
-    /// `compact`: references that each view will have when it is refined; 0 trains a network that does without.
+    /// `compact`: references that each view gets while the network learns, as many as it will have when it is refined; 0 trains a network that does without.
     #[schemars(range(min = 0, max = 64))]
-    pub references: u32,
+    pub references_per_view: u32,
     /// `compact`: whether a reference shows only what it sees by its own depth; without it also what something stands before (to be compared with).
     pub occlusion: bool,
     /// `compact`: whether what a reference shows is moved, by up to two pixels, to fit what is rendered (to be compared with).
@@ -74,11 +74,11 @@ impl Default for Params {
             net: Net::Compact,
             steps: None,
             batch: None,
-            square: 64,
+            patch_size: 64,
             rate: None,
-            channels: None,
+            features: None,
             blocks: 4,
-            references: 0,
+            references_per_view: 0,
             occlusion: true,
             alignment: false,
             patches: 8,
@@ -147,24 +147,29 @@ impl Stage for TrainRefine {
         if params.net == Net::Paper {
             return paper::run(context, params);
         }
-        if params.square % 2 == 1 {
-            return Err(Failure::Usage(format!("parameter square: {} is odd; an even number is expected", params.square)).into());
+        if params.patch_size % 2 == 1 {
+            return Err(Failure::Usage(format!(
+                "parameter patch_size: {} is odd; an even number is expected",
+                params.patch_size
+            ))
+            .into());
         }
         let own = lr_observations(context)?;
         let (training, left_out) = examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
-        if params.references > 0 && training.len() < 2 {
+        if params.references_per_view > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
         let architecture = RefinerArchitecture {
-            channels: params.channels.unwrap_or(32),
+            channels: params.features.unwrap_or(32),
             blocks: params.blocks,
-            guidance: (params.references > 0).then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),
+            guidance: (params.references_per_view > 0)
+                .then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),
         };
         let options = RefinerTraining {
             steps: params.steps.unwrap_or(4000),
             batch: params.batch.unwrap_or(8) as usize,
-            square: params.square as usize,
-            references: params.references as usize,
+            square: params.patch_size as usize,
+            references: params.references_per_view as usize,
             rate: params.rate.unwrap_or(1e-3),
             seed: params.seed,
         };
@@ -201,7 +206,8 @@ fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_
 /// What training brought to some views.
 fn say(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
     let RefinerFile { rendered_psnr, refined_psnr, strength, .. } = file;
-    let summary = format!("{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (strength {strength:.2})");
+    let summary =
+        format!("{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight {strength:.2})");
     context.say(&summary);
     context.write_summary(&summary)
 }

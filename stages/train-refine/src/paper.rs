@@ -17,7 +17,7 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
     let options = PaperTraining {
         steps: params.steps.unwrap_or(46_875),
         batch: params.batch.unwrap_or(32) as usize,
-        patch: params.square as usize,
+        patch: params.patch_size as usize,
         references: params.patches as usize,
         rate: params.rate.unwrap_or(5e-4),
         seed: params.seed,
@@ -28,7 +28,7 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         Some(loss) => format!("L1 and the perceptual loss of {} of VGG-19's 5 blocks", loss.blocks()),
         None => "L1 alone: give input weights for the perceptual loss".to_owned(),
     });
-    let width = params.channels.unwrap_or(128);
+    let width = params.features.unwrap_or(128);
     let network = PaperRefiner::new(width, params.seed)?;
     let mut trainer = PaperTrainer::new(network, options, perceptual)?;
     train(context, options.steps, &mut trainer, &known, |error| format!("L1 {error:.4}"))?;

@@ -216,9 +216,9 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         Ok(trainer.finish())
     };
     // Rays drawn evenly over all pixels, so that the figure compares with others'; then as trainings really go.
-    let params = Params { rays: Some(rays), detail: Some(1.0), ..Params::default() };
+    let params = Params { rays: Some(rays), pixel_importance: Some(1.0), ..Params::default() };
     let field = run(&params, rows, "")?;
-    run(&Params { detail: None, ..params.clone() }, rows, "_by_detail")?;
+    run(&Params { pixel_importance: None, ..params.clone() }, rows, "_by_detail")?;
     let short = Params { rays: Some(rays / 6), ..params.clone() };
     run(&short, rows, "_first_sixth")?;
     one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
@@ -258,7 +258,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;
     let params =
-        Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), crop_steps: Some(0), ..Params::default() };
+        Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), precrop_steps: Some(0), ..Params::default() };
     nets::deterministic();
     let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None, &|_| ())?;
     let architecture = params.mlp();

@@ -54,7 +54,7 @@ pub(crate) fn start(
         FieldModel::Grid(architecture) => {
             let field = match from {
                 Some(weights) => {
-                    let mut field = Field::read(weights, architecture, bounds).bad_input("input field")?;
+                    let mut field = Field::read(weights, architecture, bounds).bad_input("input init")?;
                     field.limit_to_occupied();
                     field
                 }
@@ -78,7 +78,7 @@ pub(crate) fn start(
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
             let field = match from {
-                Some(weights) => torch_field::Mlp::read(weights, architecture, bounds, device).bad_input("input field")?,
+                Some(weights) => torch_field::Mlp::read(weights, architecture, bounds, device).bad_input("input init")?,
                 None => torch_field::Mlp::new(architecture, bounds, params.seed, device)?,
             };
             Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(rays, epoch))?))

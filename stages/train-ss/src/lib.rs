@@ -35,7 +35,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use member::Member;
-pub use params::{Begun, FieldKind, Params, RateSchedule};
+pub use params::{Combine, FieldKind, Params, RateSchedule};
 pub use supervision::{Order, Supersampling, SupersamplingOptions, Supervision};
 
 /// `training.json`: how the training went, over all members one after the other.
@@ -119,10 +119,10 @@ impl Stage for TrainSs {
                 Input::optional(&["scene/references"], "HR pictures of some views, to be trained on beside the LR ones"),
             ),
             (
-                "field",
+                "init",
                 Input::optional(
                     &["field"],
-                    "a field that the same parameters gave of the same scene, to go on from; parameter begun says what becomes of it",
+                    "a field that the same parameters gave of the same scene, to fine-tune; parameter combine says how both are used",
                 ),
             ),
         ]
@@ -149,22 +149,22 @@ impl Stage for TrainSs {
         let references = context.optional_input("references");
         let views = Views::read(input)?;
         let epoch = epoch(&views, params);
-        let kept = params.begun(&views.bounds.space);
-        let begun = context.optional_input("field");
+        let kept = params.combine(&views.bounds.space);
+        let begun = context.optional_input("init");
         let params = if begun.is_some() { &params.going_on() } else { params };
         let params = &params.suited(&views.bounds.space, views.background, epoch);
         let model = match params.field {
             FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
             FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
         };
-        let mut file = FieldFile { field: model, members: params.members, bounds: views.bounds, background: views.background };
-        let begun = begun.map(|input| BegunField::read(input, &file)).transpose()?;
+        let mut file = FieldFile { field: model, members: params.ensemble, bounds: views.bounds, background: views.background };
+        let begun = begun.map(|input| InitField::read(input, &file)).transpose()?;
         let first = match (&begun, kept) {
-            (Some(begun), Begun::Beside) => begun.keep_beside(context, &mut file)?,
+            (Some(begun), Combine::Ensemble) => begun.keep_beside(context, &mut file)?,
             _ => 0,
         };
         let all = params.rays(epoch);
-        let members: Vec<Params> = (0..params.members).map(|index| params.member(index, all)).collect();
+        let members: Vec<Params> = (0..params.ensemble).map(|index| params.member(index, all)).collect();
         let compared = if params.pose_refinement { members[0].rays(epoch) } else { 0 };
         let progress = context.progress("training", compared + all);
         let data = TrainingData { input, references, views: &views, progress: &progress };
@@ -206,12 +206,12 @@ pub(crate) struct TrainingData<'a> {
 }
 
 /// A field to go on from.
-struct BegunField<'a> {
+struct InitField<'a> {
     input: &'a GivenInput,
     members: u32,
 }
 
-impl<'a> BegunField<'a> {
+impl<'a> InitField<'a> {
     /// Reads what it says of itself, which must be what is to be trained.
     fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
         let file: FieldFile = input.read_json(FIELD_FILE)?;
@@ -222,7 +222,7 @@ impl<'a> BegunField<'a> {
             ("is made of something else than the parameters ask for; give those it was trained with", file.field != wanted.field),
         ];
         match differs.iter().find(|(_, differs)| *differs) {
-            Some((what, _)) => Err(Failure::BadInput(format!("input field: it {what}")).into()),
+            Some((what, _)) => Err(Failure::BadInput(format!("input init: it {what}")).into()),
             None => Ok(Self { input, members: file.members }),
         }
     }
@@ -237,12 +237,12 @@ impl<'a> BegunField<'a> {
         file.members += self.members;
         file.check().map_err(|reason| {
             let message =
-                format!("parameter members: {reason} with those of input field beside; lower it, or set begun averaged");
+                format!("parameter ensemble: {reason} with those of input init; lower it, or set combine to average_weights");
             Failure::Usage(message)
         })?;
         for index in 0..self.members {
             std::fs::copy(self.member(index), context.output_path(&FieldFile::member(index))?)
-                .context("cannot keep input field")?;
+                .context("cannot keep input init")?;
         }
         Ok(self.members)
     }
@@ -355,10 +355,10 @@ pub fn supervision(
         supervision,
         scale: [params.supersample; 2],
         filter: kernel.filter(),
-        coarse: params.coarse(),
+        coarse: params.supersample_warmup(),
         order: params.order(),
         crop_groups: params.crop_groups(rays),
-        detail: params.detail(),
+        detail: params.pixel_importance(),
         exposure: params.exposure,
         pose_refinement: params.pose_refinement,
         seed: params.seed,

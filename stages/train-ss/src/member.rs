@@ -7,7 +7,7 @@ use radiance::{FieldFile, FieldModel};
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
-use crate::{Begun, Params, Photographs, TrainingData, TrainingLog, epoch, read_hull, supervision};
+use crate::{Combine, Params, Photographs, TrainingData, TrainingLog, epoch, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
@@ -15,7 +15,7 @@ pub(crate) struct Member<'a> {
     params: Params,
     model: FieldModel,
     /// Weights to go on from, and what becomes of them.
-    from: Option<(PathBuf, Begun)>,
+    from: Option<(PathBuf, Combine)>,
     /// Where its weights go.
     output: PathBuf,
     work: Option<PathBuf>,
@@ -35,7 +35,7 @@ impl<'a> Member<'a> {
     pub(crate) fn new(
         context: &'a Context,
         params: Params,
-        (model, from): (FieldModel, Option<(PathBuf, Begun)>),
+        (model, from): (FieldModel, Option<(PathBuf, Combine)>),
         index: u32,
         before: u64,
     ) -> anyhow::Result<Self> {
@@ -113,7 +113,7 @@ impl<'a> Member<'a> {
     /// Trains to the end, with checkpoints, progress and a curve.
     fn train(&self, params: &Params, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
-        let most = params.references.map_or(usize::MAX, |most| most as usize);
+        let most = params.max_references.map_or(usize::MAX, |most| most as usize);
         let references = data.references.map(|input| Photographs::read_first(input, most)).transpose()?;
         let mut supervision = supervision(input, params, Photographs::read(input)?, references, &|text| context.say(text))?;
         let epoch = epoch(views, params);
@@ -155,7 +155,7 @@ impl<'a> Member<'a> {
         log.poses = supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
         log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
         trainer.finish(&self.output)?;
-        if let Some((from, Begun::Averaged)) = &self.from {
+        if let Some((from, Combine::AverageWeights)) = &self.from {
             average(self.model, views.bounds, from, &self.output).context("cannot average the weights")?;
         }
         if let Some(work) = &self.work {

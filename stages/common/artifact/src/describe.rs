@@ -40,7 +40,7 @@ pub struct Description {
 impl Description {
     /// Says what is wrong with a description that has the right form: what it names must be there, and its folders inside the output.
     pub fn check(&self) -> Result<(), String> {
-        let schema = Schema::new(&self.parameters).map_err(|e| format!("its parameter schema is {e}"))?;
+        let schema = Schema::new(&self.name, &self.parameters).map_err(|e| format!("its parameter schema is {e}"))?;
         if self.name.is_empty() {
             return Err("it has no name".to_owned());
         }

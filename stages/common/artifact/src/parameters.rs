@@ -1,11 +1,13 @@
 use serde_json::{Map, Value, json};
 
 use crate::nearest::{known_names, nearest};
+use crate::renames::{Named, renamed};
 use crate::values::Reader;
 
 /// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and in the stage alike.
 #[derive(Debug)]
 pub struct Schema {
+    program: String,
     schema: Value,
     validator: jsonschema::Validator,
 }
@@ -21,12 +23,12 @@ pub struct ParameterProblem {
 }
 
 impl Schema {
-    /// Compiles the schema of `describe`; the error says what is wrong with it.
-    pub fn new(schema: &Value) -> Result<Self, String> {
+    /// Compiles the schema that a program describes; the error says what is wrong with it.
+    pub fn new(program: &str, schema: &Value) -> Result<Self, String> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
         let validator = jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
-        Ok(Self { schema: schema.clone(), validator })
+        Ok(Self { program: program.to_owned(), schema: schema.clone(), validator })
     }
 
     /// Names of all parameters, sorted.
@@ -61,8 +63,7 @@ impl Schema {
             if self.properties().is_some_and(|p| p.contains_key(name)) {
                 resolved.insert(name.clone(), self.canonical_value(name, value));
             } else {
-                let problem = format!("unknown; {}", known_names(name, self.names()));
-                problems.push(ParameterProblem { name: name.clone(), problem });
+                problems.push(ParameterProblem { name: name.clone(), problem: self.unknown(name, value) });
             }
         }
         let resolved = Value::Object(resolved);
@@ -77,6 +78,14 @@ impl Schema {
             problems.push(ParameterProblem { name, problem });
         }
         if problems.is_empty() { Ok(resolved) } else { Err(problems) }
+    }
+
+    /// What to say of a parameter that there isn't.
+    fn unknown(&self, name: &str, value: &Value) -> String {
+        match renamed(Named::Parameter, &self.program, name) {
+            Some(rename) => rename.problem(Some(value)),
+            None => format!("unknown; {}", known_names(name, self.names())),
+        }
     }
 
     /// The words a parameter may be, where it is a choice: the validator itself only says that no alternative fits.
@@ -137,20 +146,23 @@ mod tests {
     use serde_json::json;
 
     fn schema() -> Schema {
-        Schema::new(&json!({
-            "type": "object",
-            "additionalProperties": false,
-            "properties": {
-                "scale": {"type": "integer", "format": "uint32", "minimum": 1, "default": 2},
-                "rate": {"type": "number", "default": 2.0},
-                "peak": {"type": "number", "default": 255},
-                "width": {"type": ["integer", "null"], "default": null},
-                "place": {"type": "array", "items": {"type": "number"}, "default": [1, 0.5]},
-                "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
-                "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}], "default": null}
-            },
-            "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"}, {"const": "lanczos", "type": "string"}]}}
-        }))
+        Schema::new(
+            "x",
+            &json!({
+                "type": "object",
+                "additionalProperties": false,
+                "properties": {
+                    "scale": {"type": "integer", "format": "uint32", "minimum": 1, "default": 2},
+                    "rate": {"type": "number", "default": 2.0},
+                    "peak": {"type": "number", "default": 255},
+                    "width": {"type": ["integer", "null"], "default": null},
+                    "place": {"type": "array", "items": {"type": "number"}, "default": [1, 0.5]},
+                    "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
+                    "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}], "default": null}
+                },
+                "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"}, {"const": "lanczos", "type": "string"}]}}
+            }),
+        )
         .unwrap()
     }
 

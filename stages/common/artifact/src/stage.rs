@@ -20,9 +20,11 @@ use crate::describe::{Description, Input, Output};
 use crate::failure::{Failure, FailureExt, exit_code, one_line};
 use crate::fsio::write_json;
 use crate::manifest::{MANIFEST_FILE, Manifest};
+use crate::nearest::known_names;
 use crate::panics::install_panic_hook;
 use crate::parameters::Schema;
 use crate::progress::{Progress, ProgressMode, StopAfter, emit_events, failed_event};
+use crate::renames::{Named, renamed};
 use crate::report_line;
 use crate::rules::Rule;
 use crate::signals::stop_on_signals;
@@ -330,7 +332,7 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     if for_runner {
         emit_events();
     }
-    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), &description.parameters)?;
+    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), description)?;
     let folders = input_folders(&arguments.inputs, description)?;
     // What made an input isn't known here; rules about that are the runner's to check.
     let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
@@ -381,8 +383,11 @@ fn input_folders<'a>(given: &'a [String], description: &Description) -> anyhow::
     for text in given {
         let (name, folder) = text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
         if !description.inputs.contains_key(name) {
-            let known = description.inputs.keys().cloned().collect::<Vec<_>>().join(", ");
-            return Err(Failure::Usage(format!("--input {name}: no such input; known: {known}")).into());
+            let problem = match renamed(Named::Input, &description.name, name) {
+                Some(rename) => rename.problem(None),
+                None => format!("no such input; {}", known_names(name, description.inputs.keys().map(String::as_str))),
+            };
+            return Err(Failure::Usage(format!("--input {name}: {problem}")).into());
         }
         folders.push((name, Path::new(folder)));
     }
@@ -407,7 +412,7 @@ fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
 }
 
 /// The parameters from the file, checked against the schema, or the defaults: as JSON and as the stage's own type.
-fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyhow::Result<(Value, P)> {
+fn read_params<P: DeserializeOwned>(file: Option<&Path>, description: &Description) -> anyhow::Result<(Value, P)> {
     let place = file.map(|f| f.display().to_string()).unwrap_or_default();
     let given = match file {
         None => serde_json::Map::new(),
@@ -416,7 +421,8 @@ fn read_params<P: DeserializeOwned>(file: Option<&Path>, schema: &Value) -> anyh
             serde_json::from_slice(&bytes).usage(format!("--params {place}: expected a JSON object"))?
         }
     };
-    let schema = Schema::new(schema).map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
+    let schema =
+        Schema::new(&description.name, &description.parameters).map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
     let resolved = schema.resolve(&given).map_err(|problems| {
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
