@@ -99,7 +99,7 @@ fn as_integer(number: &Number) -> Option<Value> {
     }
     let value = number.as_f64()?;
     const LIMIT: f64 = 18_446_744_073_709_551_616.0; // 2^64
-    if value.fract() != 0.0 || value >= LIMIT || value < -LIMIT / 2.0 {
+    if value.fract() != 0.0 || !(-LIMIT / 2.0..LIMIT).contains(&value) {
         return None;
     }
     Some(if value < 0.0 { Value::from(value as i64) } else { Value::from(value as u64) })
