@@ -105,7 +105,7 @@ fn poses_that_cannot_be_are_refused() {
         (|list| pose(list, 2)[0][3] = json!(1e30), 3, &["frame 2 (./train/r_2)", "(1e30, ", "farther from the origin than 1e9"]),
         (
             |list| {
-                pose(list, 1).as_array_mut().unwrap()[..3].iter_mut().for_each(|row| row[0] = json!(-row[0].as_f64().unwrap()))
+                pose(list, 1).as_array_mut().unwrap()[..3].iter_mut().for_each(|row| row[0] = json!(-row[0].as_f64().unwrap()));
             },
             3,
             &["frame 1 (./train/r_1)", "transform_matrix: camera_to_world is a reflection (its determinant is -1.000)"],
@@ -141,7 +141,8 @@ fn poses_that_cannot_be_are_refused() {
 /// What is likely wrong is used all the same, and said at once, in the log, in `scene.json` and at the end.
 #[test]
 fn poses_that_look_wrong_are_warned_of() {
-    let warnings: [(fn(&mut Value), &str); 4] = [
+    type Change = fn(&mut Value);
+    let warnings: [(Change, &str); 4] = [
         (|_| {}, ""),
         (
             |list| list["frames"].as_array_mut().unwrap().truncate(1),

@@ -106,6 +106,12 @@ pub(crate) fn run(plan: &Plan, store: &Store, file: &RunFile, options: &Options,
     outcome
 }
 
+/// A node's inputs: where each lies, and the hash of its content.
+struct Inputs {
+    folders: Vec<(String, PathBuf)>,
+    hashes: Vec<(String, String)>,
+}
+
 /// One node's work.
 struct NodeJob<'a> {
     node: &'a Node,
@@ -147,7 +153,8 @@ impl NodeJob<'_> {
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
         };
-        self.make(&lock, attempt, action, (&hashes, &output_of)).map(|record| (record, true))
+        let folders = self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, &output_of))).collect();
+        self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
     }
 
     /// The record, if the action was done. Either way it is written down that this run needs it, so that it can't go meanwhile.
@@ -167,22 +174,14 @@ impl NodeJob<'_> {
     }
 
     /// Calls the stage and takes in what it made.
-    fn make(
-        &self,
-        lock: &KeyLock,
-        attempt: Attempt,
-        action: Unfinished,
-        (hashes, output_of): (&[(String, String)], &dyn Fn(usize) -> String),
-    ) -> Result<Record, StageFailure> {
-        let inputs: Vec<(String, PathBuf)> =
-            self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, output_of))).collect();
+    fn make(&self, lock: &KeyLock, attempt: Attempt, action: Unfinished, inputs: &Inputs) -> Result<Record, StageFailure> {
         let label = self.node.label();
         let call = Call {
             label: &label,
             program: &self.node.program,
             params: &attempt.params,
-            inputs: &inputs,
-            hashes,
+            inputs: &inputs.folders,
+            hashes: &inputs.hashes,
             output: &attempt.output,
             work: Some(&attempt.work),
             device: &self.options.device,

@@ -115,8 +115,8 @@ mod tests {
         assert!(of(&["x/a.jpg", "x/a.png"]).unwrap_err().to_string().contains("frame 1 (x/a.png): a second view named \"a\""));
         assert_eq!(of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
         assert!(of(&["a\n.png", "a\t.png"]).unwrap_err().to_string().contains("frame 1 (a\\t.png): a second view named \"a_\""));
-        let odd = std::os::unix::ffi::OsStrExt::from_bytes(b"images/\xff\xfe.png");
-        let message = names("list".as_ref(), &[PathBuf::from(<&std::ffi::OsStr>::from(odd))]).unwrap_err().to_string();
+        let odd = <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
+        let message = names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();
         assert_eq!(message, "list: frame 0 (images/\\xFF\\xFE.png): its name is not UTF-8; rename the file");
     }
 
