@@ -190,7 +190,7 @@ fn a_run_does_what_the_plan_says() {
         (&["-p", "prep.scale=2.0", "-p", "lr_width=24.0", "-p", "demo-scene.size=48e0", "-p", "demo-scene.seed=0"], 0),
         (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
         // Equal output ends what waits.
-        (&["-p", "hr=48"], 1),
+        (&["-p", "hr_width=48"], 1),
         (&["-p", "demo-scene.train=11", "-p", "demo-scene.train=12"], 0),
         (&["-p", "kernel=box,bicubic"], 1),
         (&["-p", "demo-scene.samples_per_axis=1", "-p", "kernel=box,bicubic"], 3),
