@@ -7,11 +7,14 @@ run-tests.py [FILTER]: only tests whose names contain FILTER. Build the stages f
 import concurrent.futures
 import json
 import os
+import pathlib
 import subprocess
 import sys
 import time
 
 SLOWEST = 3
+# Seconds that each binary took last time: what takes long begins early.
+TIMES = pathlib.Path("target/test-times.json")
 
 
 def build() -> list[tuple[str, str, str]]:
@@ -28,24 +31,27 @@ def build() -> list[tuple[str, str, str]]:
             folder = os.path.dirname(message["manifest_path"])
             package = os.path.basename(folder) if kind != "test" else "tests"
             found.append((kind == "test", f"{package}::{message['target']['name']}", message["executable"], folder))
-    return [entry[1:] for entry in sorted(found)]
+    known = json.loads(TIMES.read_text()) if TIMES.exists() else {}
+    found.sort(key=lambda entry: (entry[0], -known.get(entry[1], 0) if entry[0] else 0, entry[1]))
+    return [entry[1:] for entry in found]
 
 
 class Outcome:
     """What the tests of one binary came to."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self.name = name
         self.passed, self.failed, self.skipped, self.times = 0, [], [], []
         self.output = ""
 
 
 def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
     """Runs a binary's tests one after the other, so that each has its time."""
-    outcome = Outcome()
+    outcome = Outcome(name)
     environment = dict(os.environ, CARGO_MANIFEST_DIR=folder)
     command = [path, "--test-threads=1", "--show-output", *test_filter]
     process = subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    line, begun, test = b"", time.monotonic(), None
+    line, begun, test, said_by = b"", time.monotonic(), None, ""
     while byte := process.stdout.read1(1):
         line += byte
         if line.startswith(b"test ") and line.endswith(b" ... "):
@@ -61,7 +67,7 @@ def run(name: str, path: str, folder: str, test_filter: list[str]) -> Outcome:
                 test = None
             elif text.startswith("---- ") and text.endswith(" stdout ----\n"):
                 said_by = text[5:-13]
-            elif text.startswith("skipped: ") and "said_by" in locals():
+            elif text.startswith("skipped: ") and said_by:
                 outcome.skipped.append(f"{name}::{said_by}: {text.strip()}")
     if process.wait() and not outcome.failed:
         outcome.failed.append(f"{name} ended with {process.returncode}" + (f" in {test}" if test else ""))
@@ -82,6 +88,8 @@ def main() -> int:
                 print(f"{runs[done]}: {outcome.passed} passed{failed}, {seconds:.1f} s", flush=True)
             if outcome.failed:
                 print(outcome.output, flush=True)
+    if not test_filter:
+        TIMES.write_text(json.dumps({outcome.name: sum(spent for spent, _ in outcome.times) for outcome in outcomes}))
     times = sorted((time for outcome in outcomes for time in outcome.times), reverse=True)
     skipped = sorted(set(skip for outcome in outcomes for skip in outcome.skipped))
     failed = sorted(name for outcome in outcomes for name in outcome.failed)
