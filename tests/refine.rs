@@ -76,7 +76,7 @@ fn a_block_follows_the_one_it_extends() {
         let refined = rows.as_array().unwrap().iter().filter(|row| row["stage"] == "eval-refined");
         refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
     };
-    assert_eq!(parameters("downscaled-field", "levels", &[]), ["4"]);
+    assert_eq!(parameters("downscaled-field", "n_levels", &[]), ["4"]);
     let both = ["-p", "supersample=1,2", "-p", "rays=50000"];
     assert_eq!(parameters("downscaled-field", "supersample", &both), ["1.0", "2.0"]);
     assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
@@ -453,7 +453,7 @@ fn other_fields_are_not_gone_on_from() {
     fails(own, &with("far", &file.replace("\"far\": ", "\"far\": 1")), &["input init: it lies elsewhere"]);
     let cut = with("cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
-    fails(own, &cut, &["input field", "field-0.safetensors"]);
+    fails(own, &cut, &["input init", "field-0.safetensors"]);
     // Nor can more than sixteen be kept.
     let many = own.replace('{', r#"{"ensemble": 16, "#);
     stage("train-ss", &many, &[("scene", scene.as_path()), ("init", field.as_path())], &project.path("no"), &[])
