@@ -101,13 +101,13 @@ mod tests {
             serde_json::from_value(node).unwrap()
         };
         let nodes = vec![
-            node("locate", "seed=1", Some("2 of 2 cameras located\nwarning: cameras have turned far\n")),
+            node("register", "seed=1", Some("2 of 2 cameras registered\nwarning: cameras have turned far\n")),
             node("prep", "", Some("8 training views\n")),
             node("train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
             node("script", "", None),
         ];
         let found = warnings_by_node(&RunRecord { nodes });
-        let expected = [("locate [seed=1]", "cameras have turned far"), ("train-ss", "one"), ("train-ss", "two")];
+        let expected = [("register [seed=1]", "cameras have turned far"), ("train-ss", "one"), ("train-ss", "two")];
         assert_eq!(found, expected.map(|(node, warning)| (node.to_owned(), warning.to_owned())));
     }
 }
