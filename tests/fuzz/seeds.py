@@ -73,7 +73,7 @@ stages:
     inputs: {data: make/part}
     parameters: &own {rays: 2, place: [1, 2.5]}
   again:
-    like: train
+    extends: train
     inputs: {data: ./folder}
     parameters:
       <<: *own
