@@ -214,6 +214,11 @@ fn any_file_name_may_lie_in_a_data_folder() {
         project.ok(&[&["run", "prep"][..], &from].concat());
         assert_eq!(project.output_of("prep", &from), scene);
     }
+    // The same holds for a folder that the command line names.
+    let mut command = project.command(&[&["run"][..], &from].concat());
+    let out = std::ffi::OsStr::from_bytes(b"pages-\xff");
+    assert!(command.arg("--out").arg(out).output().unwrap().status.success());
+    assert!(is_whole(&project.path(".").join(out).join("report")));
     // A link that leads back up is named, with what to do.
     std::os::unix::fs::symlink(&data, data.join("loop")).unwrap();
     project.run(&[&["run", "prep"][..], &from].concat()).fails(3, &["ds/loop", "remove the link"]);

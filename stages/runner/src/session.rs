@@ -53,6 +53,11 @@ impl Session {
     }
 }
 
+/// The command line, for people: what isn't UTF-8 in it is shown as well as can be.
+pub(crate) fn command_line() -> Vec<String> {
+    std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect()
+}
+
 /// The nodes of a stage, by the stage's name.
 pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
     let found: Vec<usize> = (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();

@@ -3,7 +3,7 @@ use std::process::ExitCode;
 use artifact::{Locked, print_line};
 
 use crate::plan::{PlanError, Request, State};
-use crate::session::Session;
+use crate::session::{Session, command_line};
 
 /// Keeps what the targets have, until `unpin`.
 pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Result<ExitCode> {
@@ -22,7 +22,7 @@ pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Resu
             }
         }
     }
-    session.store.pin(&entered, name, std::env::args().collect(), &actions)?;
+    session.store.pin(&entered, name, command_line(), &actions)?;
     print_line!("pinned {} artifacts as {name}", actions.len());
     Ok(ExitCode::SUCCESS)
 }

@@ -11,7 +11,7 @@ use crate::execute::{self, Options, Outcome};
 use crate::plan::{Plan, Request, State};
 use crate::process::StageFailure;
 use crate::remedy::Remedy;
-use crate::session::Session;
+use crate::session::{Session, command_line};
 use crate::sink::{Showing, Shown, show};
 use crate::waiting::enter;
 
@@ -44,7 +44,7 @@ pub(crate) fn run(session: &Session, what: &Request, options: &Options, out: &Pa
 fn register(session: &Session, plan: &Plan, stop: &AtomicBool) -> Result<RunFile, StageFailure> {
     let fail = |e: artifact::StoreError| StageFailure { code: 1, message: e.to_string() };
     let entered = enter(&session.store, stop, &|text| report_line!("nerf-sr: {text}"))?;
-    let file = session.store.begin_run(&entered, std::env::args().collect()).map_err(fail)?;
+    let file = session.store.begin_run(&entered, command_line()).map_err(fail)?;
     // A source that can't be read is said when the stage's turn comes; other stages may not need it.
     let states = session.states(plan).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
