@@ -132,6 +132,9 @@ enum Verb {
         /// Delete checkpoints, too, of stages that were stopped
         #[arg(long)]
         drop_unfinished: bool,
+        /// Delete what older versions of nerf-sr made, too: its keys can't be met any more
+        #[arg(long)]
+        drop_old: bool,
     },
     /// Print the help of a stage's program: what it makes, its inputs and its parameters
     Describe {
@@ -208,8 +211,8 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Verify { remove } => verbs::verify(&session.store, remove),
         Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
         Verb::Unpin { name } => verbs::unpin(&session, &name),
-        Verb::Gc { what, dry_run, keep_days, drop_unfinished } => {
-            verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished })
+        Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old } => {
+            verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished, drop_old })
         }
         Verb::Completions { .. } | Verb::Describe { .. } => unreachable!("handled before the session"),
     }

@@ -1,5 +1,5 @@
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use artifact::{Description, Record, Store, Waiting};
@@ -123,6 +123,17 @@ impl Node {
         }
     }
 
+    /// The parameters that the scene decides, with the values that a finished artifact records; null before that.
+    pub(crate) fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
+        let output = &self.program.description.output;
+        if output.resolved.is_none() {
+            return Map::new();
+        }
+        let mut recorded = output.resolved(artifact);
+        let names = self.program.schema.by_scene(&self.parameters);
+        names.into_iter().map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default())).collect()
+    }
+
     /// The nodes it needs.
     pub(crate) fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(|i| match i.from {
@@ -223,3 +234,7 @@ pub(crate) fn input_hashes(
 #[cfg(test)]
 #[path = "plan_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "variant_tests.rs"]
+mod variant_tests;

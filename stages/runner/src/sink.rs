@@ -24,6 +24,7 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
     let position = |index: usize| wanted.iter().position(|&i| i == index);
     let nodes = wanted.iter().map(|&index| {
         let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
+        let folder = store.object(&record.output);
         let inputs = node.inputs.iter().map(|input| {
             let from = match &input.from {
                 Origin::Node { index, subtree } => RunInput { node: position(*index), subtree: subtree.clone(), folder: None },
@@ -37,7 +38,8 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
             kind: node.program.description.output.kind.clone(),
             key: record.key(),
             output: record.output.clone(),
-            folder: store.object(&record.output),
+            resolved: node.by_scene(&folder),
+            folder,
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
             inputs: inputs.collect(),
             started_unix: record.started_unix,

@@ -1,12 +1,14 @@
 //! States of nodes, in words.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 
 use artifact::{Record, hash_json};
+use serde_json::Value;
 
 use crate::execute::seconds;
 use crate::key;
-use crate::plan::{Plan, Sink, State};
+use crate::plan::{Node, Plan, Sink, State};
 use crate::session::Session;
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
@@ -40,6 +42,21 @@ pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State,
             Some(changes) => format!("will run: {}", changes.join("; ")),
         },
     }
+}
+
+/// A line on the parameters that the scene decides: their values where the node is cached, else their names.
+pub(crate) fn by_scene(session: &Session, node: &Node, state: &State) -> Option<String> {
+    let artifact = match state {
+        State::Cached(record) => session.store.object(&record.output),
+        _ => PathBuf::new(),
+    };
+    let entry = |(name, value): (String, Value)| match value {
+        Value::Null => name,
+        Value::String(word) => format!("{name}={word}"),
+        value => format!("{name}={value}"),
+    };
+    let entries: Vec<String> = node.by_scene(&artifact).into_iter().map(entry).collect();
+    (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
 }
 
 /// What becomes of a sink at the end of a run. Whether its page is there is for `run` to see: it alone knows where pages are written.

@@ -3,6 +3,7 @@ use std::collections::BTreeSet;
 use artifact::{Run, Store, StoreError, Waiting, unix_time};
 
 use super::contents::Contents;
+use crate::key;
 
 /// Something that is needed, and why.
 #[derive(Debug, Clone, Default)]
@@ -24,6 +25,8 @@ pub(crate) struct Choice {
     pub(crate) keep_days: u64,
     /// Whether checkpoints of actions that nobody works on go.
     pub(crate) drop_unfinished: bool,
+    /// Whether artifacts whose keys are of an older version go.
+    pub(crate) drop_old: bool,
 }
 
 impl Choice {
@@ -50,6 +53,10 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
     roots.extend(store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)));
     for (key, record) in contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix)) {
         roots.push(one(format!("made {}", ago(record.started_unix)), key));
+    }
+    if !choice.drop_old {
+        let old = contents.records.iter().filter(|(_, record)| key::is_old(record));
+        roots.extend(old.map(|(key, _)| one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)));
     }
     if !choice.drop_unfinished {
         let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));

@@ -4,7 +4,7 @@ use artifact::print_line;
 
 use crate::plan::Request;
 use crate::session::Session;
-use crate::words::{shown, words};
+use crate::words::{by_scene, shown, words};
 
 /// Shows what `run` would do.
 pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
@@ -12,6 +12,7 @@ pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode
     let states = session.states(&plan)?;
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+        by_scene(session, &plan.nodes[i], state).iter().for_each(|line| print_line!("    {line}"));
     }
     for sink in &plan.sinks {
         print_line!("{:<40} {}", sink.stage, shown(&plan, sink, &states));

@@ -4,7 +4,7 @@ use artifact::print_line;
 
 use crate::plan::Request;
 use crate::session::{Session, of_stage};
-use crate::words::{causes, shown, words};
+use crate::words::{by_scene, causes, shown, words};
 
 /// Says why a stage is cached, would run, or waits; of a sink, what it shows.
 pub(crate) fn why(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
@@ -21,6 +21,7 @@ pub(crate) fn why(session: &Session, stage: &str, what: &Request) -> anyhow::Res
     }
     for index in of_stage(&plan, stage)? {
         say(index, "");
+        by_scene(session, &plan.nodes[index], &states[index]).iter().for_each(|line| print_line!("    {line}"));
         causes(&states, index).into_iter().for_each(|cause| say(cause, "  "));
     }
     Ok(ExitCode::SUCCESS)
