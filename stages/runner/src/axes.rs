@@ -7,21 +7,33 @@ use artifact::{Named, known_names, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;
+use crate::experiment;
 use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
 use crate::plan::{PlanError, Request};
 use crate::renames::known_blocks;
 use crate::stages::{Programs, StageProgram};
 
-/// A value that is set, or several that are swept.
+/// Settings that go together, or several such that are swept.
 #[derive(Debug)]
 pub(crate) struct Axis {
+    /// By which points are called.
+    pub(crate) name: String,
+    pub(crate) values: Vec<AxisValue>,
+    /// Whether points have its value in their name, though it is the only one.
+    pub(crate) is_named: bool,
+    /// As it was given, for people.
+    given: String,
+}
+
+/// A parameter or an input of a stage, set.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Setting {
     pub(crate) stage: String,
     pub(crate) kind: Kind,
     pub(crate) name: String,
-    pub(crate) values: Vec<AxisValue>,
-    /// As it was given, for people.
-    given: String,
+    /// The parameter's value; of an input, the folder that it leads to.
+    pub(crate) value: Value,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,11 +42,12 @@ pub(crate) enum Kind {
     Input,
 }
 
-/// One value of an axis: as it was written, and what is meant; an input's is the folder's name.
+/// One value of an axis: as it was written, and what it sets. On the command line that is one thing; a scene, a protocol or a variant of an
+/// experiment sets several.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct AxisValue {
     pub(crate) text: String,
-    pub(crate) value: Value,
+    pub(crate) settings: Vec<Setting>,
 }
 
 impl Kind {
@@ -82,14 +95,31 @@ impl Kind {
     }
 }
 
-impl Axis {
-    /// The folder that a value of an input names.
-    pub(crate) fn folder(&self, value: usize) -> PathBuf {
-        PathBuf::from(&self.values[value].text)
+impl Setting {
+    /// The folder that an input leads to.
+    pub(crate) fn folder(&self) -> PathBuf {
+        PathBuf::from(self.value.as_str().unwrap_or_default())
     }
 
     fn is_of(&self, other: &Self) -> bool {
         (&self.stage, self.kind, &self.name) == (&other.stage, other.kind, &other.name)
+    }
+}
+
+impl Axis {
+    /// An axis of an experiment.
+    pub(crate) fn new(name: &str, values: Vec<AxisValue>) -> Self {
+        Self { name: name.to_owned(), values, is_named: true, given: String::new() }
+    }
+
+    /// All that any of its values sets.
+    pub(crate) fn settings(&self) -> impl Iterator<Item = &Setting> {
+        self.values.iter().flat_map(|value| &value.settings)
+    }
+
+    /// Whether both set one and the same thing.
+    fn is_of(&self, other: &Self) -> bool {
+        self.settings().zip(other.settings()).next().is_some_and(|(one, other)| one.is_of(other))
     }
 }
 
@@ -105,6 +135,7 @@ impl Scope<'_> {
     /// The axes in the order in which they were given, the last one where several set the same; and what to say of it.
     pub(crate) fn axes(&self, request: &Request) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
         let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
+        let experiment = experiment::axes(self, request)?;
         let parameters = request.parameters.iter().map(|text| (Kind::Parameter, text));
         let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
         for (kind, text) in parameters.chain(inputs) {
@@ -114,7 +145,16 @@ impl Scope<'_> {
             }
             axes.push(axis);
         }
-        Ok((axes, notes))
+        // What is said on the command line comes later, and so wins.
+        Ok((experiment.into_iter().chain(axes).collect(), notes))
+    }
+
+    /// What a name and a value of an experiment's file set.
+    pub(crate) fn setting(&self, kind: Kind, name: &str, value: &Value) -> Result<Setting, PlanError> {
+        let (stage, name) = self.owner(kind, name, &value.to_string())?;
+        let program = self.programs.require(&stage)?;
+        let value = if kind == Kind::Parameter { program.schema.canonical_value(&name, value) } else { value.clone() };
+        Ok(Setting { stage, kind, name, value })
     }
 
     fn axis(&self, kind: Kind, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
@@ -123,15 +163,16 @@ impl Scope<'_> {
         let (name, text) = text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
         let (stage, name) = self.owner(kind, name, text)?;
         let program = self.programs.require(&stage)?;
+        let value = |(text, value): (&str, Value)| AxisValue {
+            text: text.to_owned(),
+            settings: vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }],
+        };
         let values: Vec<AxisValue> = match kind {
             Kind::Parameter => {
-                let canonical = |(text, value): (&str, Value)| AxisValue {
-                    text: text.to_owned(),
-                    value: program.schema.canonical_value(&name, &value),
-                };
-                arguments::values(text).map_err(usage)?.into_iter().map(canonical).collect()
+                let given = arguments::values(text).map_err(usage)?.into_iter();
+                given.map(|(text, given)| value((text, program.schema.canonical_value(&name, &given)))).collect()
             }
-            Kind::Input => arguments::folders(text).map_err(usage)?.into_iter().map(folder).collect(),
+            Kind::Input => arguments::folders(text).map_err(usage)?.into_iter().map(|text| value((text, folder(text)))).collect(),
         };
         let values = each_once(values, |again, first| notes.push(format!("{given}: {again} is {first} again; it is made once")));
         if program.description.sink && kind == Kind::Input {
@@ -140,7 +181,8 @@ impl Scope<'_> {
         if program.description.sink && values.len() > 1 {
             return Err(usage(format!("{stage} is a sink and shows all points of a sweep at once; give one value")));
         }
-        Ok(Axis { stage, kind, name, values, given })
+        let is_named = values.len() > 1;
+        Ok(Axis { name, values, is_named, given })
     }
 
     /// The stage that a name belongs to, and the name without it. Where several stages have the name, that one is meant that the targets need; a
@@ -225,16 +267,16 @@ impl Scope<'_> {
 }
 
 /// A folder's name, which means the folder that it leads to.
-fn folder(name: &str) -> AxisValue {
+pub(crate) fn folder(name: &str) -> Value {
     let leads_to = Path::new(name).canonicalize().unwrap_or_else(|_| PathBuf::from(name));
-    AxisValue { text: name.to_owned(), value: Value::from(leads_to.to_string_lossy()) }
+    Value::from(leads_to.to_string_lossy())
 }
 
 /// Values without those that mean the same as an earlier one; `tell` is told of these and of the earlier ones.
 fn each_once(values: Vec<AxisValue>, mut tell: impl FnMut(&str, &str)) -> Vec<AxisValue> {
     let mut kept: Vec<AxisValue> = Vec::new();
     for value in values {
-        match kept.iter().find(|earlier| earlier.value == value.value) {
+        match kept.iter().find(|earlier| earlier.settings == value.settings) {
             Some(earlier) => tell(&value.text, &earlier.text),
             None => kept.push(value),
         }

@@ -6,6 +6,7 @@ use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 
 use crate::execute::Options;
+use crate::experiment::Choice as Selection;
 use crate::gc::Choice;
 use crate::graph::{ascii, dot, svg};
 use crate::limits::capped;
@@ -48,6 +49,28 @@ struct What {
     /// Takes an input from a folder instead, e.g. -i dataset=scenes/lego
     #[arg(short = 'i', long = "input", value_name = "[STAGE.]NAME=DIR[,DIR…]")]
     inputs: Vec<String>,
+    #[command(flatten)]
+    experiment: OfExperiment,
+}
+
+/// What of an experiment is wanted
+#[derive(Args, Default)]
+struct OfExperiment {
+    /// Scenes of an experiment: folders of --data, or `demo` [default: those that its file names]
+    #[arg(long = "scene", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    scenes: Vec<String>,
+    /// Protocols of an experiment: its presets, or WIDTHxSCALE [default: those that its file names]
+    #[arg(long = "protocol", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    protocols: Vec<String>,
+    /// A variant of an experiment; repeat for more [default: all]
+    #[arg(long = "variant", value_name = "NAME")]
+    variants: Vec<String>,
+    /// Only so many variants of an experiment, the first
+    #[arg(long, value_name = "N")]
+    first_variants: Option<usize>,
+    /// Folder of an experiment's data sets [default: the file's]
+    #[arg(long, value_name = "DIR", env = "NERF_SR_DATA")]
+    data: Option<PathBuf>,
 }
 
 #[derive(Subcommand)]
@@ -205,7 +228,9 @@ pub fn main() -> ExitCode {
 
 impl From<What> for Request {
     fn from(what: What) -> Self {
-        Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs }
+        let OfExperiment { scenes, protocols, variants, first_variants, data } = what.experiment;
+        let choice = Selection { data, scenes, protocols, variants, first: first_variants };
+        Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, choice }
     }
 }
 

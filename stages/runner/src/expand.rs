@@ -6,7 +6,7 @@ use std::sync::Arc;
 use artifact::GivenInputs;
 use serde_json::{Map, Value};
 
-use crate::axes::{Axis, Kind};
+use crate::axes::{Axis, Kind, Setting};
 use crate::check::{closure, needs};
 use crate::pipeline::{Part, Pipeline, Source};
 use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
@@ -56,25 +56,47 @@ impl<'a> Expansion<'a> {
 
     /// A block's inputs less those that the command line replaces.
     fn block_inputs(&self, stage: &str) -> impl Iterator<Item = (&'a str, Source<'a>)> {
+        let settings = self.axes.iter().flat_map(Axis::settings);
         let replaced: Vec<&str> =
-            self.axes.iter().filter(|a| a.stage == stage && a.kind == Kind::Input).map(|a| a.name.as_str()).collect();
+            settings.filter(|set| set.stage == stage && set.kind == Kind::Input).map(|set| set.name.as_str()).collect();
         let inputs = self.pipeline.stages[stage].inputs.iter().map(|(name, source)| (name.as_str(), Source::of(source)));
         inputs.filter(move |(name, _)| !replaced.contains(name))
     }
 
-    /// Whether a value from the command line reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.
-    fn sets(&self, axis: &Axis, stage: &str) -> bool {
+    /// Whether a setting reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.
+    fn sets(&self, set: &Setting, stage: &str) -> bool {
         let block = &self.pipeline.stages[stage];
-        let is_own = || axis.kind.is_given(self.programs.get(stage), block, &axis.name);
-        axis.stage == stage || (block.extends.as_deref() == Some(&axis.stage) && !is_own())
+        let is_own = || set.kind.is_given(self.programs.get(stage), block, &set.name);
+        set.stage == stage || (block.extends.as_deref() == Some(&set.stage) && !is_own())
+    }
+
+    /// The settings of a point that reach a stage, in the order of the axes.
+    fn settings<'b>(&'b self, stage: &'b str, point: &'b Point) -> impl Iterator<Item = &'b Setting> {
+        let of_axis = move |(index, axis): (usize, &'b Axis)| {
+            // A stage that an axis doesn't reach has no value of it; a sink has the only one.
+            &axis.values[point.get(&index).copied().unwrap_or(0)].settings
+        };
+        self.axes.iter().enumerate().flat_map(of_axis).filter(move |set| self.sets(set, stage))
     }
 
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         for point in self.points(stage)? {
             let inputs = self.node_inputs(stage, &point);
             let parameters = self.resolve(stage, program, &point)?;
-            let node =
-                Node { stage: stage.to_owned(), point: self.label(&point), parameters, inputs, program: Arc::clone(program) };
+            // Points that come to one result have one node.
+            let is_it = |node: &&usize| self.nodes[**node].parameters == parameters && self.nodes[**node].inputs == inputs;
+            if let Some(node) = self.of_stage.get(stage).into_iter().flatten().map(|(_, node)| node).find(is_it).copied() {
+                self.of_stage.entry(stage.to_owned()).or_default().push((point, node));
+                continue;
+            }
+            let node = Node {
+                stage: stage.to_owned(),
+                point: self.label(&point),
+                values: self.values(&point),
+                parameters,
+                inputs,
+                program: Arc::clone(program),
+            };
             let given: GivenInputs = node.inputs.iter().map(|input| (input.name.clone(), self.made_by(input))).collect();
             if let Some(problem) = program.description.broken_rule(&node.parameters, &given) {
                 return Err(PlanError::Usage(format!("stage {}: {problem}", node.label())));
@@ -87,7 +109,9 @@ impl<'a> Expansion<'a> {
 
     /// All combinations of the values that reach a stage: those of its own axes and of its parents'.
     fn points(&self, stage: &str) -> Result<Vec<Point>, PlanError> {
-        let mut reach: BTreeSet<usize> = (0..self.axes.len()).filter(|&a| self.sets(&self.axes[a], stage)).collect();
+        let is_set = |axis: &&usize| self.axes[**axis].settings().any(|set| self.sets(set, stage));
+        let all: Vec<usize> = (0..self.axes.len()).collect();
+        let mut reach: BTreeSet<usize> = all.iter().filter(is_set).copied().collect();
         for parent in self.block_inputs(stage).filter_map(|(_, source)| source.stage()) {
             reach.extend(self.of_stage[parent].iter().flat_map(|(values, _)| values.keys().copied()));
         }
@@ -113,15 +137,12 @@ impl<'a> Expansion<'a> {
                     Origin::Node { index: self.parent(name, point), subtree: subtree.map(str::to_owned) }
                 }
             };
-            NodeInput { name: name.to_owned(), from }
+            (name.to_owned(), from)
         });
-        let of_command_line = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter_map(|(axis, value)| {
-            let reaches = axis.kind == Kind::Input && self.sets(axis, stage);
-            reaches.then(|| NodeInput { name: axis.name.clone(), from: Origin::Folder(axis.folder(value)) })
-        });
-        let mut inputs: Vec<NodeInput> = of_block.chain(of_command_line).collect();
-        inputs.sort_by(|a, b| a.name.cmp(&b.name));
-        inputs
+        let mut inputs: BTreeMap<String, Origin> = of_block.collect();
+        let folders = self.settings(stage, point).filter(|set| set.kind == Kind::Input);
+        inputs.extend(folders.map(|set| (set.name.clone(), Origin::Folder(set.folder()))));
+        inputs.into_iter().map(|(name, from)| NodeInput { name, from }).collect()
     }
 
     /// A parent's node at a point of its child.
@@ -141,8 +162,18 @@ impl<'a> Expansion<'a> {
 
     /// What a point is called: the values of what is swept.
     fn label(&self, point: &Point) -> String {
-        let values = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter(|(axis, _)| axis.values.len() > 1);
-        values.map(|(axis, value)| format!("{}={}", axis.name, axis.values[value].text)).collect::<Vec<_>>().join(", ")
+        let swept = self.named(point).filter(|(axis, _)| axis.values.len() > 1);
+        swept.map(|(axis, text)| format!("{}={text}", axis.name)).collect::<Vec<_>>().join(", ")
+    }
+
+    /// The values of what has a name, for tables.
+    fn values(&self, point: &Point) -> BTreeMap<String, String> {
+        self.named(point).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
+    }
+
+    fn named<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {
+        let values = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter(|(axis, _)| axis.is_named);
+        values.map(|(axis, value)| (axis, axis.values[value].text.as_str()))
     }
 
     /// A stage's parameters at a point: the command line's over the file's, those over what it extends, and that over the defaults.
@@ -150,12 +181,8 @@ impl<'a> Expansion<'a> {
         let mut given = Map::new();
         for layer in self.pipeline.layers(stage) {
             program.lay_over(&mut given, &self.pipeline.stages[layer]);
-            let set = self.axes.iter().enumerate().filter(|(_, axis)| axis.kind == Kind::Parameter && axis.stage == layer);
-            let mut from_line = Map::new();
-            for (index, axis) in set.filter(|(_, axis)| self.sets(axis, stage)) {
-                let value = point.get(&index).copied().unwrap_or(0);
-                from_line.insert(axis.name.clone(), axis.values[value].value.clone());
-            }
+            let set = self.settings(stage, point).filter(|set| set.kind == Kind::Parameter && set.stage == layer);
+            let from_line: Map<String, Value> = set.map(|set| (set.name.clone(), set.value.clone())).collect();
             program.schema.lay_over(&mut given, &from_line);
         }
         program.schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))

@@ -34,6 +34,7 @@ impl Pipeline {
             return Err(format!("block {name} isn't the same in {one} and in {two}"));
         }
         self.stages.extend(other.stages);
+        self.experiment.change(&other.experiment);
         for file in other.files {
             if !self.files.iter().any(|known| known.id == file.id) {
                 self.files.push(file);
@@ -73,6 +74,7 @@ fn changed(mut pipeline: Pipeline, by: File) -> Pipeline {
     for (name, block) in &by.written.stages {
         pipeline.stages.entry(name.clone()).or_default().change(block);
     }
+    pipeline.experiment.change(&by.written.experiment);
     if !by.written.default.is_empty() {
         pipeline.default.clone_from(&by.written.default);
     }

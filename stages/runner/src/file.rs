@@ -7,6 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 
+use crate::experiment::Experiment;
 use crate::pipeline::{Part, PipelineError};
 use crate::{renames, yaml};
 
@@ -26,6 +27,13 @@ pub struct PipelineFile {
     pub default: Vec<String>,
     /// The stages by name.
     pub stages: BTreeMap<String, StageBlock>,
+    /// Scenes, protocols and variants, which make the file an experiment.
+    #[serde(skip_serializing_if = "is_default")]
+    pub experiment: Experiment,
+}
+
+fn is_default(experiment: &Experiment) -> bool {
+    *experiment == Experiment::default()
 }
 
 /// A text, or a list of them.
@@ -156,7 +164,8 @@ fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
         let problem = format!("{}: a number is neither NaN nor infinite", keys.join("."));
         return Some((keys, problem));
     }
-    let missing = |key: &&str| document.get(key).is_none() && document.get("extends").is_none();
+    let says_more = ["extends", "experiment"].iter().any(|key| document.get(key).is_some());
+    let missing = |key: &&str| document.get(key).is_none() && !says_more;
     if let Some(key) = ["default", "stages"].iter().find(|key| missing(key)) {
         return Some((Vec::new(), format!("missing field `{key}`")));
     }

@@ -4,6 +4,7 @@
 //!   before anything runs. `targets` finds what pipeline.yaml doesn't have in `pipelines/`.
 //! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
+//! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several things.
 //! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
 //! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all that they were made of.
@@ -22,6 +23,7 @@ mod counts;
 mod describing;
 mod execute;
 mod expand;
+mod experiment;
 mod extend;
 mod file;
 mod gc;
@@ -49,6 +51,7 @@ mod words;
 mod yaml;
 
 pub use cli::main;
+pub use experiment::{Choice, Experiment, Variant};
 pub use file::{PipelineFile, StageBlock};
 pub use key::explain;
 pub use pipeline::{Part, Pipeline, PipelineError};

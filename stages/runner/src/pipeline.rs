@@ -2,6 +2,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::experiment::Experiment;
 use crate::file::{File, StageBlock};
 
 /// The blocks of a pipeline file and of those that it extends.
@@ -11,12 +12,14 @@ pub struct Pipeline {
     pub default: Vec<String>,
     /// The stages by name.
     pub stages: BTreeMap<String, StageBlock>,
+    /// Scenes, protocols and variants.
+    pub(crate) experiment: Experiment,
     /// The file that was asked for, and those that it extends, each before what it extends itself.
     pub(crate) files: Vec<Arc<File>>,
 }
 
-/// The folder of further pipelines, beside pipeline.yaml.
-pub(crate) const SHELF: &str = "pipelines";
+/// The folders of further pipelines and of experiments, beside pipeline.yaml.
+pub(crate) const SHELVES: [&str; 2] = ["pipelines", "experiments"];
 
 /// Where an input's text leads.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,10 +83,11 @@ impl Pipeline {
     /// those of the folder above.
     pub(crate) fn home(&self) -> PathBuf {
         let folder = self.files[0].folder();
-        let is_shelf = folder.canonicalize().is_ok_and(|folder| folder.ends_with(SHELF));
+        let ends = |folder: &Path| SHELVES.iter().any(|shelf| folder.ends_with(shelf));
+        let is_shelf = folder.canonicalize().is_ok_and(|folder| ends(&folder));
         match folder.parent() {
             _ if !is_shelf || self.files[0].written.extends.is_empty() => folder.to_path_buf(),
-            Some(above) if folder.ends_with(SHELF) => Path::new(".").join(above),
+            Some(above) if ends(folder) => Path::new(".").join(above),
             _ => folder.join(".."),
         }
     }

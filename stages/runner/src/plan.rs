@@ -7,6 +7,7 @@ use serde_json::{Map, Value};
 
 use crate::axes::Scope;
 use crate::check::{self, closure, needs};
+use crate::experiment::Choice;
 use crate::expand::Expansion;
 use crate::key;
 use crate::pipeline::{Pipeline, PipelineError};
@@ -30,6 +31,8 @@ pub struct Node {
     pub stage: String,
     /// The sweep's values that reach it, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
+    /// The values of the axes that reach it and have a name, by that.
+    pub(crate) values: BTreeMap<String, String>,
     /// All parameters, defaults filled in.
     pub parameters: Value,
     pub(crate) inputs: Vec<NodeInput>,
@@ -37,13 +40,13 @@ pub struct Node {
 }
 
 /// Where an input comes from.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) struct NodeInput {
     pub(crate) name: String,
     pub(crate) from: Origin,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Origin {
     /// Another node's artifact, or a folder of it.
     Node { index: usize, subtree: Option<String> },
@@ -68,6 +71,8 @@ pub struct Request {
     pub parameters: Vec<String>,
     /// `input=DIR[,DIR…]`, likewise.
     pub inputs: Vec<String>,
+    /// What of an experiment is wanted.
+    pub choice: Choice,
 }
 
 /// Why there is no plan.

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use crate::pipeline::{Part, Pipeline, SHELF};
+use crate::pipeline::{Part, Pipeline, SHELVES};
 use crate::plan::PlanError;
 use crate::renames::known_blocks;
 
@@ -47,9 +47,10 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
     Err(PlanError::Usage(format!("no stage {target:?}; {}", known_blocks(target, known))))
 }
 
-/// The files of `pipelines/`, by name.
+/// The files of `pipelines/` and `experiments/`, by name; the former win.
 fn shelf(pipeline: &Pipeline) -> BTreeMap<String, PathBuf> {
-    let entries = std::fs::read_dir(pipeline.home().join(SHELF)).into_iter().flatten().flatten();
+    let folders = SHELVES.iter().rev().map(|shelf| pipeline.home().join(shelf));
+    let entries = folders.flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
     let paths = entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == "yaml"));
     paths.filter_map(|path| Some((path.file_stem()?.to_str()?.to_owned(), path))).collect()
 }

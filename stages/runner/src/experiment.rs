@@ -1,0 +1,195 @@
+//! Experiments: a pipeline file with scenes, protocols and variants, each of which sets several things at once.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use artifact::known_names;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, folder};
+use crate::plan::{PlanError, Request};
+
+/// What a pipeline file says of an experiment, besides its blocks. A file that extends others changes theirs part by part.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Experiment {
+    /// Folder of the data sets, from the current folder, unless `--data` names another.
+    pub data: Option<String>,
+    /// Folders inside it in which a scene is looked for; the first that has it counts.
+    pub folders: Vec<String>,
+    /// Scenes: names of data sets, or `demo` for the pipeline's own.
+    pub scenes: Vec<String>,
+    /// Protocols: names of `presets`. An unknown one of the form WIDTHxSCALE has the settings of preset `other`.
+    pub protocols: Vec<String>,
+    /// Parameters that go together, by name and then by `[STAGE.]NAME`.
+    pub presets: BTreeMap<String, Map<String, Value>>,
+    /// Inputs that come from the folder of the data sets, by `[STAGE.]NAME`; left out where the folder isn't there.
+    pub inputs: BTreeMap<String, String>,
+    /// Variants, in the order of the table; they form no product.
+    pub variants: Vec<Variant>,
+}
+
+/// Parameters and inputs that go together.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Variant {
+    /// Its name in tables.
+    pub name: String,
+    /// Parameters, by `[STAGE.]NAME`.
+    #[serde(default)]
+    pub parameters: Map<String, Value>,
+    /// Inputs from the folder of the data sets, by `[STAGE.]NAME`.
+    #[serde(default)]
+    pub inputs: BTreeMap<String, String>,
+}
+
+/// What of an experiment the command line wants; nothing means all that the file names.
+#[derive(Clone, Debug, Default)]
+pub struct Choice {
+    /// Folder of the data sets.
+    pub data: Option<PathBuf>,
+    /// Scenes.
+    pub scenes: Vec<String>,
+    /// Protocols.
+    pub protocols: Vec<String>,
+    /// Variants, by name.
+    pub variants: Vec<String>,
+    /// Only so many variants, the first.
+    pub first: Option<usize>,
+}
+
+/// The scene that is the pipeline's own.
+const DEMO: &str = "demo";
+/// The preset of protocols that have none.
+const OTHER: &str = "other";
+
+impl Experiment {
+    /// Takes what a file that extends this one's says.
+    pub(crate) fn change(&mut self, by: &Self) {
+        let take = |mine: &mut Vec<String>, by: &Vec<String>| {
+            if !by.is_empty() {
+                mine.clone_from(by);
+            }
+        };
+        take(&mut self.folders, &by.folders);
+        take(&mut self.scenes, &by.scenes);
+        take(&mut self.protocols, &by.protocols);
+        if !by.variants.is_empty() {
+            self.variants.clone_from(&by.variants);
+        }
+        self.data = by.data.clone().or_else(|| self.data.take());
+        self.presets.extend(by.presets.clone());
+        self.inputs.extend(by.inputs.clone());
+    }
+
+    fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+}
+
+/// The axes of an experiment; none where the pipeline is none.
+pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, PlanError> {
+    let (experiment, choice) = (&scope.pipeline.experiment, &request.choice);
+    if experiment.is_none() {
+        let is_asked = !(choice.scenes.is_empty() && choice.protocols.is_empty() && choice.variants.is_empty());
+        let problem = "--scene, --protocol and --variant are for experiments; name one as target, such as quality";
+        return if is_asked { Err(PlanError::Usage(problem.to_owned())) } else { Ok(Vec::new()) };
+    }
+    let asked = Asked { scope, experiment, choice };
+    let axes = [("scene", asked.scenes()?), ("protocol", asked.protocols()?), ("variant", asked.variants()?)];
+    Ok(axes.into_iter().filter(|(_, values)| !values.is_empty()).map(|(name, values)| Axis::new(name, values)).collect())
+}
+
+/// An experiment and what of it is wanted.
+struct Asked<'a> {
+    scope: &'a Scope<'a>,
+    experiment: &'a Experiment,
+    choice: &'a Choice,
+}
+
+impl Asked<'_> {
+    fn data(&self) -> PathBuf {
+        let stated = self.experiment.data.as_ref().map(PathBuf::from);
+        self.choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
+    }
+
+    fn scenes(&self) -> Result<Vec<AxisValue>, PlanError> {
+        let names = if self.choice.scenes.is_empty() { &self.experiment.scenes } else { &self.choice.scenes };
+        let common = self.inputs(&self.experiment.inputs)?;
+        let scene = |name: &String| {
+            let mut settings = common.clone();
+            if name != DEMO {
+                settings.push(self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?);
+            }
+            Ok(AxisValue { text: name.clone(), settings })
+        };
+        names.iter().map(scene).collect()
+    }
+
+    /// The folder of a scene.
+    fn scene_folder(&self, name: &str) -> Result<Value, PlanError> {
+        let data = self.data();
+        let place = |inside: &String| data.join(inside).join(name);
+        let here = ".".to_owned();
+        let found = self.experiment.folders.iter().chain([&here]).map(place).find(|path| path.is_dir());
+        match found {
+            Some(path) => Ok(folder(&path.to_string_lossy())),
+            None => {
+                let problem = format!("no scene {name} in {}; --data names a folder that has it", data.display());
+                Err(PlanError::Usage(problem))
+            }
+        }
+    }
+
+    /// Inputs from the data sets' folder, those that are there.
+    fn inputs(&self, inputs: &BTreeMap<String, String>) -> Result<Vec<Setting>, PlanError> {
+        let data = self.data();
+        let there = inputs.iter().map(|(name, inside)| (name, data.join(inside))).filter(|(_, path)| path.is_dir());
+        there.map(|(name, path)| self.scope.setting(Kind::Input, name, &folder(&path.to_string_lossy()))).collect()
+    }
+
+    fn protocols(&self) -> Result<Vec<AxisValue>, PlanError> {
+        let names = if self.choice.protocols.is_empty() { &self.experiment.protocols } else { &self.choice.protocols };
+        let protocol = |name: &String| Ok(AxisValue { text: name.clone(), settings: self.parameters(&self.preset(name)?)? });
+        names.iter().map(protocol).collect()
+    }
+
+    /// A preset's parameters; those of `other` with the width and the scale for one that isn't named.
+    fn preset(&self, name: &str) -> Result<Map<String, Value>, PlanError> {
+        let presets = &self.experiment.presets;
+        if let Some(preset) = presets.get(name).filter(|_| name != OTHER) {
+            return Ok(preset.clone());
+        }
+        let sizes =
+            name.split_once('x').and_then(|(width, scale)| Some((width.parse::<u32>().ok()?, scale.parse::<f64>().ok()?)));
+        let Some((width, scale)) = sizes else {
+            let known = known_names(name, presets.keys().map(String::as_str).filter(|known| *known != OTHER));
+            return Err(PlanError::Usage(format!("no protocol {name:?}, and not of the form WIDTHxSCALE; {known}")));
+        };
+        let mut preset = presets.get(OTHER).cloned().unwrap_or_default();
+        preset.insert("lr_width".to_owned(), Value::from(width));
+        preset.insert("prep.scale".to_owned(), Value::from(scale));
+        Ok(preset)
+    }
+
+    fn variants(&self) -> Result<Vec<AxisValue>, PlanError> {
+        let all = &self.experiment.variants;
+        let known = |name: &str| known_names(name, all.iter().map(|variant| variant.name.as_str()));
+        if let Some(name) = self.choice.variants.iter().find(|name| !all.iter().any(|variant| variant.name == **name)) {
+            return Err(PlanError::Usage(format!("no variant {name:?}; {}", known(name))));
+        }
+        let is_wanted = |variant: &&Variant| self.choice.variants.is_empty() || self.choice.variants.contains(&variant.name);
+        let wanted = all.iter().filter(is_wanted).take(self.choice.first.unwrap_or(usize::MAX));
+        let variant = |variant: &Variant| {
+            let settings = [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
+            Ok(AxisValue { text: variant.name.clone(), settings })
+        };
+        wanted.map(variant).collect()
+    }
+
+    fn parameters(&self, parameters: &Map<String, Value>) -> Result<Vec<Setting>, PlanError> {
+        parameters.iter().map(|(name, value)| self.scope.setting(Kind::Parameter, name, value)).collect()
+    }
+}

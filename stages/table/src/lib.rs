@@ -1,0 +1,109 @@
+//! `table`: figures of an experiment as Markdown, CSV and JSON.
+//!
+//! * [`Params`]: what makes a row, what makes a column, and what values are shown.
+//! * `rows`: a row for every result of a run, with its scores, its times, and where it was made.
+//! * `markdown`: these rows as a table for people, means where several results fall into one cell, the best marked.
+//!
+//! A sink: it gets the run's record and is never cached. What a failed point would have shown is named.
+
+mod markdown;
+mod rows;
+
+use std::collections::BTreeMap;
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+pub use rows::Row;
+
+/// Parameters of `table`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Heading of the table.
+    pub title: String,
+    /// Keys that make a row: axes of the run (`scene`, `protocol`, `variant`, a swept parameter), or `method` for the block that was scored. Results that
+    /// differ in other keys alone are averaged. Default: all keys that differ, except `scene`.
+    #[schemars(extend("x-default" = "all keys that differ, except `scene`"))]
+    pub rows: Vec<String>,
+    /// Keys that make a column each, with all values in one cell.
+    #[schemars(extend("x-default" = "a column for each value"))]
+    pub columns: Vec<String>,
+    /// Values to show, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, and all others that `rows.json` has.
+    pub values: Vec<String>,
+    /// The row that others are compared with, by its keys: a further column has their PSNR minus its own.
+    #[schemars(extend("x-default" = "no comparison"))]
+    pub relative_to: BTreeMap<String, String>,
+    /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
+    #[schemars(extend("x-default" = "the blocks' names"))]
+    pub methods: BTreeMap<String, String>,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        let values = ["psnr", "ssim", "lpips", "train_s", "render_s"];
+        Self {
+            title: "Results".to_owned(),
+            rows: Vec::new(),
+            columns: Vec::new(),
+            values: values.map(str::to_owned).into(),
+            relative_to: BTreeMap::new(),
+            methods: BTreeMap::new(),
+        }
+    }
+}
+
+/// The stage.
+pub struct Table;
+
+impl Stage for Table {
+    type Params = Params;
+    const NAME: &'static str = "table";
+    const SUMMARY: &'static str = "Shows figures of an experiment as Markdown, CSV and JSON.";
+    const SINK: bool = true;
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![("run", Input::required(&["run"], "folder with run.json: the record of what was scored"))]
+    }
+
+    fn output() -> Output {
+        Output::kind("table")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        let run: RunRecord = context.input("run")?.read_json("run.json")?;
+        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
+        let rows = rows::rows(&run, &params.methods)?;
+        if rows.is_empty() && run.failed.is_empty() {
+            return Err(Failure::BadInput("run.json: nothing in it was scored".to_owned()).into());
+        }
+        context.write_json("rows.json", &rows)?;
+        write_csv(context, &rows)?;
+        let text = markdown::markdown(params, &rows, &run.failed).map_err(Failure::Usage)?;
+        let path = context.output_path("table.md")?;
+        std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
+        context.say(&text);
+        context.write_summary(&format!("{} results", rows.len()))
+    }
+}
+
+/// Writes the rows with all keys and values that any of them has.
+fn write_csv(context: &Context, rows: &[Row]) -> anyhow::Result<()> {
+    let path = context.output_path("rows.csv")?;
+    let place = || format!("cannot write {}", path.display());
+    let mut names: Vec<&String> = Vec::new();
+    for name in rows.iter().flat_map(|row| row.keys()) {
+        if !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    let mut writer = csv::Writer::from_path(&path).with_context(place)?;
+    writer.write_record(&names).with_context(place)?;
+    for row in rows {
+        let cells = names.iter().map(|name| row.get(*name).map(markdown::plain).unwrap_or_default());
+        writer.write_record(cells).with_context(place)?;
+    }
+    writer.flush().with_context(place)
+}

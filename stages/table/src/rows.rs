@@ -1,0 +1,94 @@
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{RunNode, RunRecord};
+use serde_json::{Map, Value, json};
+
+/// A result: its keys (axes of the run, `method`), then its values, by name.
+pub type Row = Map<String, Value>;
+
+/// A row for every result of a run, in the order of the run.
+pub(crate) fn rows(run: &RunRecord, methods: &BTreeMap<String, String>) -> anyhow::Result<Vec<Row>> {
+    let scored = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown);
+    let rows = scored.map(|(index, node)| {
+        let mut row: Row = node.values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
+        row.insert("method".to_owned(), json!(methods.get(&node.stage).unwrap_or(&node.stage)));
+        row.extend(scores(node)?);
+        row.extend(times(run, index)?);
+        row.insert("commit".to_owned(), json!(run.commit));
+        row.insert("machine".to_owned(), json!(run.machine));
+        Ok(row)
+    });
+    rows.collect()
+}
+
+/// What a result's own file says: means of metrics, or what a refiner's training says of itself.
+fn scores(node: &RunNode) -> anyhow::Result<Row> {
+    let mut found = Row::new();
+    if node.kind == "refiner" {
+        let file = read(&node.folder.join("refiner.json"))?;
+        numbers("", &file, &mut found);
+        return Ok(found);
+    }
+    if node.kind != "metrics" {
+        return Ok(found);
+    }
+    let file = read(&node.folder.join("metrics.json"))?;
+    numbers("", &file["mean"], &mut found);
+    found.insert("views".to_owned(), json!(file["views"].as_array().map_or(0, Vec::len)));
+    Ok(found)
+}
+
+/// Every number inside a value, by its path.
+fn numbers(name: &str, value: &Value, found: &mut Row) {
+    match value {
+        Value::Number(_) => _ = found.insert(name.to_owned(), value.clone()),
+        Value::Object(entries) => {
+            for (key, value) in entries {
+                let name = if name.is_empty() { key.clone() } else { format!("{name}.{key}") };
+                numbers(&name, value, found);
+            }
+        }
+        _ => {}
+    }
+}
+
+fn read(path: &Path) -> anyhow::Result<Value> {
+    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+    serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
+}
+
+/// Seconds of what a result came through. What fields and refiners were made of counts as training; other views count as rendering, and
+/// those of them that no field made directly as refining.
+fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
+    let ancestors = run.ancestors(index);
+    let is_trained = |node: &RunNode| ["field", "refiner"].contains(&node.kind.as_str());
+    let trained: Vec<usize> = ancestors.iter().copied().filter(|&i| is_trained(&run.nodes[i])).collect();
+    let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
+    let is_views = |i: &usize| run.nodes[*i].kind == "views";
+    let training: Vec<usize> =
+        ancestors.iter().copied().filter(|i| in_training.contains(i) && (is_views(i) || trained.contains(i))).collect();
+    let rendering: Vec<usize> = ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
+    let by_field = |i: &usize| {
+        let mut parents = run.nodes[*i].inputs.values().filter_map(|input| input.node);
+        parents.any(|parent| run.nodes[parent].kind == "field")
+    };
+    let refining: Vec<usize> = rendering.iter().copied().filter(|i| !by_field(i)).collect();
+    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>();
+    let mut row = Row::new();
+    for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)] {
+        row.insert(name.to_owned(), json!(seconds(nodes)));
+    }
+    // Of the field that the views show: the first one of the run that isn't there for a refiner.
+    let field = trained.iter().map(|&i| &run.nodes[i]).find(|node| node.kind == "field");
+    if let Some(field) = field {
+        let path = field.folder.join("training.json");
+        if path.exists() {
+            let log = read(&path)?;
+            row.insert("samples_per_ray".to_owned(), log["samples_per_ray"].clone());
+            row.insert("rays_per_s".to_owned(), json!(log["rays"].as_f64().unwrap_or(0.0) / field.seconds.max(1e-9)));
+        }
+    }
+    Ok(row)
+}
