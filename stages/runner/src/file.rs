@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
+use slurm::Resources;
 
 use crate::pipeline::{Part, PipelineError};
 use crate::{renames, yaml};
@@ -58,6 +59,9 @@ pub struct StageBlock {
     pub inputs: BTreeMap<String, String>,
     /// Parameters that differ from the stage's defaults.
     pub parameters: Map<String, Value>,
+    /// What it needs of a machine, where a cluster runs it.
+    #[serde(skip_serializing_if = "Resources::is_empty")]
+    pub resources: Resources,
 }
 
 impl StageBlock {
@@ -84,6 +88,7 @@ impl StageBlock {
         }
         self.inputs.extend(by.inputs.clone());
         self.parameters.extend(by.parameters.clone());
+        self.resources = self.resources.changed(&by.resources);
     }
 }
 

@@ -6,7 +6,7 @@
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
 //! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
-//! * `execute`: runs nodes, some at once, each under its key's lock.
+//! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]

@@ -5,16 +5,16 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, Record, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
 
-use crate::execute::{Display, Options, Outcome};
+use crate::execute::Display;
 use crate::plan::{Origin, Plan, Sink};
 use crate::process::{Call, StageFailure};
 use crate::publish;
 
 /// The record of the nodes that a sink shows and all they were made of.
-fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<RunRecord> {
+fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store) -> Option<RunRecord> {
     let mut wanted: BTreeSet<usize> = sink.shows.iter().copied().collect();
     for index in (0..plan.nodes.len()).rev() {
         if wanted.contains(&index) {
@@ -23,7 +23,7 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
     }
     let position = |index: usize| wanted.iter().position(|&i| i == index);
     let nodes = wanted.iter().map(|&index| {
-        let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
+        let (node, record) = (&plan.nodes[index], records[index].as_ref()?);
         let inputs = node.inputs.iter().map(|input| {
             let from = match &input.from {
                 Origin::Node { index, subtree } => RunInput { node: position(*index), subtree: subtree.clone(), folder: None },
@@ -48,6 +48,17 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
     Some(RunRecord { nodes: nodes.collect::<Option<Vec<_>>>()? })
 }
 
+/// By what a page is known to show a record.
+fn identity(sink: &Sink, record: &RunRecord) -> String {
+    hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}))
+}
+
+/// Whether a sink's page shows these records already.
+pub(crate) fn is_shown(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> bool {
+    let record = record(plan, sink, records, store);
+    record.is_some_and(|record| publish::shows(&out.join(&sink.stage), &identity(sink, &record)))
+}
+
 /// What became of a sink.
 pub(crate) enum Shown {
     /// It ran and wrote this folder.
@@ -65,17 +76,17 @@ pub(crate) struct Showing<'a> {
     pub(crate) run: &'a RunFile,
     /// Where pages go.
     pub(crate) out: &'a Path,
-    pub(crate) options: &'a Options,
+    pub(crate) threads: usize,
     pub(crate) stop: &'a AtomicBool,
 }
 
 /// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Result<Shown, StageFailure> {
-    let Showing { plan, store, run, out, options, stop } = showing;
+pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>]) -> Result<Shown, StageFailure> {
+    let Showing { plan, store, run, out, threads, stop } = *showing;
     let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
-    let Some(record) = record(plan, sink, outcome, store) else { return Ok(Shown::Missing) };
+    let Some(record) = record(plan, sink, records, store) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
-    let identity = hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}));
+    let identity = identity(sink, &record);
     if publish::shows(&target, &identity) {
         return Ok(Shown::UpToDate(target));
     }
@@ -96,8 +107,8 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Res
         hashes: &[],
         output: &output,
         work: None,
-        device: &options.device,
-        threads: options.threads,
+        device: plan.device(&sink.stage),
+        threads,
         lock: None,
     };
     let result = call.run(&scratch.join("log"), &view, stop);

@@ -25,7 +25,7 @@ pub(crate) struct StageProgram {
 }
 
 impl StageProgram {
-    fn new(path: &Path, description: Description) -> Result<Self, String> {
+    pub(crate) fn new(path: &Path, description: Description) -> Result<Self, String> {
         description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
         let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })

@@ -31,10 +31,13 @@ pub(crate) struct Verdict {
 /// Decides what goes. `plan` is what the pipeline needs.
 pub(crate) fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
     let contents = Contents::of(store)?;
-    let roots = roots::roots(store, &contents, plan, choice)?;
+    let runs = store.runs()?;
+    // After the runs were read: whoever had submitted by then has left jobs.
+    let outstanding = roots::outstanding(store)?;
+    let roots = roots::roots(store, &contents, plan, choice, &runs, &outstanding)?;
     let kept = reach::reach(&contents, &roots);
-    let is_over = |run: &&artifact::Run| !run.in_progress && !choice.is_recent(run.used_unix());
-    let runs_to_go = store.runs()?.iter().filter(is_over).map(|run| run.id.clone()).collect();
+    let is_kept = |run: &artifact::Run| run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix());
+    let runs_to_go = runs.iter().filter(|run| !is_kept(run)).map(|run| run.id.clone()).collect();
     Ok(Verdict { contents, kept, runs_to_go })
 }
 

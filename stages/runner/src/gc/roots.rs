@@ -1,6 +1,7 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::{Run, Store, StoreError, Waiting, unix_time};
+use slurm::{Queue, Slurm};
 
 use super::contents::Contents;
 
@@ -34,11 +35,20 @@ impl Choice {
 }
 
 /// All roots of a store; where several hold a thing, the first says why.
-pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choice) -> Result<Vec<Root>, StoreError> {
+pub(super) fn roots(
+    store: &Store,
+    contents: &Contents,
+    plan: Root,
+    choice: Choice,
+    runs: &[Run],
+    outstanding: &BTreeMap<String, String>,
+) -> Result<Vec<Root>, StoreError> {
     let mut roots = vec![plan];
     roots.extend(store.pins()?.into_iter().map(|pin| of_run(format!("pinned as {}", pin.id), pin)));
-    for run in store.runs()? {
-        if run.in_progress {
+    for run in runs.iter().cloned() {
+        if let Some(why) = outstanding.get(&run.id) {
+            roots.push(of_run(why.clone(), run));
+        } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
             roots.push(of_run(format!("process {process} is running it"), run));
         } else if choice.is_recent(run.used_unix()) {
@@ -56,6 +66,20 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
         roots.extend(with_checkpoint.map(|key| one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)));
     }
     Ok(roots)
+}
+
+/// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every one.
+pub(super) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
+    let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| ids.map(|id| (id.to_owned(), why.to_owned())).collect();
+    match Queue::look(&Slurm::default(), store.root()) {
+        Ok(queue) => Ok(all("a submitted job needs it", &mut queue.submissions().into_iter())),
+        Err(error) => {
+            let path = store.root().join("slurm");
+            let submissions = slurm::all(store.root()).map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
+            let why = format!("a submitted job may need it, for {error}");
+            Ok(all(&why, &mut submissions.iter().map(|(id, _)| id.as_str())))
+        }
+    }
 }
 
 fn of_run(why: String, run: Run) -> Root {

@@ -11,7 +11,9 @@ use crate::words::age;
 /// Shows every stage with its artifact, age and time.
 pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
+    let mut jobs = session.jobs(&plan).into_iter();
     for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
+        let job = jobs.next().flatten().map(|job| job.words());
         let detail = match &state {
             State::Cached(record) => {
                 let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
@@ -22,6 +24,7 @@ pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCo
             }
             _ => String::new(),
         };
+        let detail = job.into_iter().chain((!detail.is_empty()).then_some(detail)).collect::<Vec<_>>().join("; ");
         print_line!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
     }
     Ok(ExitCode::SUCCESS)
