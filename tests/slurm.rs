@@ -292,7 +292,11 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     assert!(said.lines().any(|line| line.contains("first") && line.contains("a submitted job needs it")), "{said}");
     // Edits meanwhile change nothing of what was submitted; a job that waits for the held one is queued with it.
     let more = cluster.submit(&project, &[&["other"][..], &["-p", "other.hold=hold", "-p", "other.seed=1"]].concat());
-    std::fs::write(project.path("pipeline.yaml"), ONE.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs")).unwrap();
+    std::fs::write(
+        project.path("pipeline.yaml"),
+        ONE.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs"),
+    )
+    .unwrap();
     std::fs::remove_file(project.path("hold")).unwrap();
     cluster.drain();
     assert_eq!([&jobs["last"], &more["other"]].map(|job| cluster.state(job)), ["COMPLETED 0:0", "COMPLETED 0:0"]);
@@ -315,7 +319,8 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
 #[test]
 fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     let Some(cluster) = Cluster::start() else { return };
-    let pipeline = "default: [first]\nstages:\n  first: {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
+    let pipeline =
+        "default: [first]\nstages:\n  first: {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
     let (shared, local) = (project(pipeline), project(pipeline));
     shared.write("site.yaml", "notice: 56s\nsetup: ['echo set-up is done']\n");
     shared.write("hold", "10");
@@ -332,13 +337,17 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
         wait_until(|| log().matches("goes on from the checkpoint later").count() == round && state().starts_with("PENDING"));
         assert!(state().starts_with("PENDING"), "{} {}", state(), log());
         shared.write("hold", &(10 * (round + 1)).to_string());
-        // Slurm waits two minutes with what is queued again.
-        cluster.slurm("scontrol", &["update", &format!("JobId={job}"), "StartTime=now"]);
+        // Slurm waits two minutes with what is queued again. At once it would take the old credential for the new one's.
+        cluster.slurm("scontrol", &["update", &format!("JobId={job}"), "StartTime=now+2"]);
     }
     std::fs::remove_file(shared.path("hold")).unwrap();
     cluster.drain();
     assert_eq!((ran(&shared).len(), state().as_str()), (6, "COMPLETED 0:0"), "{}", log());
-    assert!(log().contains("set-up is done") && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))), "{}", log());
+    assert!(
+        log().contains("set-up is done") && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))),
+        "{}",
+        log()
+    );
     local.ok(&["run"]);
     assert_eq!(outputs(&shared, "first", &[]), outputs(&local, "first", &[]));
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
@@ -358,7 +367,8 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     let log = project.path("log");
     let output = format!("--output={}", log.display());
     // Slurm takes a job that it doesn't know for one that went well.
-    let arguments = ["--parsable", "--dependency=afterok:99999", "--kill-on-invalid-dep=yes", &output, script.to_str().unwrap(), "1"];
+    let arguments =
+        ["--parsable", "--dependency=afterok:99999", "--kill-on-invalid-dep=yes", &output, script.to_str().unwrap(), "1"];
     let job = cluster.slurm("sbatch", &arguments);
     cluster.drain();
     assert_eq!(cluster.state(&job), "FAILED 3:0");
@@ -389,13 +399,25 @@ fn what_slurm_is_told() {
     };
     project.write("site.yaml", "partition: gpu\nmax_submit: 2\nsetup: [module load cuda]\n");
     let said = run(&["run"]);
-    assert_eq!((said.code, said.stdout.as_str()), (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 queued before\n"), "{}", said.stderr);
-    assert!(said.stderr.contains("1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"), "{}", said.stderr);
+    assert_eq!(
+        (said.code, said.stdout.as_str()),
+        (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 queued before\n"),
+        "{}",
+        said.stderr
+    );
+    assert!(
+        said.stderr.contains("1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"),
+        "{}",
+        said.stderr
+    );
     let called = std::fs::read_to_string(project.path("sbatch.called")).unwrap();
     let lines: Vec<&str> = called.lines().collect();
     for (line, words) in [
         (lines[0], " --cpus-per-task=4 --mem=8192M --gres=gpu:1 --time=120 --partition=gpu /"),
-        (lines[1], " --cpus-per-task=4 --mem=8192M --time=120 --partition=gpu --dependency=afterok:41 --kill-on-invalid-dep=yes /"),
+        (
+            lines[1],
+            " --cpus-per-task=4 --mem=8192M --time=120 --partition=gpu --dependency=afterok:41 --kill-on-invalid-dep=yes /",
+        ),
     ] {
         assert!(line.contains(words) && line.contains("--requeue") && line.contains("--signal=B:USR1@90"), "{line}");
     }

@@ -249,5 +249,9 @@ fn old_names_are_told_the_new_ones() {
 
 #[test]
 fn tmp_schema() {
-    std::fs::write("/tmp/pipeline.json", serde_json::to_string_pretty(&schemars::schema_for!(crate::PipelineFile).to_value()).unwrap() + "\n").unwrap();
+    std::fs::write(
+        "/tmp/pipeline.json",
+        serde_json::to_string_pretty(&schemars::schema_for!(crate::PipelineFile).to_value()).unwrap() + "\n",
+    )
+    .unwrap();
 }
