@@ -376,6 +376,20 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     assert!(said.contains("last needs first, which isn't there"), "{said}");
 }
 
+/// A stage that asks for a GPU computes on the first of its own; here that is another kind of device, and so another key.
+#[test]
+fn a_stage_with_a_gpu_computes_on_it() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = project(&ONE.replace("last: {", "last: {resources: {gpus: 1}, "));
+    let jobs = cluster.submit(&project, &[]);
+    cluster.drain();
+    assert_eq!(cluster.state(&jobs["last"]), "COMPLETED 0:0");
+    let devices: Vec<String> = ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
+    assert_eq!(devices, ["cpu", "cuda:0"]);
+    assert!(cluster.ok(&project, &["run"]).contains("nothing to run"));
+    assert!(project.ok(&["plan"]).contains("device: \"cuda\" → \"cpu\""), "{}", project.ok(&["plan"]));
+}
+
 /// A program of Slurm's that writes down how it was called.
 fn fake(project: &Project, name: &str, more: &str) {
     let here = project.path(".").display().to_string();

@@ -4,10 +4,10 @@ use std::process::ExitCode;
 
 use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use garbage::Choice;
 use slurm::Site;
 
 use crate::execute::{Cluster, Executor, JOB_VERB, Local};
-use crate::gc::Choice;
 use crate::graph::{ascii, dot, svg};
 use crate::limits::capped;
 use crate::pipeline::Pipeline;

@@ -246,12 +246,3 @@ fn old_names_are_told_the_new_ones() {
         assert_eq!(error, format!("p.yaml:5: stage b: `{old}` is called `{new}` now; write `{new}:`"));
     }
 }
-
-#[test]
-fn tmp_schema() {
-    std::fs::write(
-        "/tmp/pipeline.json",
-        serde_json::to_string_pretty(&schemars::schema_for!(crate::PipelineFile).to_value()).unwrap() + "\n",
-    )
-    .unwrap();
-}

@@ -4,7 +4,7 @@
 //!   before anything runs. `targets` finds what pipeline.yaml doesn't have in `pipelines/`.
 //! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
-//! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
+//! * `stages`: what each stage says of itself; those that aren't known are asked.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
@@ -15,34 +15,27 @@ mod arguments;
 mod axes;
 mod check;
 mod cli;
-mod clock;
 mod counts;
-mod describing;
 mod execute;
 mod expand;
 mod extend;
 mod file;
-mod gc;
 mod graph;
 mod key;
 mod limits;
 mod pipeline;
 mod plan;
-mod process;
 mod publish;
 mod remedy;
 mod renames;
 mod session;
 mod sink;
 mod sources;
-mod stage_log;
 mod stages;
 mod targets;
 mod verbs;
-mod verdict;
 mod waiting;
 mod words;
-mod yaml;
 
 pub use cli::main;
 pub use file::{PipelineFile, StageBlock};

@@ -2,10 +2,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Description, Record, Store, Waiting, hash_json};
+use artifact::{Description, Record, Store, Waiting, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
+use stage_call::Interrupted;
 
 use crate::axes::Scope;
 use crate::check::{self, closure, needs};
@@ -13,7 +14,7 @@ use crate::expand::Expansion;
 use crate::key;
 use crate::pipeline::{Pipeline, PipelineError};
 use crate::renames::known_blocks;
-use crate::stages::{Asking, Interrupted, Programs, StageProgram};
+use crate::stages::{Asking, Programs, StageProgram};
 
 /// Stages × swept values, in an order in which every node comes after what it needs.
 #[derive(Default)]
@@ -119,11 +120,6 @@ pub(crate) enum State {
     WillRun { key_parts: Map<String, Value> },
     /// It can't be known before these have run.
     Waits { on: Vec<usize> },
-}
-
-/// A stage and a sweep's point, as people read it.
-pub(crate) fn label(stage: &str, point: &str) -> String {
-    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
 }
 
 impl Node {

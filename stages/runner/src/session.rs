@@ -51,17 +51,19 @@ impl Session {
         Ok(plan)
     }
 
-    /// The queued or running job of each node, where there is one. Slurm is asked once, and only where this store has had jobs.
-    pub(crate) fn jobs(&self, plan: &Plan) -> Vec<Option<Job>> {
+    /// The queued or running job of each node, where there is one, and how many there are besides. Slurm is asked once, and only where this store has had jobs.
+    pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
         let queue = Queue::look(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
             report_text(&format!("nerf-sr: whether jobs are queued isn't known: {error}"));
             Queue::default()
         });
         if queue.jobs.is_empty() {
-            return Vec::new();
+            return (Vec::new(), 0);
         }
         let identities = identities(plan, &self.store).unwrap_or_default();
-        identities.iter().map(|identity| queue.job_of(identity).cloned()).collect()
+        let jobs: Vec<Option<Job>> = identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
+        let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
+        (jobs, besides)
     }
 
     pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {

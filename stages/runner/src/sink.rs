@@ -7,10 +7,9 @@ use std::sync::atomic::AtomicBool;
 
 use artifact::{MANIFEST_FILE, Manifest, Record, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
+use stage_call::{Call, Display, StageFailure};
 
-use crate::execute::Display;
 use crate::plan::{Origin, Plan, Sink};
-use crate::process::{Call, StageFailure};
 use crate::publish;
 
 /// The record of the nodes that a sink shows and all they were made of.
@@ -101,7 +100,8 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>
     let inputs = [("run".to_owned(), folder)];
     let call = Call {
         label: &sink.stage,
-        program: &sink.program,
+        program: &sink.program.path,
+        description: &sink.program.description,
         params: &params,
         inputs: &inputs,
         hashes: &[],

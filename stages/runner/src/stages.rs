@@ -12,8 +12,8 @@ use std::time::UNIX_EPOCH;
 
 use artifact::{Description, Schema, Store, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
+use stage_call::{Answers, Interrupted, ask_all};
 
-use crate::describing::{Answers, ask_all};
 use crate::pipeline::{Part, Pipeline, PipelineError};
 
 /// A stage's executable and what it says of itself.
@@ -40,10 +40,6 @@ pub(crate) enum Asking<'a> {
     /// The runner's own.
     Look,
 }
-
-/// The asking was interrupted.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Interrupted;
 
 /// The stages' programs, or why they aren't known.
 pub(crate) struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use artifact::{Record, hash_json};
+use stage_call::seconds;
 
-use crate::execute::seconds;
 use crate::key;
 use crate::plan::{Plan, Sink, State};
 use crate::session::Session;

@@ -83,7 +83,7 @@ pub use run_record::{RunInput, RunNode, RunRecord};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished};
+pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished, label};
 pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.

@@ -56,6 +56,11 @@ pub struct Record {
     pub host: String,
 }
 
+/// A stage and a sweep's point, as people read it.
+pub fn label(stage: &str, point: &str) -> String {
+    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
+}
+
 impl Record {
     /// The action's key.
     pub fn key(&self) -> String {

@@ -62,7 +62,12 @@ impl Slurm {
 
     fn call(&self, program: &'static str, arguments: &[impl AsRef<OsStr>]) -> Result<String, SlurmError> {
         let path = self.folder.as_ref().map_or_else(|| PathBuf::from(program), |folder| folder.join(program));
-        let output = Command::new(path).args(arguments).output().map_err(|source| SlurmError::Absent { program, source })?;
+        let mut command = Command::new(path);
+        // What a user wants to see of the queue by default hides nothing here.
+        for (name, _) in std::env::vars_os().filter(|(name, _)| name.as_encoded_bytes().starts_with(b"SQUEUE_")) {
+            command.env_remove(name);
+        }
+        let output = command.args(arguments).output().map_err(|source| SlurmError::Absent { program, source })?;
         if output.status.success() {
             return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
         }

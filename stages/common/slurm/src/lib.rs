@@ -26,5 +26,5 @@ pub use error::SlurmError;
 pub use queue::{Job, Queue};
 pub use resources::Resources;
 pub use site::Site;
-pub use submission::{Submission, Task, all, jobs_log};
+pub use submission::{Submission, Task, all, job_logs};
 pub use submit::{Submitted, Terms};

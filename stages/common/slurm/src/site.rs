@@ -4,6 +4,7 @@ use serde::Deserialize;
 
 use crate::amounts::Period;
 use crate::error::SlurmError;
+use crate::resources::Resources;
 
 /// What a cluster wants that is no pipeline's affair: it stands outside of it, and outside every key.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
@@ -52,6 +53,12 @@ impl Site {
         usual.filter(|file| file.exists()).map_or_else(|| Ok(Self::default()), |file| Self::read(&file))
     }
 
+    /// Why a job with these resources could never get anywhere.
+    pub fn problem(&self, resources: &Resources) -> Option<String> {
+        let time = resources.time.filter(|time| time.seconds <= self.notice.seconds)?;
+        Some(format!("resources: time: {time} is no longer than the site's notice of {}; give it more", self.notice))
+    }
+
     fn read(path: &Path) -> Result<Self, SlurmError> {
         let text = std::fs::read_to_string(path).map_err(|e| SlurmError::file(path, e))?;
         if text.lines().all(|line| line.trim().is_empty() || line.trim_start().starts_with('#')) {
@@ -81,6 +88,8 @@ mod tests {
         let site =
             read("partition: gpu\nsetup: [module load cuda]\narguments: [--exclusive]\nmax_submit: 5\nnotice: 5m\n").unwrap();
         assert_eq!((site.partition.as_deref(), site.max_submit, site.notice.seconds), (Some("gpu"), 5, 300));
+        let problem = |time: &str| site.problem(&serde_yaml::from_str(&format!("time: {time}")).unwrap());
+        assert!(problem("6m").is_none() && problem("5m").unwrap().contains("the site's notice of 5m"));
         for (text, words) in [
             ("partitions: gpu", "unknown field `partitions`"),
             ("notice: 90", "notice: \"90\" is no time"),

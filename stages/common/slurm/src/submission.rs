@@ -1,3 +1,4 @@
+use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -108,16 +109,15 @@ pub fn all(root: &Path) -> Result<Vec<(String, PathBuf)>, SlurmError> {
     Ok(named)
 }
 
-/// The newest log of a job for a task with this identity.
-pub fn jobs_log(root: &Path, identity: &str) -> Option<PathBuf> {
-    let mut newest: Vec<(std::time::SystemTime, PathBuf)> = Vec::new();
-    for (id, _) in all(root).ok()? {
-        let Some(submission) = Submission::read(root, &id) else { continue };
-        let numbers = (0..submission.tasks.len()).filter(|&n| submission.tasks[n].identity == identity);
-        let logs = numbers.map(|number| submission.log(number));
-        newest.extend(logs.filter_map(|log| Some((log.metadata().ok()?.modified().ok()?, log))));
+/// The newest job's log of each task that a job has begun, by the task's identity.
+pub fn job_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError> {
+    let mut logs = BTreeMap::new();
+    // Names begin with the time: the newest comes last.
+    for submission in all(root)?.iter().filter_map(|(id, _)| Submission::read(root, id)) {
+        let numbered = submission.tasks.iter().enumerate().map(|(number, task)| (task, submission.log(number)));
+        logs.extend(numbered.filter(|(_, log)| log.is_file()).map(|(task, log)| (task.identity.clone(), log)));
     }
-    newest.into_iter().max().map(|(_, log)| log)
+    Ok(logs)
 }
 
 /// One submits at a time, so that two don't submit the same. `None` where the wait was given up.
@@ -158,8 +158,9 @@ mod tests {
         assert_eq!(ids, ["a", "b"]);
         assert_eq!(Submission::read(root.path(), "a").unwrap().tasks, [task("x"), task("a")]);
         assert!(Submission::read(root.path(), "c").is_none());
-        let log = jobs_log(root.path(), "b").unwrap();
-        assert!(log.ends_with("slurm/b/1.log") && jobs_log(root.path(), "x").is_none());
+        let logs = job_logs(root.path()).unwrap();
+        assert_eq!(logs.keys().collect::<Vec<_>>(), ["a", "b"], "x has none");
+        assert!(logs["b"].ends_with("slurm/b/1.log"));
     }
 
     #[test]

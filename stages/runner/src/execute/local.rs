@@ -8,11 +8,11 @@ use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
 use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_text};
+use stage_call::{Display, StageFailure};
 
-use super::{Display, Executor, NodeJob, Work};
+use super::{Executor, NodeJob, Work};
 use crate::counts;
 use crate::plan::Plan;
-use crate::process::StageFailure;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::sink::{Showing, Shown, show};

@@ -1,6 +1,5 @@
 //! Who sees to it that a plan's nodes are made: this process, or a cluster's jobs.
 
-mod display;
 mod frozen;
 mod local;
 mod node;
@@ -15,7 +14,6 @@ use artifact::RunFile;
 use crate::plan::Plan;
 use crate::session::Session;
 
-pub(crate) use display::{Display, seconds};
 pub(crate) use frozen::Frozen;
 pub(crate) use local::Local;
 pub(crate) use node::NodeJob;

@@ -6,11 +6,10 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
+use stage_call::{Call, Display, StageFailure, seconds};
 
-use super::display::{Display, seconds};
 use crate::key;
 use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
-use crate::process::{Call, StageFailure};
 use crate::waiting::{by, enter, until_held};
 
 /// A node's inputs: where each lies, and the hash of its content.
@@ -89,7 +88,8 @@ impl NodeJob<'_> {
         let label = self.node.label();
         let call = Call {
             label: &label,
-            program: &self.node.program,
+            program: &self.node.program.path,
+            description: &self.node.program.description,
             params: &attempt.params,
             inputs: &inputs.folders,
             hashes: &inputs.hashes,

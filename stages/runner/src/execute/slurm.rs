@@ -29,6 +29,9 @@ impl Executor for Cluster {
         let root = work.session.store.root();
         let out = std::path::absolute(work.out)?;
         let submission = Submission::new(root, work.run.id(), tasks(work.plan, &work.session.store, &out)?);
+        if let Some((task, problem)) = submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?))) {
+            return Err(PlanError::Usage(format!("stage {}: {problem}", task.stage)).into());
+        }
         let runner = std::env::current_exe().and_then(|exe| exe.canonicalize()).context("the runner's own path")?;
         let terms = Terms {
             slurm: &Slurm::default(),

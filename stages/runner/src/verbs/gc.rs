@@ -1,9 +1,9 @@
 use std::process::ExitCode;
 
 use artifact::{Failure, print_line, report_line, stop_on_signals};
+use garbage::{Choice, Root, judge};
+use stage_call::seconds;
 
-use crate::execute::seconds;
-use crate::gc::{Choice, Root, judge};
 use crate::plan::Request;
 use crate::session::Session;
 use crate::waiting::until_held;

@@ -7,12 +7,11 @@ use anyhow::Context as _;
 use artifact::{Record, RunFile, Store, print_line, report_line, report_text, stop_on_signals};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
+use stage_call::{Display, StageFailure, ask_all};
 
 use super::run::register;
-use crate::describing::ask_all;
-use crate::execute::{Display, Frozen, NodeJob};
+use crate::execute::{Frozen, NodeJob};
 use crate::plan::{Node, Plan, Sink, State};
-use crate::process::StageFailure;
 use crate::sink::{Showing, Shown, show};
 use crate::stages::StageProgram;
 
@@ -27,10 +26,11 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let store = Store::open(root)?;
     let frozen = Frozen::read(&Submission::plan(folder))?;
     let plan = frozen.part(number)?;
-    let run = register(&store, &plan, &stop)?;
-    let task = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop };
-    let result = task.carry_out();
-    run.end().ok();
+    let result = register(&store, &plan, &stop).and_then(|run| {
+        let result = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop }.carry_out();
+        run.end().ok();
+        result
+    });
     let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
     report_text(&format!("nerf-sr: {}", failure.message));
     if is_time_up.load(Ordering::Relaxed) && failure.code == 130 {

@@ -2,11 +2,11 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Store, StoreError, print_line, print_lines};
+use artifact::{Store, StoreError, label, print_line, print_lines};
+use stage_call::utc;
 
-use crate::clock::utc;
 use crate::execute::identities;
-use crate::plan::{Plan, Request, State, label};
+use crate::plan::{Plan, Request, State};
 use crate::session::{Session, of_stage};
 
 /// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
@@ -37,7 +37,7 @@ pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Res
 fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, PathBuf, String)> {
     // What can't be known, say of a folder that is gone, may still have a log from before.
     let Ok(states) = session.states(plan) else { return Vec::new() };
-    let jobs = jobs_logs(session, plan);
+    let jobs = job_logs(session, plan);
     let mut logs = Vec::new();
     for &node in nodes {
         let stages = states[node].key().map(|key| match states[node] {
@@ -53,13 +53,11 @@ fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, Path
 }
 
 /// What the newest job of each node said, where nodes were submitted.
-fn jobs_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
-    let root = session.store.root();
-    if slurm::all(root).map_or(0, |submissions| submissions.len()) == 0 {
-        return Vec::new();
-    }
-    let identities = identities(plan, &session.store).unwrap_or_default();
-    identities.iter().map(|identity| slurm::jobs_log(root, identity)).collect()
+fn job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
+    let logs = slurm::job_logs(session.store.root()).unwrap_or_default();
+    // Without submissions no source is hashed.
+    let identities = (!logs.is_empty()).then(|| identities(plan, &session.store).unwrap_or_default());
+    identities.into_iter().flatten().map(|identity| logs.get(&identity).cloned()).collect()
 }
 
 fn attempt_log(store: &Store, key: &str) -> PathBuf {

@@ -3,10 +3,10 @@ use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use artifact::{Failure, RunFile, Store, report_line, stop_on_signals};
+use stage_call::StageFailure;
 
 use crate::execute::{Executor, Work};
 use crate::plan::{Plan, Request, State};
-use crate::process::StageFailure;
 use crate::session::{Session, command_line};
 use crate::waiting::enter;
 

@@ -1,8 +1,8 @@
 use std::process::ExitCode;
 
-use artifact::{hash_json, print_line, sized};
+use artifact::{counted, hash_json, print_line, sized};
+use stage_call::seconds;
 
-use crate::execute::seconds;
 use crate::graph::state_word;
 use crate::plan::{Request, State};
 use crate::session::Session;
@@ -11,7 +11,8 @@ use crate::words::age;
 /// Shows every stage with its artifact, age and time.
 pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
-    let mut jobs = session.jobs(&plan).into_iter();
+    let (jobs, besides) = session.jobs(&plan);
+    let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
         let job = jobs.next().flatten().map(|job| job.words());
         let detail = match &state {
@@ -26,6 +27,9 @@ pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCo
         };
         let detail = job.into_iter().chain((!detail.is_empty()).then_some(detail)).collect::<Vec<_>>().join("; ");
         print_line!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
+    }
+    if besides > 0 {
+        print_line!("queued besides: {}, of pages or of runs with other arguments", counted(besides, "job"));
     }
     Ok(ExitCode::SUCCESS)
 }

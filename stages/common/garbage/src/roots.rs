@@ -3,39 +3,39 @@ use std::collections::{BTreeMap, BTreeSet};
 use artifact::{Run, Store, StoreError, Waiting, unix_time};
 use slurm::{Queue, Slurm};
 
-use super::contents::Contents;
+use crate::contents::Contents;
 
 /// Something that is needed, and why.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Root {
+pub struct Root {
     /// As people read it after "stays:".
-    pub(crate) why: String,
+    pub why: String,
     /// Keys of actions.
-    pub(crate) keys: BTreeSet<String>,
+    pub keys: BTreeSet<String>,
     /// Nodes that any fitting record may belong to.
-    pub(crate) waiting: Vec<Waiting>,
+    pub waiting: Vec<Waiting>,
     /// Whether it needs the actions that those were made of, too. A plan or a run names them itself.
-    pub(crate) with_inputs: bool,
+    pub with_inputs: bool,
 }
 
 /// What the person who collects garbage chooses.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Choice {
+pub struct Choice {
     /// What was used within so many days stays.
-    pub(crate) keep_days: u64,
+    pub keep_days: u64,
     /// Whether checkpoints of actions that nobody works on go.
-    pub(crate) drop_unfinished: bool,
+    pub drop_unfinished: bool,
 }
 
 impl Choice {
     /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be kept for its age.
-    pub(super) fn is_recent(self, unix: u64) -> bool {
+    pub(crate) fn is_recent(self, unix: u64) -> bool {
         unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
     }
 }
 
 /// All roots of a store; where several hold a thing, the first says why.
-pub(super) fn roots(
+pub(crate) fn roots(
     store: &Store,
     contents: &Contents,
     plan: Root,
@@ -69,7 +69,7 @@ pub(super) fn roots(
 }
 
 /// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every one.
-pub(super) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
+pub(crate) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
     let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| ids.map(|id| (id.to_owned(), why.to_owned())).collect();
     match Queue::look(&Slurm::default(), store.root()) {
         Ok(queue) => Ok(all("a submitted job needs it", &mut queue.submissions().into_iter())),

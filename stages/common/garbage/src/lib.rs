@@ -1,6 +1,7 @@
 //! Garbage collection by reachability: what roots reach stays, everything else goes.
 //!
 //! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress and recent runs.
+//! * Submissions with jobs are roots, too; where a cluster can't be asked, all of them are.
 //! * `contents`: what lies in the store.
 //! * `reach`: from the roots to what they name, and to what that was made of.
 
@@ -12,24 +13,22 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use artifact::{Closed, Store, StoreError, unix_time};
+use artifact::{Closed, Store, StoreError, label, unix_time};
 
-use crate::plan::label;
-
-pub(crate) use roots::{Choice, Root};
+pub use roots::{Choice, Root};
 
 use contents::Contents;
 use reach::Kept;
 
 /// What stays and what goes, for people and for [`Verdict::carry_out`].
-pub(crate) struct Verdict {
+pub struct Verdict {
     contents: Contents,
     kept: Kept,
     runs_to_go: Vec<String>,
 }
 
 /// Decides what goes. `plan` is what the pipeline needs.
-pub(crate) fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
+pub fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
     let contents = Contents::of(store)?;
     let runs = store.runs()?;
     // After the runs were read: whoever had submitted by then has left jobs.
@@ -43,7 +42,7 @@ pub(crate) fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict
 
 impl Verdict {
     /// A line for each artifact and each unfinished action: why it stays, or that it goes.
-    pub(crate) fn lines(&self) -> Vec<String> {
+    pub fn lines(&self) -> Vec<String> {
         let mut makers: BTreeMap<&str, String> = BTreeMap::new();
         for record in self.contents.records.values() {
             let age = unix_time().saturating_sub(record.started_unix) / 3600;
@@ -63,7 +62,7 @@ impl Verdict {
     }
 
     /// Bytes that go, and bytes that stay.
-    pub(crate) fn bytes(&self) -> (u64, u64) {
+    pub fn bytes(&self) -> (u64, u64) {
         let sum = |stays: bool| {
             let objects = self.contents.objects.iter().filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
             objects.map(|(_, bytes)| bytes).sum()
@@ -73,7 +72,7 @@ impl Verdict {
 
     /// Removes what goes: records first, so that none names an object that is gone. The store is closed meanwhile; deleting
     /// ([`Store::empty_trash`]) can wait until it is open again.
-    pub(crate) fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
+    pub fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
         let goes = |kept: &BTreeMap<String, String>, key: &String| !kept.contains_key(key);
         for key in self.contents.action_files.iter().filter(|key| goes(&self.kept.records, key)) {
             store.remove_record(key)?;

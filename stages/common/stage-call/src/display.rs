@@ -7,24 +7,27 @@ use std::time::{Duration, Instant};
 use artifact::{Event, Pace, printable, report_text};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
-use crate::process::Watcher;
-
-/// A time as people say it.
-pub(crate) fn seconds(s: f64) -> String {
-    if s < 90.0 { format!("{s:.1} s") } else { format!("{:.1} min", s / 60.0) }
-}
+use crate::call::Watcher;
 
 /// Bars on a terminal, lines elsewhere.
-pub(crate) struct Display {
+pub struct Display {
     bars: Option<MultiProgress>,
 }
 
+impl Default for Display {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 impl Display {
-    pub(crate) fn new() -> Self {
+    /// Bars where stderr is a terminal.
+    pub fn new() -> Self {
         Self { bars: std::io::stderr().is_terminal().then(MultiProgress::new) }
     }
 
-    pub(crate) fn line(&self, text: &str) {
+    /// Prints a line above the bars.
+    pub fn line(&self, text: &str) {
         match &self.bars {
             // The terminal may have gone; the run goes on.
             Some(bars) => bars.println(printable(text)).unwrap_or_default(),
@@ -32,7 +35,8 @@ impl Display {
         }
     }
 
-    pub(crate) fn start(&self, label: &str) -> StageView<'_> {
+    /// Shows a stage from now on.
+    pub fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
             let style =
                 ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
@@ -51,7 +55,7 @@ impl Display {
 }
 
 /// One running stage on the display.
-pub(crate) struct StageView<'a> {
+pub struct StageView<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
@@ -66,7 +70,8 @@ struct LastShown {
 }
 
 impl StageView<'_> {
-    pub(crate) fn end(&self) {
+    /// Takes its bar away.
+    pub fn end(&self) {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
