@@ -387,7 +387,8 @@ fn a_stage_with_a_gpu_computes_on_it() {
     let devices: Vec<String> = ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
     assert_eq!(devices, ["cpu", "cuda:0"]);
     assert!(cluster.ok(&project, &["run"]).contains("nothing to run"));
-    assert!(project.ok(&["plan"]).contains("device: \"cuda\" → \"cpu\""), "{}", project.ok(&["plan"]));
+    let why = project.ok(&["why", "last"]);
+    assert!(why.contains("device: \"cuda\" → \"cpu\""), "{why}");
 }
 
 /// A program of Slurm's that writes down how it was called.
