@@ -1,4 +1,4 @@
-//! `schemas/` is made from the types; this test keeps it current. `UPDATE=1 cargo test --test schemas` writes it anew.
+//! `schemas/` and `docs/reference/` are made from the types; this test keeps them current. `UPDATE=1 cargo test --test schemas` writes them anew.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -7,8 +7,9 @@ use std::path::Path;
 
 use artifact::{Description, Named, RENAMES, Rename, Schema, Stage};
 use schemars::{JsonSchema, schema_for};
+use serde_json::Value;
 
-fn of<T: JsonSchema>() -> serde_json::Value {
+fn of<T: JsonSchema>() -> Value {
     schema_for!(T).to_value()
 }
 
@@ -30,13 +31,9 @@ fn descriptions() -> Vec<Description> {
     ]
 }
 
-#[test]
-fn schemas_are_current() {
-    let mut all = BTreeMap::new();
-    for description in descriptions() {
-        all.insert(format!("parameters/{}.json", description.name), description.parameters);
-    }
-    for (name, schema) in [
+/// The schemas of all files, by their place in `schemas/`.
+fn schemas() -> BTreeMap<String, Value> {
+    let files = [
         ("pipeline", of::<runner::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
@@ -50,24 +47,83 @@ fn schemas_are_current() {
         ("metrics", of::<eval::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),
         ("degradation", of::<pixels::Degradation>()),
-    ] {
-        all.insert(format!("{name}.json"), schema);
-    }
-    let folder = common::root().join("schemas");
+    ];
+    let parameters = descriptions().into_iter().map(|d| (format!("parameters/{}.json", d.name), d.parameters));
+    files.into_iter().map(|(name, schema)| (format!("{name}.json"), schema)).chain(parameters).collect()
+}
+
+/// Compares a folder with what it should hold, or writes it anew.
+fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
+    let root = common::root().join(folder);
     let update = std::env::var_os("UPDATE").is_some();
-    for (name, schema) in &all {
-        let path = folder.join(name);
-        let text = serde_json::to_string_pretty(schema).unwrap() + "\n";
+    for (name, text) in expected {
+        let path = root.join(name);
         if update {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(&path, text).unwrap();
         } else {
             let found = std::fs::read_to_string(&path).unwrap_or_default();
-            assert!(found == text, "schemas/{name} is out of date: UPDATE=1 cargo test --test schemas");
+            assert!(found == *text, "{folder}/{name} is out of date: UPDATE=1 cargo test --test schemas");
         }
     }
-    let files = walkdir::WalkDir::new(&folder).into_iter().filter(|e| e.as_ref().unwrap().file_type().is_file()).count();
-    assert_eq!(files, all.len(), "schemas/ has a file that no type makes");
+    let files = walkdir::WalkDir::new(&root).into_iter().filter(|e| e.as_ref().unwrap().file_type().is_file()).count();
+    assert_eq!(files, expected.len(), "{folder} has a file that nothing makes");
+}
+
+#[test]
+fn schemas_are_current() {
+    let text = |schema: &Value| serde_json::to_string_pretty(schema).unwrap() + "\n";
+    check_folder("schemas", &schemas().iter().map(|(name, schema)| (name.clone(), text(schema))).collect());
+}
+
+#[test]
+fn reference_pages_are_current() {
+    let mut pages: BTreeMap<String, String> =
+        descriptions().iter().map(|d| (format!("{}.md", d.name), reference::stage_page(d))).collect();
+    pages.insert("files.md".to_owned(), reference::files_page(&schemas()));
+    let project = common::Project::tiny();
+    let help = |arguments: &[&str]| project.run(arguments).stdout;
+    pages.insert("command-line.md".to_owned(), reference::command_page(help));
+    let list = |d: &Description| format!("* [{0}]({0}.md): {1}\n", d.name, d.summary);
+    let stages: String = descriptions().iter().map(list).collect();
+    let further = "\nBesides: [file formats](files.md), [command line](command-line.md).\n";
+    let index = reference::heading("Reference", "Inputs, output and parameters of every stage.") + "\n" + &stages + further;
+    pages.insert("README.md".to_owned(), index);
+    check_folder("docs/reference", &pages);
+}
+
+/// A stage's help names its page, and a parameter's group is one of those that there are.
+#[test]
+fn help_leads_to_the_reference() {
+    for description in descriptions().iter().filter(|d| d.documented().iter().any(|section| !section.parameters.is_empty())) {
+        let help = std::process::Command::new(common::bin(&description.name)).arg("--help").output().unwrap();
+        let help = String::from_utf8(help.stdout).unwrap();
+        let page = format!("docs/reference/{}.md", description.name);
+        assert!(help.contains(&page) && common::root().join(&page).exists(), "{page}");
+        assert!(!help.contains("null"), "{help}");
+        for parameter in description.documented().iter().flat_map(|section| &section.parameters) {
+            let known = parameter.group.is_empty() || artifact::GROUPS.contains(&parameter.group.as_str());
+            assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
+            assert!(parameter.text.ends_with('.') && parameter.default != "none", "{parameter:?}");
+        }
+    }
+}
+
+/// A name means one parameter in each variant of a stage.
+#[test]
+fn parameters_have_one_meaning() {
+    for description in descriptions() {
+        let sections = description.documented();
+        let (common, variants): (Vec<_>, Vec<_>) = sections.iter().partition(|section| section.variant.is_none());
+        for variant in &variants {
+            let all = common.iter().chain([variant]).flat_map(|section| &section.parameters);
+            let mut names: Vec<&str> = all.map(|parameter| parameter.name.as_str()).collect();
+            let count = names.len();
+            names.sort_unstable();
+            names.dedup();
+            assert_eq!(names.len(), count, "{}: {:?}", description.name, variant.variant);
+        }
+    }
 }
 
 /// Every old name is gone, and every new one is there.
@@ -116,5 +172,8 @@ fn artifacts_fit_their_schemas() {
         }
     }
 }
+
+#[path = "reference.rs"]
+mod reference;
 
 mod common;

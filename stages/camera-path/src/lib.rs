@@ -16,21 +16,22 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// The path. Without it: `list` where there are `poses`, `spiral` for cameras that look one way, else `orbit`.
+    /// Kind of path. Default: `list` with `poses`, `spiral` for cameras that look one way, else `orbit`.
+    #[schemars(extend("x-default" = "by cameras"))]
     pub kind: Option<Kind>,
-    /// Frames; a list has its own number.
+    /// Number of frames. A list has a frame for each pose.
     #[schemars(range(min = 1, max = 10000))]
     pub frames: u32,
     /// Turns of a spiral or orbit.
     #[schemars(range(min = 0.01, max = 100.0))]
     pub turns: f64,
-    /// Radius of a spiral or orbit over that which the given cameras have.
+    /// Radius of a spiral or orbit, over that of the given cameras.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub radius: f64,
-    /// For `list`: `camera_to_world`, three rows of four numbers for each frame, as `views.json` has them.
+    /// Poses of `kind: list`: for each frame a `camera_to_world` of three rows of four numbers, as in `views.json`.
     pub poses: Vec<[[f64; 4]; 3]>,
-    /// Width of the frames; the height follows the first camera's aspect. Without it: that of the scene's HR pictures.
-    #[schemars(range(min = 1, max = 65536))]
+    /// Width of the frames; the height follows the first camera's aspect. Default: the width of the scene's HR images.
+    #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
     pub size: Option<u32>,
 }
 

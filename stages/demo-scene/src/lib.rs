@@ -35,20 +35,20 @@ pub struct Params {
     /// Side of the square images, in pixels.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
-    /// Training views.
+    /// Number of training views.
     #[schemars(range(min = 1, max = 1000))]
     pub train: u32,
-    /// Test views, with depth.
+    /// Number of test views, which have depth.
     #[schemars(range(min = 1, max = 1000))]
     pub test: u32,
-    /// Rays a pixel along each axis, for anti-aliasing.
+    /// Rays along each side of a pixel, against aliasing.
     #[schemars(range(min = 1, max = 16))]
     pub samples_per_axis: u32,
     /// Where cameras stand.
     pub layout: Layout,
-    /// Puts the things into a world without end: ground, towers far away, a sky.
+    /// Adds an unbounded background: ground, towers far away, a sky.
     pub backdrop: bool,
-    /// Another seed puts other textures on the things and them in other places.
+    /// Seed of the objects' places and textures.
     pub seed: u32,
 }
 

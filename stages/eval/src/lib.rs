@@ -43,7 +43,7 @@ pub use warp::WarpScore;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// The absolute error that error maps show in their brightest colour.
+    /// Absolute error that error maps show in their brightest colour.
     #[schemars(range(min = 0.001, max = 1.0))]
     pub error_range: f64,
 }

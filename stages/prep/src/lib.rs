@@ -39,44 +39,51 @@ pub use sizes::{SizeError, Sizes, enlarged, sizes};
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the LR images, in pixels; the height follows the aspect. Without it: the HR width divided by `scale`.
-    #[schemars(range(min = 1))]
+    /// Width of the LR images in pixels; the height follows the aspect. Default: the HR width divided by `scale`.
+    #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
-    /// Width of the HR images; without it: `lr_width` times `scale`, or the data's own width.
-    #[schemars(range(min = 1))]
+    /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the images given.
+    #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub hr_width: Option<u32>,
-    /// HR width over LR width; not needed where `lr_width` and `hr_width` are given. Without any of them: 2.
-    #[schemars(range(min = 1.0, max = 16.0))]
+    /// HR width over LR width. It needn't be given beside both widths.
+    #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
     pub scale: Option<f64>,
-    /// Where LR images come from: `photographs` as given, without HR truth, or `downscaled` from HR images by `kernel`. Without it:
-    /// `photographs` for COLMAP and transforms.json, people's own photographs, where no `lr_width` is given; else `downscaled`.
+    /// Where LR images come from: `photographs` as given, without HR ground truth, or `downscaled` from HR images by `kernel`. Default:
+    /// `photographs` for COLMAP and transforms.json without `lr_width`, else `downscaled`.
+    #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub lr_source: Option<LrSource>,
-    /// The kernel that makes LR images from HR ones; with `lr_source: photographs`, the kernel that is assumed to have made them.
-    /// Without it: `lanczos` for downscaled images, `box` for photographs.
+    /// Kernel that makes LR images from HR ones. With `lr_source: photographs`, the kernel that is assumed to have made them. Default: `lanczos`
+    /// for downscaled images, `box` for photographs.
+    #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
-    /// What is done about lenses that aren't pinholes.
+    /// Treatment of lens distortion, where the data set states it.
+    #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
-    /// What lies behind the scene; `alpha` keeps it open, `opaque` says that there is nothing behind. Without it: `opaque` where the
-    /// space holds all that is seen (`ndc`, `contraction`) and pictures aren't transparent, else `white`.
+    /// What lies behind the scene. Default: `opaque` in NDC and in contraction where images have no alpha, else `white`.
+    #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
-    /// Distance along rays before which there is nothing; without it: from the cameras.
-    #[schemars(range(min = 0.0))]
+    /// Distance along rays before which nothing lies. Default: from the cameras.
+    #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub near: Option<f64>,
-    /// Distance along rays behind which there is nothing; without it: from the cameras.
-    #[schemars(range(min = 0.0))]
+    /// Distance along rays behind which nothing lies. Default: from the cameras.
+    #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// What a field keeps in its cube. Without it: `ndc` where all cameras look one way and it is known how near they see, `contraction`
-    /// where something is known to lie far outside what they look at, else `box`.
+    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way and the nearest depth is known, `contraction`
+    /// where points are known far outside the space that the cameras look at, else `box`.
+    #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
-    /// `alpha` carves a visual hull from the LR images' alpha: faster training, but information the paper's method doesn't see.
+    /// `alpha` carves a visual hull from the LR images' alpha. Training is faster, with information that the paper's method doesn't use.
+    #[schemars(extend("x-group" = "field"))]
     pub hull: HullSource,
-    /// Which views are trained on and which are for testing. Without it: what the data set says, else `holdout`.
+    /// Which views are for training and which for testing. Default: the data set's own split, else `holdout`.
+    #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
-    /// At most so many test views, spread evenly; without it: all.
-    #[schemars(range(min = 1))]
+    /// Maximum number of test views, spread evenly.
+    #[schemars(range(min = 1), extend("x-group" = "data", "x-default" = "all"))]
     pub test_views: Option<u32>,
-    /// Training views that are kept at HR, as references for refinement: the first, then each time the one whose camera stands farthest
-    /// from those.
+    /// Number of training views that are kept at HR, as references. The first view is one; each further one has the camera farthest from those
+    /// before.
+    #[schemars(extend("x-group" = "data"))]
     pub hr_references: u32,
 }
 

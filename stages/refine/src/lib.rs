@@ -29,15 +29,16 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Share of the predicted residual that is added. Without it: what was best for the views that its training left out.
-    #[schemars(range(min = 0.0, max = 2.0))]
+    /// Share of the predicted residual that is added. Default: the best share for views that the refiner's training left out.
+    #[schemars(range(min = 0.0, max = 2.0), extend("x-default" = "by refiner"))]
     pub residual_weight: Option<f64>,
-    /// At most so many of the references given, the first. Without it: all.
+    /// Maximum number of HR references: the first ones of input `references` are used.
+    #[schemars(extend("x-default" = "all"))]
     pub max_references: Option<u32>,
-    /// Ways to turn and mirror a view in which our network sees it; the mean of what it adds is taken. Time grows with them.
+    /// Turned and mirrored versions of a view whose residuals are averaged (geometric self-ensemble). Time grows with their number.
     #[schemars(range(min = 1, max = 8))]
     pub self_ensemble: u32,
-    /// `net: paper`: pixels by which its patches of 64 overlap and are blended.
+    /// For refiners of `net: paper`: pixels by which patches of 64 pixels overlap.
     #[schemars(range(min = 0, max = 32))]
     pub overlap: u32,
 }

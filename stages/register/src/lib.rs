@@ -19,10 +19,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// How often the photograph is halved to begin with: more finds cameras that are farther off.
+    /// How often a photograph is halved at the start. More finds cameras that are farther off.
     #[schemars(range(min = 0, max = 8))]
     pub smaller: u32,
-    /// Renderings at most for a photograph at each of its sizes.
+    /// Maximum number of renders for a photograph at each of its sizes.
     #[schemars(range(min = 2, max = 100))]
     pub renderings: u32,
 }

@@ -19,17 +19,15 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the views; heights follow the cameras' aspect. Without it: the cameras' own size.
-    #[schemars(range(min = 1, max = 65536))]
+    /// Width of the views; heights follow the cameras' aspect. Default: the cameras' own size.
+    #[schemars(range(min = 1, max = 65536), extend("x-default" = "by camera"))]
     pub size: Option<u32>,
-    /// Rays along each side of a pixel; 2 casts four: it shows the mean of their colours, as a camera's pixel does, and a depth that one of
-    /// them has.
+    /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
-    /// Which depth goes into `Z`. The median is a surface's, where the mean lies between that and the haze before it: neighbouring views'
-    /// medians agree far more often.
+    /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the surface and floaters before it.
     pub depth: Depth,
-    /// Writes the distance along the ray, too, as channel `distance`.
+    /// Also writes the distance along the ray, as channel `distance`.
     pub ray_distance: bool,
 }
 

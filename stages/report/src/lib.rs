@@ -22,12 +22,14 @@ pub use results::{ResultRow, StageResult};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Views to show, spread evenly over the test views.
+    /// Number of views on the page, spread evenly over the test views.
     #[schemars(range(min = 1, max = 100))]
     pub views: u32,
-    /// The view to show of every method side by side, by name; without it: the first.
+    /// Name of the view that all methods show side by side.
+    #[schemars(extend("x-default" = "the first"))]
     pub compare: Option<String>,
-    /// The square of it to show: x, y and side, in pixels; without it: the one with most detail.
+    /// Square of that view to show: x, y and side, in pixels.
+    #[schemars(extend("x-default" = "the one with most detail"))]
     pub crop: Option<[u32; 3]>,
 }
 

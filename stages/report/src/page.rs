@@ -217,6 +217,14 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
     Ok(html! { @for row in rows { (row) } })
 }
 
+/// A parameter's value; where that was left to the scene, the one in use.
+fn parameter(given: &Value, resolved: Option<&Value>) -> String {
+    match resolved {
+        Some(value) if given.is_null() && !value.is_null() => format!("{value} (by scene)"),
+        _ => given.to_string(),
+    }
+}
+
 /// Every node with parameters, hashes and times.
 fn stages(run: &RunRecord) -> Markup {
     let source = |input: &RunInput| match (input.node, &input.subtree) {
@@ -238,7 +246,7 @@ fn stages(run: &RunRecord) -> Markup {
                         td class="n" { (format!("{:.1} s", node.seconds)) }
                         td class="n" { (node.threads) }
                         td { details { summary { (node.parameters.len()) " parameters, " (node.inputs.len()) " inputs" }
-                            @for (name, value) in &node.parameters { div { code { (name) ": " (value.to_string()) } } }
+                            @for (name, value) in &node.parameters { div { code { (name) ": " (parameter(value, node.resolved.get(name))) } } }
                             @for (name, input) in &node.inputs { div { code { (name) " ← " (source(input)) } } }
                         } }
                     }

@@ -7,6 +7,7 @@ use artifact::{Named, known_names, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;
+use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
 use crate::plan::{PlanError, Request};
 use crate::renames::known_blocks;
@@ -62,6 +63,14 @@ impl Kind {
         match self {
             Self::Parameter => Named::Parameter,
             Self::Input => Named::Input,
+        }
+    }
+
+    /// Whether a block gives that name itself.
+    pub(crate) fn is_given(self, program: Option<&StageProgram>, block: &StageBlock, name: &str) -> bool {
+        match self {
+            Self::Parameter => program.is_some_and(|program| program.is_given(block, name)),
+            Self::Input => block.inputs.contains_key(name),
         }
     }
 
@@ -146,8 +155,8 @@ impl Scope<'_> {
         let has = |stage: &str| self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name));
         let follows = |stage: &str| {
             let block = &self.pipeline.stages[stage];
-            let own = block.gives(kind == Kind::Parameter, name);
-            block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !own)
+            let is_own = || kind.is_given(self.programs.get(stage), block, name);
+            block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !is_own())
         };
         let with_name: Vec<&String> = self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
         let meant: Vec<&String> = with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();

@@ -4,6 +4,8 @@ use std::collections::BTreeSet;
 
 use artifact::{Description, Input, Named, known_names, renamed};
 
+use serde_json::Map;
+
 use crate::file::StageBlock;
 use crate::pipeline::{Part, Pipeline, PipelineError, Source};
 use crate::renames::{known_blocks, known_subtrees};
@@ -49,12 +51,11 @@ fn extension(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), 
 
 /// Checks every block whose stage is known against its description, and every input against what it names.
 pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), PipelineError> {
-    for (name, block) in &pipeline.stages {
+    // What is wrong with a block that others extend is said of it alone.
+    let (extending, own): (Vec<_>, Vec<_>) = pipeline.stages.iter().partition(|(_, block)| block.extends.is_some());
+    for (name, block) in own.into_iter().chain(extending) {
         let Some(program) = programs.get(name) else { continue };
-        if let Err(problems) = program.schema.resolve(&block.parameters) {
-            let parameter = problems[0].name.split('/').next().unwrap_or_default();
-            return Err(pipeline.error(name, Part::Parameter(parameter), problems[0].to_string()));
-        }
+        parameters(pipeline, program, name, block)?;
         for (input, source) in &block.inputs {
             check_input(&program.description, input, source, programs)
                 .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
@@ -66,6 +67,16 @@ pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), Pip
         }
     }
     Ok(())
+}
+
+/// Checks the parameters of a block, over those of the block that it extends.
+fn parameters(pipeline: &Pipeline, program: &StageProgram, name: &str, block: &StageBlock) -> Result<(), PipelineError> {
+    let mut given = Map::new();
+    pipeline.layers(name).for_each(|layer| program.lay_over(&mut given, &pipeline.stages[layer]));
+    let Err(problems) = program.schema.resolve(&given) else { return Ok(()) };
+    let parameter = problems[0].name.split('/').next().unwrap_or_default();
+    let part = if program.is_given(block, parameter) { Part::Parameter(parameter) } else { Part::Block };
+    Err(pipeline.error(name, part, problems[0].to_string()))
 }
 
 /// Checks one input of a stage against what it names.

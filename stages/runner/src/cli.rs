@@ -14,7 +14,7 @@ use crate::pipeline::Pipeline;
 use crate::plan::{Devices, PlanError, Request};
 use crate::remedy::Remedy;
 use crate::session::Session;
-use crate::verbs;
+use crate::verbs::{self, Style};
 
 /// Where the pipeline is looked for.
 const PIPELINE: &str = "pipeline.yaml";
@@ -104,6 +104,9 @@ enum Verb {
     Plan {
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Say why a stage is cached, would run, or waits
     Why {
@@ -111,11 +114,35 @@ enum Verb {
         stage: String,
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Show every stage with its artifact, age and time
     Status {
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the folder of a stage's artifact, or a folder or file inside it
+    Path {
+        /// The stage, e.g. eval, or with a folder or file, e.g. prep/train
+        #[arg(value_name = "STAGE[/FOLDER]")]
+        stage: String,
+        #[command(flatten)]
+        what: What,
+    },
+    /// Tell what differs between two results: parameters, defaults in use, metrics, images
+    Diff {
+        /// A stage with its arguments as one word ("eval -p kernel=box"), the beginning of an artifact's hash, or a recorded run or pin
+        before: String,
+        /// Likewise
+        now: String,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Draw the graph
     Graph {
@@ -163,6 +190,12 @@ enum Verb {
         /// Delete checkpoints, too, of stages that were stopped
         #[arg(long)]
         drop_unfinished: bool,
+        /// Delete what older versions of nerf-sr made, too: its keys can't be met any more
+        #[arg(long)]
+        drop_old: bool,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Print the help of a stage's program: what it makes, its inputs and its parameters
     Describe {
@@ -236,9 +269,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             verbs::run(&session, &what.into(), &out, executor.as_ref())
         }
         Verb::Cancel { stage } => verbs::cancel(&session.store, stage.as_deref()),
-        Verb::Plan { what } => verbs::plan(&session, &what.into()),
-        Verb::Why { stage, what } => verbs::why(&session, &stage, &what.into()),
-        Verb::Status { what } => verbs::status(&session, &what.into()),
+        Verb::Plan { what, json } => verbs::plan(&session, &what.into(), json),
+        Verb::Why { stage, what, json } => verbs::why(&session, &stage, &what.into(), json),
+        Verb::Status { what, json } => verbs::status(&session, &what.into(), json),
+        Verb::Path { stage, what } => verbs::path(&session, &stage, &what.into()),
+        Verb::Diff { before, now, json } => verbs::diff(&session, &before, &now, json),
         Verb::Graph { what, format } => {
             let plan = session.plan(&what.into())?;
             let states = session.states(&plan)?;
@@ -253,8 +288,9 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Verify { remove } => verbs::verify(&session.store, remove),
         Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
         Verb::Unpin { name } => verbs::unpin(&session, &name),
-        Verb::Gc { what, dry_run, keep_days, drop_unfinished } => {
-            verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished })
+        Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old, json } => {
+            let choice = Choice { keep_days, drop_unfinished, drop_old };
+            verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
         }
         Verb::Completions { .. } | Verb::Describe { .. } | Verb::Job { .. } => unreachable!("handled before the session"),
     }

@@ -65,8 +65,8 @@ impl<'a> Expansion<'a> {
     /// Whether a value from the command line reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.
     fn sets(&self, axis: &Axis, stage: &str) -> bool {
         let block = &self.pipeline.stages[stage];
-        let is_own = block.gives(axis.kind == Kind::Parameter, &axis.name);
-        axis.stage == stage || (block.extends.as_deref() == Some(&axis.stage) && !is_own)
+        let is_own = || axis.kind.is_given(self.programs.get(stage), block, &axis.name);
+        axis.stage == stage || (block.extends.as_deref() == Some(&axis.stage) && !is_own())
     }
 
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
@@ -149,12 +149,14 @@ impl<'a> Expansion<'a> {
     fn resolve(&self, stage: &str, program: &StageProgram, point: &Point) -> Result<Value, PlanError> {
         let mut given = Map::new();
         for layer in self.pipeline.layers(stage) {
-            given.extend(self.pipeline.stages[layer].parameters.clone());
+            program.lay_over(&mut given, &self.pipeline.stages[layer]);
             let set = self.axes.iter().enumerate().filter(|(_, axis)| axis.kind == Kind::Parameter && axis.stage == layer);
+            let mut from_line = Map::new();
             for (index, axis) in set.filter(|(_, axis)| self.sets(axis, stage)) {
                 let value = point.get(&index).copied().unwrap_or(0);
-                given.insert(axis.name.clone(), axis.values[value].value.clone());
+                from_line.insert(axis.name.clone(), axis.values[value].value.clone());
             }
+            program.schema.lay_over(&mut given, &from_line);
         }
         program.schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
     }

@@ -57,17 +57,21 @@ pub struct StageBlock {
     pub extends: Option<String>,
     /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that begins with `.` or `/`.
     pub inputs: BTreeMap<String, String>,
-    /// Parameters that differ from the stage's defaults.
+    /// Parameters that differ from the stage's defaults. One that selects a variant may hold that variant's own: `field: {grid: {n_levels: 4}}` is
+    /// `field: grid` and `n_levels: 4`.
     pub parameters: Map<String, Value>,
     /// What it needs of a machine, where a cluster runs it.
     #[serde(skip_serializing_if = "Resources::is_empty")]
     pub resources: Resources,
+    /// What files that extend this one's say of its parameters, one after the other.
+    #[serde(skip)]
+    pub(crate) changes: Vec<Map<String, Value>>,
 }
 
 impl StageBlock {
-    /// Whether the block itself has that parameter, or that input.
-    pub(crate) fn gives(&self, is_parameter: bool, name: &str) -> bool {
-        if is_parameter { self.parameters.contains_key(name) } else { self.inputs.contains_key(name) }
+    /// Its parameters, those that weigh most last.
+    pub(crate) fn parameter_layers(&self) -> impl Iterator<Item = &Map<String, Value>> {
+        [&self.parameters].into_iter().chain(&self.changes)
     }
 
     /// Whether the block itself says that.
@@ -87,7 +91,7 @@ impl StageBlock {
             (self.run, self.extends) = (by.run.clone(), by.extends.clone());
         }
         self.inputs.extend(by.inputs.clone());
-        self.parameters.extend(by.parameters.clone());
+        self.changes.extend(by.parameter_layers().filter(|layer| !layer.is_empty()).cloned());
         self.resources = self.resources.changed(&by.resources);
     }
 }

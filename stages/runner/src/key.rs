@@ -1,16 +1,17 @@
 //! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are what `why` says. So an
 //! explanation can't drift from the key.
 
-use artifact::Record;
+use artifact::{KEY_VERSION, KEY_VERSION_PART, Record};
 use serde_json::{Map, Value, json};
 
+use crate::changes::{Change, changes};
 use crate::plan::Node;
 
 /// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host, the block's name.
 pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();
-    parts.insert("key version".to_owned(), json!(1));
+    parts.insert(KEY_VERSION_PART.to_owned(), json!(KEY_VERSION));
     parts.insert("stage".to_owned(), json!(description.name));
     parts.insert("code".to_owned(), json!(description.code));
     // cuda:0 and cuda:1 are the same kind of device.
@@ -29,34 +30,14 @@ pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> M
 
 /// What differs between a key and the nearest earlier one of the same block, in words; `None` when there is no earlier one.
 pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
-    let differences = |record: &Record| -> Vec<String> {
-        let names: std::collections::BTreeSet<&String> = parts.keys().chain(record.key_parts.keys()).collect();
-        names
-            .into_iter()
-            .filter(|name| parts.get(*name) != record.key_parts.get(*name))
-            .map(|name| describe_change(name, record.key_parts.get(name), parts.get(name)))
-            .collect()
-    };
-    let nearest = records
-        .iter()
-        .filter(|r| r.stage == stage)
-        .map(|r| (differences(r), std::cmp::Reverse(r.started_unix)))
-        .min_by_key(|(changes, newest)| (changes.len(), *newest));
-    nearest.map(|(changes, _)| changes)
+    Some(nearest_changes(parts, stage, records)?.iter().map(ToString::to_string).collect())
 }
 
-/// The beginning of a hash, for people.
-pub(crate) fn short(hash: &str) -> &str {
-    hash.get(..10).unwrap_or(hash)
-}
-
-fn describe_change(name: &str, before: Option<&Value>, now: Option<&Value>) -> String {
-    let show = |value: Option<&Value>| match value {
-        None => "absent".to_owned(),
-        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => short(hash).to_owned(),
-        Some(value) => value.to_string(),
-    };
-    format!("{name}: {} → {}", show(before), show(now))
+/// The same, for programs.
+pub(crate) fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
+    let of_stage = records.iter().filter(|record| record.stage == stage);
+    let compared = of_stage.map(|record| (changes(&record.key_parts, parts), std::cmp::Reverse(record.started_unix)));
+    compared.min_by_key(|(changes, newest)| (changes.len(), *newest)).map(|(changes, _)| changes)
 }
 
 #[cfg(test)]

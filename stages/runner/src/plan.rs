@@ -136,6 +136,17 @@ impl Node {
         }
     }
 
+    /// The parameters that the scene decides, with the values that a finished artifact records; null before that.
+    pub(crate) fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
+        let output = &self.program.description.output;
+        if output.resolved.is_none() {
+            return Map::new();
+        }
+        let mut recorded = output.resolved(artifact);
+        let names = self.program.schema.by_scene(&self.parameters);
+        names.into_iter().map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default())).collect()
+    }
+
     /// The nodes it needs.
     pub(crate) fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(NodeInput::node)
@@ -153,6 +164,15 @@ impl NodeInput {
 }
 
 impl State {
+    /// In a word.
+    pub(crate) fn word(&self) -> &'static str {
+        match self {
+            Self::Cached(_) => "cached",
+            Self::WillRun { .. } => "will run",
+            Self::Waits { .. } => "waits",
+        }
+    }
+
     /// The record, where it is done.
     pub(crate) fn record(self) -> Option<Record> {
         match self {
@@ -274,3 +294,7 @@ pub(crate) fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path
 #[cfg(test)]
 #[path = "plan_tests.rs"]
 mod tests;
+
+#[cfg(test)]
+#[path = "variant_tests.rs"]
+mod variant_tests;

@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, Record, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
 
-use crate::plan::{Origin, Plan, Sink};
+use crate::plan::{Plan, Sink};
 use crate::publish;
 
 /// The record of the nodes that a sink shows and all they were made of.
@@ -23,22 +23,17 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store) -
     let position = |index: usize| wanted.iter().position(|&i| i == index);
     let nodes = wanted.iter().map(|&index| {
         let (node, record) = (&plan.nodes[index], records[index].as_ref()?);
-        let inputs = node.inputs.iter().map(|input| {
-            let from = match &input.from {
-                Origin::Node { index, subtree } => RunInput { node: position(*index), subtree: subtree.clone(), folder: None },
-                Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
-            };
-            (input.name.clone(), from)
-        });
+        let folder = store.object(&record.output);
         Some(RunNode {
             stage: node.stage.clone(),
             point: node.point.clone(),
             kind: node.program.description.output.kind.clone(),
             key: record.key(),
             output: record.output.clone(),
-            folder: store.object(&record.output),
+            resolved: node.by_scene(&folder),
+            folder,
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
-            inputs: inputs.collect(),
+            inputs: node.run_inputs(position),
             started_unix: record.started_unix,
             seconds: record.seconds,
             threads: record.threads,

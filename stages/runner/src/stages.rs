@@ -12,8 +12,10 @@ use std::time::UNIX_EPOCH;
 
 use artifact::{Description, Schema, Store, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use stage_call::{Answers, Interrupted, ask_all};
 
+use crate::file::StageBlock;
 use crate::pipeline::{Part, Pipeline, PipelineError};
 
 /// A stage's executable and what it says of itself.
@@ -29,6 +31,16 @@ impl StageProgram {
         description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
         let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
+    }
+
+    /// Whether a block of this program gives a parameter itself.
+    pub(crate) fn is_given(&self, block: &StageBlock, parameter: &str) -> bool {
+        block.parameter_layers().any(|layer| self.schema.flattened(layer).contains_key(parameter))
+    }
+
+    /// The parameters that a block gives, laid over those that were given before.
+    pub(crate) fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
+        block.parameter_layers().for_each(|layer| self.schema.lay_over(given, layer));
     }
 }
 

@@ -1,12 +1,15 @@
 //! States of nodes, in words.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 
 use artifact::{Record, hash_json};
+use serde_json::Value;
 use stage_call::seconds;
 
+use crate::changes::short;
 use crate::key;
-use crate::plan::{Plan, Sink, State};
+use crate::plan::{Node, Plan, Sink, State};
 use crate::session::Session;
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
@@ -34,12 +37,27 @@ pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State,
         State::WillRun { key_parts } => match key::explain(key_parts, &plan.nodes[index].stage, records) {
             None => "will run: it never ran before".to_owned(),
             Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
-                Some(record) => format!("will run: its artifact {} is gone or incomplete", key::short(&record.output)),
+                Some(record) => format!("will run: its artifact {} is gone or incomplete", short(&record.output)),
                 None => "will run".to_owned(),
             },
             Some(changes) => format!("will run: {}", changes.join("; ")),
         },
     }
+}
+
+/// A line on the parameters that the scene decides: their values where the node is cached, else their names.
+pub(crate) fn by_scene(session: &Session, node: &Node, state: &State) -> Option<String> {
+    let artifact = match state {
+        State::Cached(record) => session.store.object(&record.output),
+        _ => PathBuf::new(),
+    };
+    let entry = |(name, value): (String, Value)| match value {
+        Value::Null => name,
+        Value::String(word) => format!("{name}={word}"),
+        value => format!("{name}={value}"),
+    };
+    let entries: Vec<String> = node.by_scene(&artifact).into_iter().map(entry).collect();
+    (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
 }
 
 /// What becomes of a sink at the end of a run. Whether its page is there is for `run` to see: it alone knows where pages are written.

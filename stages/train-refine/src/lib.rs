@@ -31,70 +31,110 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Parameters of `train-refine`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Which network: ours, or the paper's own (weeks on a CPU; with the published settings unless told otherwise).
+    /// Kind of network: ours, or the paper's, which takes weeks on a CPU.
+    #[schemars(extend("x-group" = "network"))]
     pub net: Net,
-    /// Steps of training. Without it: 4,000 for `compact`, 46,875 for `paper`.
-    #[schemars(range(min = 1))]
-    pub steps: Option<u64>,
-    /// Patches of views in a step. Without it: 8 for `compact`, 32 for `paper`.
-    #[schemars(range(min = 1, max = 4096))]
-    pub batch: Option<u32>,
-    /// Pixels along a patch's side; a multiple of 2 for `compact`, of 8 for `paper`.
-    #[schemars(range(min = 8, max = 1024))]
-    pub patch_size: u32,
-    /// Highest learning rate. Without it: 0.001 for `compact`, 0.0005 for `paper`.
-    #[schemars(range(min = 0.0, max = 1.0))]
-    pub rate: Option<f64>,
-    /// Features of the network's hidden layers; of the first for `paper`. Without it: 32 for `compact`, 128 for `paper`.
-    #[schemars(range(min = 1, max = 512))]
-    pub features: Option<u32>,
-    /// `compact`: residual blocks, of two layers each.
-    #[schemars(range(min = 0, max = 64))]
-    pub blocks: u32,
-    /// `compact`: references that each view gets while the network learns, as many as it will have when it is refined; 0 trains a network that does without.
-    #[schemars(range(min = 0, max = 64))]
-    pub references_per_view: u32,
-    /// `compact`: whether a reference shows only what it sees by its own depth; without it also what something stands before (to be compared with).
-    pub occlusion: bool,
-    /// `compact`: whether what a reference shows is moved, by up to two pixels, to fit what is rendered (to be compared with).
-    pub alignment: bool,
-    /// `paper`: reference patches that a patch gets.
-    #[schemars(range(min = 1, max = 64))]
-    pub patches: u32,
-    /// Seed of everything that is drawn.
+    /// Seed of all random numbers.
+    #[schemars(extend("x-group" = "sampling"))]
     pub seed: u64,
 }
 
-impl Default for Params {
+/// The networks, each with its own parameters.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Net {
+    /// Ours: small, trained by internal learning, with or without references.
+    Compact(CompactParams),
+    /// NeRF-SR's: 30 million weights, trained on patches of HR references.
+    Paper(PaperParams),
+}
+
+impl Default for Net {
+    fn default() -> Self {
+        Self::Compact(CompactParams::default())
+    }
+}
+
+/// Parameters of our network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct CompactParams {
+    /// Steps of training.
+    #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
+    pub steps: u64,
+    /// Patches in a step.
+    #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
+    pub batch: u32,
+    /// Pixels along a patch's side; an even number.
+    #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
+    pub patch_size: u32,
+    /// Highest learning rate.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
+    pub rate: f64,
+    /// Features of the hidden layers.
+    #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
+    pub features: u32,
+    /// Residual blocks, of two layers each.
+    #[schemars(range(min = 0, max = 64), extend("x-group" = "network"))]
+    pub blocks: u32,
+    /// References that each view gets while the network learns: as many as it will have when views are refined. 0 trains a network without references.
+    #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
+    pub references_per_view: u32,
+    /// A reference shows only points that it sees by its own depth. Without this, it also shows points that something hides; for comparisons.
+    #[schemars(extend("x-group" = "data"))]
+    pub occlusion: bool,
+    /// Moves warped references by up to two pixels to fit the render; for comparisons.
+    #[schemars(extend("x-group" = "data"))]
+    pub alignment: bool,
+}
+
+impl Default for CompactParams {
     fn default() -> Self {
         Self {
-            net: Net::Compact,
-            steps: None,
-            batch: None,
+            steps: 4_000,
+            batch: 8,
             patch_size: 64,
-            rate: None,
-            features: None,
+            rate: 1e-3,
+            features: 32,
             blocks: 4,
             references_per_view: 0,
             occlusion: true,
             alignment: false,
-            patches: 8,
-            seed: 0,
         }
     }
 }
 
-/// The networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum Net {
-    /// Ours: small, taught by a rehearsal one size down, sees references where there are some.
-    Compact,
-    /// NeRF-SR's: 30 million weights, patches, taught on HR references.
-    Paper,
+/// Parameters of the paper's network, with the published settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct PaperParams {
+    /// Steps of training.
+    #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
+    pub steps: u64,
+    /// Patches in a step.
+    #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
+    pub batch: u32,
+    /// Pixels along a patch's side; a multiple of 8.
+    #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
+    pub patch_size: u32,
+    /// Highest learning rate.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
+    pub rate: f64,
+    /// Features of the first layer.
+    #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
+    pub features: u32,
+    /// Reference patches that a patch gets.
+    #[schemars(range(min = 1, max = 64), extend("x-group" = "data"))]
+    pub patches: u32,
+}
+
+impl Default for PaperParams {
+    fn default() -> Self {
+        Self { steps: 46_875, batch: 32, patch_size: 64, rate: 5e-4, features: 128, patches: 8 }
+    }
 }
 
 /// One view in so many is left out of training.
@@ -144,33 +184,31 @@ impl Stage for TrainRefine {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         nets::deterministic();
-        if params.net == Net::Paper {
-            return paper::run(context, params);
-        }
-        if params.patch_size % 2 == 1 {
-            return Err(Failure::Usage(format!(
-                "parameter patch_size: {} is odd; an even number is expected",
-                params.patch_size
-            ))
-            .into());
+        let net = match &params.net {
+            Net::Compact(compact) => compact,
+            Net::Paper(paper) => return paper::run(context, paper, params.seed),
+        };
+        if net.patch_size % 2 == 1 {
+            return Err(
+                Failure::Usage(format!("parameter patch_size: {} is odd; an even number is expected", net.patch_size)).into()
+            );
         }
         let own = lr_observations(context)?;
         let (training, left_out) = examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
-        if params.references_per_view > 0 && training.len() < 2 {
+        if net.references_per_view > 0 && training.len() < 2 {
             return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
         }
         let architecture = RefinerArchitecture {
-            channels: params.features.unwrap_or(32),
-            blocks: params.blocks,
-            guidance: (params.references_per_view > 0)
-                .then_some(Guidance { occlusion: params.occlusion, alignment: params.alignment }),
+            channels: net.features,
+            blocks: net.blocks,
+            guidance: (net.references_per_view > 0).then_some(Guidance { occlusion: net.occlusion, alignment: net.alignment }),
         };
         let options = RefinerTraining {
-            steps: params.steps.unwrap_or(4000),
-            batch: params.batch.unwrap_or(8) as usize,
-            square: params.patch_size as usize,
-            references: params.references_per_view as usize,
-            rate: params.rate.unwrap_or(1e-3),
+            steps: net.steps,
+            batch: net.batch as usize,
+            square: net.patch_size as usize,
+            references: net.references_per_view as usize,
+            rate: net.rate,
             seed: params.seed,
         };
         let mut trainer = RefinerTrainer::new(Refiner::new(architecture, params.seed)?, options)?;

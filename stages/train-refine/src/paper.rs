@@ -3,24 +3,24 @@ use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, Perceptu
 use pixels::psnr_of;
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 
-use crate::{Params, examples, say, train};
+use crate::{PaperParams, examples, say, train};
 
 /// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in Caffe's scaling.
 const VGG: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
 
 /// Trains the published network. It learns from all views there are, as published: from one.
-pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
     let (mut known, left_out) = examples(context.input("views")?, context.input("truth")?, None)?;
     if known.len() > 1 {
         known.extend(left_out);
     }
     let options = PaperTraining {
-        steps: params.steps.unwrap_or(46_875),
-        batch: params.batch.unwrap_or(32) as usize,
+        steps: params.steps,
+        batch: params.batch as usize,
         patch: params.patch_size as usize,
         references: params.patches as usize,
-        rate: params.rate.unwrap_or(5e-4),
-        seed: params.seed,
+        rate: params.rate,
+        seed,
     };
     options.check(&known).bad_input("input truth")?;
     let perceptual = context.optional_input("weights").map(perceptual).transpose()?;
@@ -28,8 +28,8 @@ pub(crate) fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         Some(loss) => format!("L1 and the perceptual loss of {} of VGG-19's 5 blocks", loss.blocks()),
         None => "L1 alone: give input weights for the perceptual loss".to_owned(),
     });
-    let width = params.features.unwrap_or(128);
-    let network = PaperRefiner::new(width, params.seed)?;
+    let width = params.features;
+    let network = PaperRefiner::new(width, seed)?;
     let mut trainer = PaperTrainer::new(network, options, perceptual)?;
     train(context, options.steps, &mut trainer, &known, |error| format!("L1 {error:.4}"))?;
     trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;

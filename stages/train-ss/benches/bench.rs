@@ -11,7 +11,9 @@ use artifact::GivenInput;
 use radiance::{Architecture, Field, Passes, Ray, Trainer};
 use scene::{Bounds, Camera, Views};
 use serde::Serialize;
-use train_ss::{Params, Photographs};
+#[cfg(feature = "torch")]
+use train_ss::MlpParams;
+use train_ss::{FieldParams, GridParams, Params, Photographs, ResolvedField, SceneFacts};
 
 #[derive(Serialize)]
 struct Row {
@@ -200,11 +202,13 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let input = GivenInput::open("scene", &scene.join("train"))?;
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
-        let params = &params.suited(&views.bounds.space, views.background, train_ss::epoch(&views, params));
-        let mut supervision = train_ss::supervision(&input, params, Photographs::read(&input)?, None, &|_| ())?;
-        let architecture = params.grid(f64::from(views.views[0].camera.intrinsics.width), &views.bounds.space);
-        let training = params.grid_training(params.rays(0));
-        let mut trainer = Trainer::new(Field::new(architecture, views.bounds, params.seed), training);
+        let params = params.resolve(&SceneFacts::of(&views, true));
+        let mut supervision = train_ss::supervision(&input, &params, Photographs::read(&input)?, None, &|_| ())?;
+        let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field else {
+            anyhow::bail!("a grid is measured here");
+        };
+        let training = params.grid_training(given, *distortion, *floater_loss);
+        let mut trainer = Trainer::new(Field::new(*architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
@@ -216,10 +220,13 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         Ok(trainer.finish())
     };
     // Rays drawn evenly over all pixels, so that the figure compares with others'; then as trainings really go.
-    let params = Params { rays: Some(rays), pixel_importance: Some(1.0), ..Params::default() };
-    let field = run(&params, rows, "")?;
-    run(&Params { pixel_importance: None, ..params.clone() }, rows, "_by_detail")?;
-    let short = Params { rays: Some(rays / 6), ..params.clone() };
+    let grid = |rays, pixel_importance| {
+        let field = FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
+        Params { field, ..Params::default() }
+    };
+    let field = run(&grid(rays, Some(1.0)), rows, "")?;
+    run(&grid(rays, None), rows, "_by_detail")?;
+    let short = grid(rays / 6, Some(1.0));
     run(&short, rows, "_first_sixth")?;
     one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
     for scale in [1.0, 4.0] {
@@ -257,15 +264,17 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
 #[cfg(feature = "torch")]
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;
-    let params =
-        Params { field: train_ss::FieldKind::Mlp, rays: Some((STEPS + 1) * 2048), precrop_steps: Some(0), ..Params::default() };
+    let mlp = MlpParams { rays: Some((STEPS + 1) * 2048), precrop_steps: Some(0), ..MlpParams::default() };
+    let params = Params { field: FieldParams::Mlp(mlp), ..Params::default() };
+    let params = params.resolve(&SceneFacts::of(views, true));
+    let ResolvedField::Mlp { architecture, density_noise_std, given } = &params.field else {
+        anyhow::bail!("MLPs are measured here");
+    };
     nets::deterministic();
     let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None, &|_| ())?;
-    let architecture = params.mlp();
-    let field = torch_field::Mlp::new(architecture, views.bounds, params.seed, nets::device("cpu")?)?;
+    let field = torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;
-    let epoch = train_ss::epoch(views, &params);
-    let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(params.rays(epoch), epoch))?;
+    let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?;
     trainer.step(&mut supervision)?;
     let (start, mut samples) = (Instant::now(), 0);
     while let Some(report) = trainer.step(&mut supervision)? {

@@ -45,9 +45,7 @@ impl Curve {
             rays,
             samples_per_ray: self.samples as f64 / rays.max(1) as f64,
             curve: self.points,
-            exposures: Vec::new(),
-            poses: Vec::new(),
-            warnings: Vec::new(),
+            ..TrainingLog::default()
         }
     }
 }

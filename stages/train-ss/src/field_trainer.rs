@@ -5,7 +5,7 @@ use artifact::{Failure, FailureExt as _};
 use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
-use crate::{Params, Supersampling};
+use crate::{Resolved, ResolvedField, Supersampling};
 
 /// Whatever is trained: a step at a time, with checkpoints.
 pub(crate) trait FieldTrainer {
@@ -39,38 +39,37 @@ impl std::fmt::Display for Collapsed {
 
 impl std::error::Error for Collapsed {}
 
-/// A training that hasn't begun, from fog or from weights that another training wrote (`from`). `hull` are 128³ cells that alone may hold
-/// something; `epoch` counts the rays of all pixels.
+/// A training that hasn't begun, from semi-transparent space or from weights that another training wrote (`from`). `hull` are 128³ cells
+/// that alone may hold something.
 pub(crate) fn start(
-    params: &Params,
-    (model, from): (FieldModel, Option<&Path>),
+    params: &Resolved,
+    from: Option<&Path>,
     bounds: Bounds,
     device: &str,
     hull: Option<Vec<u8>>,
-    epoch: u64,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let rays = params.rays(epoch);
-    match model {
-        FieldModel::Grid(architecture) => {
+    match &params.field {
+        ResolvedField::Grid { architecture, distortion, floater_loss, given } => {
             let field = match from {
                 Some(weights) => {
-                    let mut field = Field::read(weights, architecture, bounds).bad_input("input init")?;
+                    let mut field = Field::read(weights, *architecture, bounds).bad_input("input init")?;
                     field.limit_to_occupied();
                     field
                 }
-                None => Field::new(architecture, bounds, params.seed),
+                None => Field::new(*architecture, bounds, params.seed),
             };
+            let options = params.grid_training(given, *distortion, *floater_loss);
             if device != "cpu" {
-                return start_grid_on(device, &field, params.grid_training(rays), hull);
+                return start_grid_on(device, &field, options, hull);
             }
-            let mut trainer = Trainer::new(field, params.grid_training(rays));
+            let mut trainer = Trainer::new(field, options);
             if let Some(hull) = hull {
                 trainer.limit_to_hull(&hull);
             }
             Ok(Box::new(trainer))
         }
         #[cfg(feature = "torch")]
-        FieldModel::Mlp(architecture) => {
+        ResolvedField::Mlp { architecture, density_noise_std, given } => {
             if hull.is_some() {
                 let message = "parameter field: mlp can't make use of a visual hull; choose prep.hull none";
                 return Err(Failure::Usage(message.to_owned()).into());
@@ -78,13 +77,13 @@ pub(crate) fn start(
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
             let field = match from {
-                Some(weights) => torch_field::Mlp::read(weights, architecture, bounds, device).bad_input("input init")?,
-                None => torch_field::Mlp::new(architecture, bounds, params.seed, device)?,
+                Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device).bad_input("input init")?,
+                None => torch_field::Mlp::new(*architecture, bounds, params.seed, device)?,
             };
-            Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(rays, epoch))?))
+            Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?))
         }
         #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => {
+        ResolvedField::Mlp { .. } => {
             let message = "parameter field: mlp needs libtorch, and train-ss was built without it; build with --features torch";
             Err(Failure::Usage(message.to_owned()).into())
         }

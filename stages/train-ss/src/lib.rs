@@ -1,6 +1,7 @@
 //! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section "Supersampling").
 //!
 //! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
+//! * [`Resolved`]: the parameters with every default that the scene decides ([`Params::resolve`]).
 //! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's average (its eq. 4), or the
 //!   kernel that made the LR images.
 //! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
@@ -19,8 +20,10 @@ mod order;
 mod params;
 mod pose_choice;
 mod references;
+mod resolve;
 mod supervision;
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
@@ -28,14 +31,15 @@ use artifact::{
     Context, Failure, FailureExt as _, GivenInput, Input, Output, Progress, Rule, Stage, WARNING, amount, with_warnings,
 };
 use pixels::{DEGRADATION_FILE, Degradation, Kernel};
-use radiance::{FIELD_FILE, FieldFile, FieldModel};
-use scene::{Intrinsics, Photograph, Space, Views};
+use radiance::{FIELD_FILE, FieldFile};
+use scene::{Photograph, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use member::Member;
-pub use params::{Combine, FieldKind, Params, RateSchedule};
+pub use params::{Combine, FieldParams, GridParams, MlpParams, Params, RateSchedule};
+pub use resolve::{Resolved, ResolvedField, SceneFacts};
 pub use supervision::{Order, Supersampling, SupersamplingOptions, Supervision};
 
 /// `training.json`: how the training went, over all members one after the other.
@@ -48,6 +52,9 @@ pub struct TrainingLog {
     pub rays: u64,
     /// Mean samples a ray over the whole training.
     pub samples_per_ray: f64,
+    /// Values in use of the parameters whose default depends on the scene, by name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub resolved: BTreeMap<String, Value>,
     /// PSNR of training pixels against rays, about a hundred points a member.
     pub curve: Vec<CurvePoint>,
     /// How many times as bright as all together each training view is, in the order of `views.json`, red, green and blue, where that was asked
@@ -89,17 +96,8 @@ pub struct CurvePoint {
     pub psnr: f64,
 }
 
-/// LR pixels across the field's cube, as the finest view sees it.
-fn pixels_across(views: &Views) -> f64 {
-    let across = |k: Intrinsics| match views.bounds.space {
-        // The cube is about what a view sees.
-        Space::Box => f64::from(k.width),
-        Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
-        // Half of it is, and the shell around it.
-        Space::Contraction => 2.0 * f64::from(k.width),
-    };
-    views.views.iter().map(|view| across(view.camera.intrinsics)).fold(0.0, f64::max)
-}
+/// Name of a [`TrainingLog`] in the output.
+const TRAINING_FILE: &str = "training.json";
 
 /// The stage.
 pub struct TrainSs;
@@ -114,22 +112,19 @@ impl Stage for TrainSs {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
             ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
-            (
-                "references",
-                Input::optional(&["scene/references"], "HR pictures of some views, to be trained on beside the LR ones"),
-            ),
+            ("references", Input::optional(&["scene/references"], "HR images of some views, to train on beside the LR images")),
             (
                 "init",
                 Input::optional(
                     &["field"],
-                    "a field that the same parameters gave of the same scene, to fine-tune; parameter combine says how both are used",
+                    "a field to fine-tune, trained on the same scene with the same parameters; see combine",
                 ),
             ),
         ]
     }
 
     fn output() -> Output {
-        Output::kind("field")
+        Output::kind("field").with_resolved(TRAINING_FILE)
     }
 
     fn rules() -> Vec<Rule> {
@@ -140,7 +135,11 @@ impl Stage for TrainSs {
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))
         };
-        closed.map(rule).into()
+        let importance = "parameter pixel_importance: an epoch goes through all pixels evenly; choose order random";
+        let evenly = Rule::new(importance)
+            .when("order", json!({"const": "epochs"}))
+            .must("pixel_importance", json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}));
+        closed.map(rule).into_iter().chain([evenly]).collect()
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
@@ -148,32 +147,26 @@ impl Stage for TrainSs {
         let input = context.input("scene")?;
         let references = context.optional_input("references");
         let views = Views::read(input)?;
-        let epoch = epoch(&views, params);
-        let kept = params.combine(&views.bounds.space);
-        let begun = context.optional_input("init");
-        let params = if begun.is_some() { &params.going_on() } else { params };
-        let params = &params.suited(&views.bounds.space, views.background, epoch);
-        let model = match params.field {
-            FieldKind::Grid => FieldModel::Grid(params.grid(pixels_across(&views), &views.bounds.space)),
-            FieldKind::Mlp => FieldModel::Mlp(params.mlp()),
-        };
+        let init = context.optional_input("init");
+        let has_kernel = input.path(DEGRADATION_FILE).exists();
+        let params = params.resolve(&SceneFacts { is_fine_tuning: init.is_some(), ..SceneFacts::of(&views, has_kernel) });
+        let (model, combine) = (params.model(), params.combine);
         let mut file = FieldFile { field: model, members: params.ensemble, bounds: views.bounds, background: views.background };
-        let begun = begun.map(|input| InitField::read(input, &file)).transpose()?;
-        let first = match (&begun, kept) {
-            (Some(begun), Combine::Ensemble) => begun.keep_beside(context, &mut file)?,
+        let init = init.map(|input| InitField::read(input, &file)).transpose()?;
+        let first = match (&init, combine) {
+            (Some(init), Combine::Ensemble) => init.keep_beside(context, &mut file)?,
             _ => 0,
         };
-        let all = params.rays(epoch);
-        let members: Vec<Params> = (0..params.ensemble).map(|index| params.member(index, all)).collect();
-        let compared = if params.pose_refinement { members[0].rays(epoch) } else { 0 };
-        let progress = context.progress("training", compared + all);
+        let members: Vec<Resolved> = (0..params.ensemble).map(|index| params.member(index)).collect();
+        let compared = if params.pose_refinement { members[0].rays } else { 0 };
+        let progress = context.progress("training", compared + params.rays);
         let data = TrainingData { input, references, views: &views, progress: &progress };
-        let mut log = TrainingLog::default();
+        let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         let mut done = compared;
         for (index, own) in members.into_iter().enumerate() {
             // What the first member finds of poses holds for all.
-            let own = Params { pose_refinement: own.pose_refinement && (index == 0 || moves_cameras(&log, &views)), ..own };
-            let from = begun.as_ref().map(|begun| (begun.member(index as u32), kept));
+            let own = Resolved { pose_refinement: own.pose_refinement && (index == 0 || moves_cameras(&log, &views)), ..own };
+            let from = init.as_ref().map(|init| (init.member(index as u32), combine));
             let before = if index == 0 { 0 } else { done };
             let member = Member::new(context, own, (model, from), first + index as u32, before)?;
             let trained = if index == 0 { pose_choice::train(&member, &data)? } else { member.run(&data)? };
@@ -183,7 +176,7 @@ impl Stage for TrainSs {
             progress.set(done, "");
         }
         context.write_json(FIELD_FILE, &file)?;
-        context.write_json("training.json", &log)?;
+        context.write_json(TRAINING_FILE, &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
         let summary = format!("{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB");
@@ -246,12 +239,6 @@ impl<'a> InitField<'a> {
         }
         Ok(self.members)
     }
-}
-
-/// Rays through all sub-pixels of all views.
-pub fn epoch(views: &Views, params: &Params) -> u64 {
-    let pixels = |v: &scene::View| u64::from(v.camera.intrinsics.width) * u64::from(v.camera.intrinsics.height);
-    views.views.iter().map(pixels).sum::<u64>() * params.side().pow(2)
 }
 
 /// Photographs to train on, each with its view: premultiplied RGBA as they are read, or over the background.
@@ -317,7 +304,7 @@ fn open_background(parameter: &str) -> String {
 /// What the field is compared with, by the parameters and by what the input says of its own making. What is wrong with a reference is said.
 pub fn supervision(
     input: &artifact::GivenInput,
-    params: &Params,
+    params: &Resolved,
     photographs: Photographs,
     references: Option<Photographs>,
     say: &dyn Fn(String),
@@ -333,9 +320,7 @@ pub fn supervision(
     let known = input.path(DEGRADATION_FILE).exists();
     let made: Option<Degradation> = if known { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
     let is_open = background == scene::Background::Alpha;
-    let ours = params.field == FieldKind::Grid && made.is_some() && !is_open;
-    let best = if ours { Supervision::Kernel } else { Supervision::Average };
-    let supervision = params.supervision.unwrap_or(best);
+    let supervision = params.supervision;
     if supervision != Supervision::Average && made.is_none() {
         let message = format!("parameter supervision: the scene has no {DEGRADATION_FILE} that names its kernel; choose average");
         return Err(Failure::Usage(message).into());
@@ -348,17 +333,16 @@ pub fn supervision(
     if let Some((parameter, _)) = closed.iter().find(|(_, asked)| is_open && *asked) {
         return Err(Failure::Usage(open_background(parameter)).into());
     }
-    let rays = params.rays(epoch(&photographs.views, params));
     let kernel = made.map_or(Kernel::Lanczos, |d| d.kernel);
     let references = references.map(|references| references::checked(references, &photographs, kernel, say));
     let options = SupersamplingOptions {
         supervision,
         scale: [params.supersample; 2],
         filter: kernel.filter(),
-        coarse: params.supersample_warmup(),
-        order: params.order(),
-        crop_groups: params.crop_groups(rays),
-        detail: params.pixel_importance(),
+        supersample_warmup: params.supersample_warmup,
+        order: params.order,
+        precrop_bundles: params.precrop_bundles(),
+        pixel_importance: params.pixel_importance,
         exposure: params.exposure,
         pose_refinement: params.pose_refinement,
         seed: params.seed,

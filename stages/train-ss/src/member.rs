@@ -7,12 +7,12 @@ use radiance::{FieldFile, FieldModel};
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
-use crate::{Combine, Params, Photographs, TrainingData, TrainingLog, epoch, read_hull, supervision};
+use crate::{Combine, Photographs, Resolved, TrainingData, TrainingLog, read_hull, supervision};
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
     context: &'a Context,
-    params: Params,
+    params: Resolved,
     model: FieldModel,
     /// Weights to go on from, and what becomes of them.
     from: Option<(PathBuf, Combine)>,
@@ -34,7 +34,7 @@ fn far_warning(moved: &Moved) -> String {
 impl<'a> Member<'a> {
     pub(crate) fn new(
         context: &'a Context,
-        params: Params,
+        params: Resolved,
         (model, from): (FieldModel, Option<(PathBuf, Combine)>),
         index: u32,
         before: u64,
@@ -45,7 +45,7 @@ impl<'a> Member<'a> {
     }
 
     /// Its parameters.
-    pub(crate) fn params(&self) -> &Params {
+    pub(crate) fn params(&self) -> &Resolved {
         &self.params
     }
 
@@ -68,7 +68,7 @@ impl<'a> Member<'a> {
     pub(crate) fn variant(&self, pose_refinement: bool, name: &str, output: PathBuf, more: u64) -> Self {
         Self {
             context: self.context,
-            params: Params { pose_refinement, ..self.params.clone() },
+            params: Resolved { pose_refinement, ..self.params.clone() },
             model: self.model,
             from: self.from.clone(),
             output,
@@ -84,8 +84,8 @@ impl<'a> Member<'a> {
             return Ok(log);
         }
         let mut said = String::new();
-        for restart in 0..=self.params.restarts {
-            let params = Params { seed: self.params.seed.wrapping_add(u64::from(restart)), ..self.params.clone() };
+        for restart in 0..=self.params.restarts() {
+            let params = Resolved { seed: self.params.seed.wrapping_add(u64::from(restart)), ..self.params.clone() };
             if restart > 0 {
                 self.context.say(format!("{said}: starting over with seed {}", params.seed));
             }
@@ -111,20 +111,18 @@ impl<'a> Member<'a> {
     }
 
     /// Trains to the end, with checkpoints, progress and a curve.
-    fn train(&self, params: &Params, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+    fn train(&self, params: &Resolved, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
-        let most = params.max_references.map_or(usize::MAX, |most| most as usize);
-        let references = data.references.map(|input| Photographs::read_first(input, most)).transpose()?;
+        let references = data.references.map(|input| Photographs::read_first(input, params.max_references)).transpose()?;
         let mut supervision = supervision(input, params, Photographs::read(input)?, references, &|text| context.say(text))?;
-        let epoch = epoch(views, params);
-        let (total, group) = (params.rays(epoch), supervision.full_side().iter().product::<usize>());
-        if total < group as u64 {
-            let message = format!("parameter rays: {total} for a field is less than the {group} of one pixel");
+        let (total, bundle) = (params.rays, supervision.full_side().iter().product::<usize>());
+        if total < bundle as u64 {
+            let message = format!("parameter rays: {total} for a field is less than the {bundle} of one pixel");
             return Err(Failure::Usage(message).into());
         }
         let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
         let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
-        let mut trainer = start(params, (self.model, from), views.bounds, &context.device, hull, epoch)?;
+        let mut trainer = start(params, from, views.bounds, &context.device, hull)?;
         if let Some(work) = work {
             std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
         }

@@ -16,11 +16,11 @@ pub(crate) struct Focus {
 const FLAT: f32 = 8.0 / 255.0;
 
 impl Focus {
-    /// Detailed pixels are drawn `detail` times as often as flat ones.
-    pub(crate) fn new(detail: f64, pixels: u64, detailed: Vec<u64>) -> Self {
+    /// Detailed pixels are drawn `importance` times as often as flat ones.
+    pub(crate) fn new(importance: f64, pixels: u64, detailed: Vec<u64>) -> Self {
         let share = detailed.len() as f64 / pixels.max(1) as f64;
-        let even = if detail > 1.0 && share > 0.0 { 1.0 / (detail - 1.0).mul_add(share, 1.0) } else { 1.0 };
-        let weights = [1.0 / even, 1.0 / (even * detail)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
+        let even = if importance > 1.0 && share > 0.0 { 1.0 / (importance - 1.0).mul_add(share, 1.0) } else { 1.0 };
+        let weights = [1.0 / even, 1.0 / (even * importance)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
         Self { detailed, even: even as f32, weights }
     }
 

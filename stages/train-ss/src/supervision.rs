@@ -16,25 +16,25 @@ use crate::hr_cache::{HrCache, KernelOperator};
 use crate::moving_cameras::MovingCameras;
 use crate::order::{Focus, detailed, shuffled};
 
-/// What an LR pixel is compared with.
+/// How rays are compared with the LR pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Supervision {
-    /// The mean of its sub-rays, whatever made the LR pictures: the paper's (eq. 4).
+    /// Their mean is compared, whatever made the LR images (the paper's eq. 4).
     Average,
-    /// The same, with the LR pictures filtered once so that they look as if averaging had made them.
+    /// As `average`, on LR images that were filtered once so that the mean is the right model.
     Refiltered,
-    /// What the known kernel makes of the field's own HR pixels.
+    /// Rays render HR pixels, and the known degradation kernel makes an LR pixel of them.
     Kernel,
 }
 
-/// In which order pixels are drawn.
+/// Orders in which pixels are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Order {
-    /// Each time any pixel.
+    /// Each time any pixel, independently.
     Random,
-    /// All of them in random order, and then again in another.
+    /// Each pixel once in random order, then again in another order.
     Epochs,
 }
 
@@ -58,9 +58,9 @@ pub struct Supersampling {
     /// Sub-rays along x and y, when all are cast and now.
     full: [usize; 2],
     side: [usize; 2],
-    coarse: f64,
+    supersample_warmup: f64,
     order: Order,
-    crop_groups: u64,
+    precrop_bundles: u64,
     focus: Focus,
     seed: u64,
     cache: Option<HrCache>,
@@ -116,13 +116,13 @@ pub struct SupersamplingOptions {
     /// The filter that made the LR pictures.
     pub filter: Filter,
     /// Share of the training during which fewer sub-rays are cast.
-    pub coarse: f64,
+    pub supersample_warmup: f64,
     /// In which order pixels are drawn.
     pub order: Order,
     /// Pixels at the start that come from the middle half of each picture's width and height alone.
-    pub crop_groups: u64,
+    pub precrop_bundles: u64,
     /// How many times as often a pixel with detail is drawn as a flat one, in random order.
-    pub detail: f64,
+    pub pixel_importance: f64,
     /// Whether to find each photograph's exposure.
     pub exposure: bool,
     /// Whether to move cameras to where photographs are met best.
@@ -196,7 +196,7 @@ impl Supersampling {
             let count = (picture.width * picture.height) as u64;
             // Each block of a reference has so many numbers.
             let draws = if hr.is_none() { 1 } else { (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1) };
-            if options.detail > 1.0 {
+            if options.pixel_importance > 1.0 {
                 let counts = |pixel: &usize| !picture.data[pixel * picture.channels].is_nan();
                 let detailed: Vec<usize> = detailed(&whole).filter(counts).collect();
                 with_detail.extend((0..draws).flat_map(|k| detailed.iter().map(move |&pixel| before + k * count + pixel as u64)));
@@ -205,8 +205,8 @@ impl Supersampling {
             ready.push(TrainingView::new(picture, hr, before, &view.camera));
             cameras.push(view.camera);
         }
-        let SupersamplingOptions { coarse, order, crop_groups, detail, exposure, seed, .. } = *options;
-        let focus = Focus::new(detail, pixels, with_detail);
+        let SupersamplingOptions { supersample_warmup, order, precrop_bundles, pixel_importance, exposure, seed, .. } = *options;
+        let focus = Focus::new(pixel_importance, pixels, with_detail);
         let exposures = exposure.then(|| Exposures::new(ready.len()));
         let moving = options.pose_refinement.then(|| MovingCameras::new(cameras, ready.iter().map(TrainingView::photograph)));
         let side = full;
@@ -217,9 +217,9 @@ impl Supersampling {
             background,
             full,
             side,
-            coarse,
+            supersample_warmup,
             order,
-            crop_groups,
+            precrop_bundles,
             focus,
             seed,
             cache,
@@ -314,8 +314,8 @@ impl Supersampling {
     fn pixel(&self, bundle: u64) -> (usize, usize) {
         let mut rng = CounterRng::new(self.seed, PIXEL, bundle);
         let (view, pixel) = match self.order {
-            Order::Epochs if bundle >= self.crop_groups => {
-                let bundle = bundle - self.crop_groups;
+            Order::Epochs if bundle >= self.precrop_bundles => {
+                let bundle = bundle - self.precrop_bundles;
                 self.place(shuffled(self.seed, bundle / self.pixels, bundle % self.pixels, self.pixels))
             }
             _ => {
@@ -331,7 +331,7 @@ impl Supersampling {
             }
         };
         let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
-        if bundle < self.crop_groups {
+        if bundle < self.precrop_bundles {
             let mut middle = |length: u64| length / 4 + rng.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
             return (view, (y * width + x) as usize);
@@ -408,7 +408,7 @@ fn block_means(picture: &Picture, block: [usize; 2]) -> Picture {
 }
 
 /// How often the sub-rays along a side double before all are cast: as many stages has the coarse share of the rays.
-pub(crate) fn coarse_stages(side: u64) -> u32 {
+pub(crate) fn warmup_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
 
@@ -416,9 +416,9 @@ impl radiance::Supervisor for Supersampling {
     fn set_progress(&mut self, done: f64) {
         self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
         self.side = self.full;
-        if done < self.coarse {
-            let stages = coarse_stages(self.full[0].max(self.full[1]) as u64);
-            let now = 1 << (done / self.coarse * f64::from(stages)) as u32;
+        if done < self.supersample_warmup {
+            let stages = warmup_stages(self.full[0].max(self.full[1]) as u64);
+            let now = 1 << (done / self.supersample_warmup * f64::from(stages)) as u32;
             self.side = self.full.map(|n| n.min(now));
         }
     }
@@ -459,7 +459,7 @@ impl radiance::Supervisor for Supersampling {
         let share = 1.0 / colours.len() as f32;
         let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
         let behind = if picture.channels == 4 { self.behind(bundle) } else { [0.0; 3] };
-        let is_cropped = bundle < self.crop_groups;
+        let is_cropped = bundle < self.precrop_bundles;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(cache) = self.kernel(index) {
             let at = [pixel % picture.width, pixel / picture.width];
@@ -530,10 +530,10 @@ mod tests {
             supervision,
             scale,
             filter: Filter::Lanczos,
-            coarse: 0.0,
+            supersample_warmup: 0.0,
             order: Order::Random,
-            crop_groups: 0,
-            detail: 1.0,
+            precrop_bundles: 0,
+            pixel_importance: 1.0,
             exposure: false,
             pose_refinement: false,
             seed: 9,
@@ -681,7 +681,7 @@ mod tests {
     fn sub_rays_double_until_all_are_cast() {
         let rays_at = |scale: f64, done: f64| {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
-            supersampling.coarse = 0.3;
+            supersampling.supersample_warmup = 0.3;
             supersampling.set_progress(done);
             supersampling.rays_per_bundle()
         };
@@ -694,7 +694,7 @@ mod tests {
     #[test]
     fn epochs_draw_without_replacement() {
         let (mut supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
-        (supersampling.order, supersampling.crop_groups) = (Order::Epochs, 50);
+        (supersampling.order, supersampling.precrop_bundles) = (Order::Epochs, 50);
         let drawn = |range: std::ops::Range<u64>| range.map(|g| supersampling.pixel(g).1).collect::<Vec<_>>();
         // 5 × 4 pixels.
         assert!(drawn(0..50).iter().all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5))));
@@ -781,7 +781,7 @@ mod tests {
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-rays they meet the block's mean together.
-            joined.coarse = 0.5;
+            joined.supersample_warmup = 0.5;
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);

@@ -33,10 +33,10 @@ use tch::{TchError, Tensor, no_grad};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// How views are enlarged.
+    /// Method that enlarges views.
     pub method: Method,
-    /// The network's file in input weights. Without it: `imdn_xS.safetensors` or `swinir_xS.safetensors`, where S is the scale, or
-    /// `liif.safetensors`.
+    /// The network's file in input `weights`. Default: `imdn_xS.safetensors` or `swinir_xS.safetensors` for scale S, or `liif.safetensors`.
+    #[schemars(extend("x-default" = "by method"))]
     pub file: Option<String>,
 }
 

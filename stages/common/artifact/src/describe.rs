@@ -1,8 +1,9 @@
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use crate::manifest::relative_path;
 use crate::parameters::Schema;
@@ -20,7 +21,8 @@ pub struct Description {
     pub code: String,
     /// One sentence: what the stage makes of what.
     pub summary: String,
-    /// JSON Schema of the parameters: an object, every property with its default.
+    /// JSON Schema of the parameters: an object, every property with its default. `x-group` names a parameter's group; `x-default` stands for a default
+    /// that is null, and is `by scene` where the inputs decide.
     pub parameters: Value,
     /// Inputs by name.
     pub inputs: BTreeMap<String, Input>,
@@ -44,7 +46,7 @@ impl Description {
         if self.name.is_empty() {
             return Err("it has no name".to_owned());
         }
-        for folder in self.output.subtrees.keys() {
+        for folder in self.output.subtrees.keys().chain(&self.output.resolved) {
             relative_path(folder).map_err(|e| format!("its output: {e}"))?;
         }
         for (index, rule) in self.rules.iter().enumerate() {
@@ -88,12 +90,15 @@ pub struct Output {
     /// Folders of it that an input may name (`prep/train`), with their kinds.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub subtrees: BTreeMap<String, String>,
+    /// A JSON file of it whose entry `resolved` has, by name, the values in use of parameters whose default depends on the inputs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resolved: Option<String>,
 }
 
 impl Output {
     /// An output without subtrees.
     pub fn kind(kind: &str) -> Self {
-        Self { kind: kind.to_owned(), subtrees: BTreeMap::new() }
+        Self { kind: kind.to_owned(), subtrees: BTreeMap::new(), resolved: None }
     }
 
     /// Adds a folder that an input may name.
@@ -101,5 +106,20 @@ impl Output {
     pub fn with_subtree(mut self, folder: &str, kind: &str) -> Self {
         self.subtrees.insert(folder.to_owned(), kind.to_owned());
         self
+    }
+
+    /// Names the file that has the values in use of parameters whose default depends on the inputs.
+    #[must_use]
+    pub fn with_resolved(mut self, file: &str) -> Self {
+        self.resolved = Some(file.to_owned());
+        self
+    }
+
+    /// The values in use that a finished artifact records, by the parameters' names.
+    pub fn resolved(&self, artifact: &Path) -> Map<String, Value> {
+        let bytes = self.resolved.as_ref().and_then(|file| std::fs::read(artifact.join(file)).ok());
+        // An artifact of an older build has none.
+        let file: Option<Value> = bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok());
+        file.and_then(|file| file.get("resolved")?.as_object().cloned()).unwrap_or_default()
     }
 }

@@ -41,8 +41,10 @@ mod canonical;
 mod console;
 mod describe;
 mod device;
+mod documented;
 mod failure;
 mod fsio;
+mod help;
 mod lock;
 mod manifest;
 mod memory;
@@ -59,6 +61,7 @@ mod runs;
 mod signals;
 mod stage;
 mod store;
+mod tagged;
 mod values;
 mod warnings;
 
@@ -67,6 +70,7 @@ pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
 pub use describe::{Description, Input, Output};
 pub use device::check_device;
+pub use documented::{GROUPS, ParameterSection, ParameterText, by_group};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
@@ -83,7 +87,7 @@ pub use run_record::{RunInput, RunNode, RunRecord};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished, label};
+pub use store::{Attempt, Checked, KEY_VERSION, KEY_VERSION_PART, Record, Store, StoreError, Unfinished, label};
 pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.

@@ -2,12 +2,24 @@ use serde_json::{Map, Value, json};
 
 use crate::nearest::{known_names, nearest};
 use crate::renames::{Named, renamed};
+use crate::tagged::Tag;
 use crate::values::Reader;
 
 /// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and in the stage alike.
+///
+/// Parameters are given and hashed by name, on one level. One of them may select a variant of the type ([`Tag`]): then its value is the
+/// variant's name, and the variant's own parameters stand beside it. A name means one parameter of a variant at most.
 #[derive(Debug)]
 pub struct Schema {
     program: String,
+    /// One for each variant, the default's first; a single one where nothing is selected.
+    forms: Vec<Form>,
+    tag: Option<Tag>,
+}
+
+/// The parameters of one variant on one level.
+#[derive(Debug)]
+struct Form {
     schema: Value,
     validator: jsonschema::Validator,
 }
@@ -25,23 +37,129 @@ pub struct ParameterProblem {
 impl Schema {
     /// Compiles the schema that a program describes; the error says what is wrong with it.
     pub fn new(program: &str, schema: &Value) -> Result<Self, String> {
-        let mut bounded = schema.clone();
-        bound_formats(&mut bounded);
-        let validator = jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
-        Ok(Self { program: program.to_owned(), schema: schema.clone(), validator })
+        let tag = Tag::find(schema)?;
+        let forms = match &tag {
+            None => vec![Form::new(schema.clone())?],
+            Some(tag) => tag.forms(schema).into_iter().map(Form::new).collect::<Result<_, _>>()?,
+        };
+        Ok(Self { program: program.to_owned(), forms, tag })
     }
 
     /// Names of all parameters, sorted.
     pub fn names(&self) -> Vec<&str> {
-        let mut names: Vec<_> = self.properties().map(|p| p.keys().map(String::as_str).collect()).unwrap_or_default();
+        let mut names: Vec<&str> = self.forms.iter().flat_map(Form::names).collect();
         names.sort_unstable();
+        names.dedup();
         names
     }
 
     /// A parameter's value in the form that is hashed: numbers as the schema's type has them, so that 2, 2.0 and 2e0 are one value, and what
     /// equals the default as the default is written.
     pub fn canonical_value(&self, name: &str, value: &Value) -> Value {
-        let Some(property) = self.properties().and_then(|p| p.get(name)) else { return value.clone() };
+        let form = self.forms.iter().find(|form| form.property(name).is_some());
+        form.map_or_else(|| value.clone(), |form| form.canonical_value(name, value))
+    }
+
+    /// Parameters on one level, whichever way they are written: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
+    pub fn flattened(&self, given: &Map<String, Value>) -> Map<String, Value> {
+        self.tag.as_ref().map_or_else(|| given.clone(), |tag| tag.flattened(given))
+    }
+
+    /// Lays later parameters over earlier ones. Where the later ones select a variant, earlier ones that it doesn't have go.
+    pub fn lay_over(&self, given: &mut Map<String, Value>, later: &Map<String, Value>) {
+        let later = self.flattened(later);
+        if self.tag.as_ref().is_some_and(|tag| later.contains_key(tag.name())) {
+            let (form, known) = (self.form(&later), self.names());
+            given.retain(|name, _| form.property(name).is_some() || !known.contains(&name.as_str()));
+        }
+        given.extend(later);
+    }
+
+    /// Every parameter with its value: the given one, else the default. The result is what is hashed and passed to the stage.
+    pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
+        let given = self.flattened(given);
+        let form = self.form(&given);
+        let mut resolved = form.defaults();
+        let mut problems = Vec::new();
+        for (name, value) in &given {
+            if form.property(name).is_some() {
+                resolved.insert(name.clone(), form.canonical_value(name, value));
+            } else {
+                let problem = self.unknown(form, name, value);
+                problems.push(ParameterProblem { name: name.clone(), problem });
+            }
+        }
+        let resolved = Value::Object(resolved);
+        problems.extend(form.problems(&resolved));
+        if problems.is_empty() { Ok(resolved) } else { Err(problems) }
+    }
+
+    /// Resolved parameters as the stage's type has them, a variant's parameters inside it.
+    pub(crate) fn nested(&self, resolved: &Value) -> Value {
+        self.tag.as_ref().map_or_else(|| resolved.clone(), |tag| tag.nested(resolved))
+    }
+
+    /// Names of the resolved parameters that are left to the scene.
+    pub fn by_scene<'a>(&'a self, resolved: &'a Value) -> Vec<&'a str> {
+        let form = self.form(resolved.as_object().unwrap_or(&Map::new()));
+        let is_open = |name: &&str| {
+            let default = form.property(name).and_then(|property| property.get(DEFAULT_KEYWORD));
+            resolved[*name].is_null() && default.is_some_and(|default| default == BY_SCENE)
+        };
+        form.names().filter(is_open).collect()
+    }
+
+    /// The form that parameters select; the default's where they select none, or none that there is.
+    fn form(&self, flat: &Map<String, Value>) -> &Form {
+        let selected = self.tag.as_ref().and_then(|tag| tag.selected(flat));
+        &self.forms[selected.unwrap_or(0)]
+    }
+
+    /// What to say of a parameter that there isn't.
+    fn unknown(&self, form: &Form, name: &str, value: &Value) -> String {
+        if let Some(rename) = renamed(Named::Parameter, &self.program, name) {
+            return rename.problem(Some(value));
+        }
+        let others = || self.forms.iter().position(|other| other.property(name).is_some());
+        match &self.tag {
+            Some(tag) if others().is_some() => tag.foreign(others().unwrap_or(0)),
+            _ => format!("unknown; {}", known_names(name, form.names())),
+        }
+    }
+}
+
+/// Keyword of a parameter's schema: stands for the default where that is null.
+pub(crate) const DEFAULT_KEYWORD: &str = "x-default";
+/// Its value where the scene decides.
+const BY_SCENE: &str = "by scene";
+
+impl Form {
+    fn new(schema: Value) -> Result<Self, String> {
+        let mut bounded = schema.clone();
+        bound_formats(&mut bounded);
+        let validator = jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
+        Ok(Self { schema, validator })
+    }
+
+    fn names(&self) -> impl Iterator<Item = &str> {
+        self.properties().into_iter().flat_map(|properties| properties.keys().map(String::as_str))
+    }
+
+    fn properties(&self) -> Option<&Map<String, Value>> {
+        self.schema.get("properties").and_then(Value::as_object)
+    }
+
+    fn property(&self, name: &str) -> Option<&Value> {
+        self.properties()?.get(name)
+    }
+
+    fn defaults(&self) -> Map<String, Value> {
+        let default = |(name, property): (&String, &Value)| Some((name.clone(), property.get("default")?.clone()));
+        self.properties().into_iter().flatten().filter_map(default).collect()
+    }
+
+    fn canonical_value(&self, name: &str, value: &Value) -> Value {
+        let Some(property) = self.property(name) else { return value.clone() };
         let reader = Reader::new(&self.schema);
         let value = reader.read(property, value);
         match property.get("default") {
@@ -50,60 +168,23 @@ impl Schema {
         }
     }
 
-    /// Every parameter with its value: the given one, else the default. The result is what is hashed and passed to the stage.
-    pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
-        let mut resolved = Map::new();
-        for (name, property) in self.properties().into_iter().flatten() {
-            if let Some(default) = property.get("default") {
-                resolved.insert(name.clone(), default.clone());
-            }
-        }
-        let mut problems = Vec::new();
-        for (name, value) in given {
-            if self.properties().is_some_and(|p| p.contains_key(name)) {
-                resolved.insert(name.clone(), self.canonical_value(name, value));
-            } else {
-                problems.push(ParameterProblem { name: name.clone(), problem: self.unknown(name, value) });
-            }
-        }
-        let resolved = Value::Object(resolved);
-        for error in self.validator.iter_errors(&resolved) {
+    fn problems(&self, resolved: &Value) -> Vec<ParameterProblem> {
+        let problem = |error: jsonschema::ValidationError<'_>| {
             let path = error.instance_path().to_string();
             let name = path.trim_start_matches('/').to_owned();
             let problem = match self.choices(&name) {
                 Some(choices) => not_one_of(error.instance(), &choices),
                 None => error.to_string(),
             };
-            let name = if name.is_empty() { "(all)".to_owned() } else { name };
-            problems.push(ParameterProblem { name, problem });
-        }
-        if problems.is_empty() { Ok(resolved) } else { Err(problems) }
-    }
-
-    /// What to say of a parameter that there isn't.
-    fn unknown(&self, name: &str, value: &Value) -> String {
-        match renamed(Named::Parameter, &self.program, name) {
-            Some(rename) => rename.problem(Some(value)),
-            None => format!("unknown; {}", known_names(name, self.names())),
-        }
+            ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
+        };
+        self.validator.iter_errors(resolved).map(problem).collect()
     }
 
     /// The words a parameter may be, where it is a choice: the validator itself only says that no alternative fits.
     fn choices(&self, name: &str) -> Option<Vec<String>> {
-        let property = self.properties()?.get(name)?;
-        // What may be left out is a choice between its kind and null.
-        let is_null = |one: &&Value| one.get("type").is_some_and(|t| t == "null");
-        let inner = property.get("anyOf").and_then(Value::as_array).and_then(|of| of.iter().find(|one| !is_null(one)));
-        let property = inner.unwrap_or(property);
-        let definition = Reader::new(&self.schema).referred(property).unwrap_or(property);
-        if let Some(words) = definition.get("enum").and_then(Value::as_array) {
-            return Some(words.iter().map(ToString::to_string).collect());
-        }
-        definition.get("oneOf")?.as_array()?.iter().map(|one| one.get("const").map(ToString::to_string)).collect()
-    }
-
-    fn properties(&self) -> Option<&Map<String, Value>> {
-        self.schema.get("properties").and_then(Value::as_object)
+        let words = Reader::new(&self.schema).choices(self.property(name)?)?;
+        Some(words.into_iter().map(|(word, _)| word.to_string()).collect())
     }
 }
 

@@ -31,6 +31,9 @@ pub struct RunNode {
     pub folder: PathBuf,
     /// All parameters.
     pub parameters: Map<String, Value>,
+    /// Values in use of the parameters whose default depends on the inputs.
+    #[serde(default, skip_serializing_if = "Map::is_empty")]
+    pub resolved: Map<String, Value>,
     /// Inputs by name.
     pub inputs: BTreeMap<String, RunInput>,
     /// When it started, seconds since 1970.

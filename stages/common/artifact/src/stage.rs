@@ -19,6 +19,7 @@ use crate::console::{print_lines, report_text};
 use crate::describe::{Description, Input, Output};
 use crate::failure::{Failure, FailureExt, exit_code, one_line};
 use crate::fsio::write_json;
+use crate::help::help_of;
 use crate::manifest::{MANIFEST_FILE, Manifest};
 use crate::nearest::known_names;
 use crate::panics::install_panic_hook;
@@ -34,7 +35,8 @@ pub const SUMMARY_FILE: &str = "summary.txt";
 
 /// A stage of the pipeline: inputs and parameters in, one artifact out.
 pub trait Stage {
-    /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default, deny_unknown_fields)]` is expected.
+    /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default, deny_unknown_fields)]` is expected. One of them may be
+    /// an externally tagged `enum` of structs: it selects a variant, whose parameters are given beside it.
     type Params: Serialize + DeserializeOwned + JsonSchema + Default;
     /// Name of stage and binary.
     const NAME: &'static str;
@@ -306,27 +308,6 @@ fn parse_and_run<S: Stage>(
     }
 }
 
-/// Inputs and parameters of a stage, for `--help`.
-fn help_of(description: &Description) -> String {
-    let mut text = String::new();
-    if !description.inputs.is_empty() {
-        text.push_str("Inputs:\n");
-        for (name, input) in &description.inputs {
-            let note = if input.optional { " (optional)" } else { "" };
-            text.push_str(&format!("  {name:<14} {}{note} [{}]\n", input.summary, input.kinds.join(" or ")));
-        }
-        text.push('\n');
-    }
-    text.push_str("Parameters (JSON, --params; in pipeline.yaml under `parameters:`):\n");
-    let properties = description.parameters.get("properties").and_then(Value::as_object);
-    for (name, property) in properties.into_iter().flatten() {
-        let words = property.get("description").and_then(Value::as_str).unwrap_or_default().replace('\n', " ");
-        let default = property.get("default").map(ToString::to_string).unwrap_or_default();
-        text.push_str(&format!("  {name:<14} {words} [default: {default}]\n"));
-    }
-    text
-}
-
 fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
     let for_runner = arguments.progress == ProgressMode::Json;
     if for_runner {
@@ -427,7 +408,7 @@ fn read_params<P: DeserializeOwned>(file: Option<&Path>, description: &Descripti
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
     })?;
-    let params = serde_path_to_error::deserialize(&resolved).usage(format!("--params {place}"))?;
+    let params = serde_path_to_error::deserialize(schema.nested(&resolved)).usage(format!("--params {place}"))?;
     Ok((resolved, params))
 }
 

@@ -62,6 +62,28 @@ impl<'a> Reader<'a> {
         found
     }
 
+    /// The values that a choice may have, each with its description, where a schema is one. What may be left out is a choice between its kind and
+    /// null.
+    pub(crate) fn choices(&self, schema: &'a Value) -> Option<Vec<(&'a Value, &'a str)>> {
+        let definition = self.present(schema);
+        if let Some(words) = definition.get("enum").and_then(Value::as_array) {
+            return Some(words.iter().map(|word| (word, "")).collect());
+        }
+        let choice = |one: &'a Value| {
+            let description = one.get("description").and_then(Value::as_str).unwrap_or_default();
+            Some((one.get("const")?, description))
+        };
+        definition.get("oneOf")?.as_array()?.iter().map(choice).collect()
+    }
+
+    /// The schema of a value that is there: without the null that stands for none, and behind its reference.
+    pub(crate) fn present(&self, schema: &'a Value) -> &'a Value {
+        let is_null = |one: &&Value| one.get("type").is_some_and(|t| t == "null");
+        let inner = schema.get("anyOf").and_then(Value::as_array).and_then(|of| of.iter().find(|one| !is_null(one)));
+        let schema = inner.unwrap_or(schema);
+        self.referred(schema).unwrap_or(schema)
+    }
+
     /// What a schema's `$ref` leads to inside the same document.
     pub(crate) fn referred(&self, schema: &Value) -> Option<&'a Value> {
         self.root.pointer(schema.get("$ref")?.as_str()?.strip_prefix('#')?)

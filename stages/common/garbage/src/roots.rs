@@ -25,6 +25,8 @@ pub struct Choice {
     pub keep_days: u64,
     /// Whether checkpoints of actions that nobody works on go.
     pub drop_unfinished: bool,
+    /// Whether artifacts whose keys are of an older version go.
+    pub drop_old: bool,
 }
 
 impl Choice {
@@ -60,6 +62,10 @@ pub(crate) fn roots(
     roots.extend(store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)));
     for (key, record) in contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix)) {
         roots.push(one(format!("made {}", ago(record.started_unix)), key));
+    }
+    if !choice.drop_old {
+        let old = contents.records.iter().filter(|(_, record)| record.has_old_key());
+        roots.extend(old.map(|(key, _)| one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)));
     }
     if !choice.drop_unfinished {
         let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));

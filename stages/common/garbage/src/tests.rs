@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
-use artifact::{KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time};
+use artifact::{
+    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time,
+};
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
 
@@ -257,7 +259,7 @@ proptest! {
             waiting: case.plan.1.iter().map(|node| waiting(*node)).collect(),
             with_inputs: false,
         };
-        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished };
+        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished, drop_old: true };
 
         let verdict = judge(store, plan, choice).unwrap();
         prop_assert_eq!(verdict.lines().len(), store.objects().unwrap().len() + store.partials().unwrap().len());
@@ -287,8 +289,28 @@ fn orphans_go() {
     let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
     let key = make_action(&store, &action, &parts, &[]);
     fs::write(store.action(&key, "json"), "{").unwrap();
-    let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false }).unwrap();
+    let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false, drop_old: true }).unwrap();
     assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
     verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
+}
+
+/// What has a key of an older version stays, with what it was made of, until it is asked to go.
+#[test]
+fn what_an_older_version_made_stays_until_it_is_dropped() {
+    let dir = tempfile::tempdir().unwrap();
+    let store = Store::open(dir.path()).unwrap();
+    let action = |content| Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes };
+    let map = |parts: Value| parts.as_object().unwrap().clone();
+    let old = make_action(&store, &action(1), &map(json!({"key version": 1, "parameter lr": 100})), &[]);
+    let now = map(json!({KEY_VERSION_PART: KEY_VERSION, "parameter lr_width": 100}));
+    make_action(&store, &action(2), &now, &[]);
+    for (drop_old, expected) in [(false, vec![old]), (true, vec![])] {
+        let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false, drop_old }).unwrap();
+        let reason =
+            verdict.lines().iter().filter(|line| line.ends_with("an older version of nerf-sr made it (--drop-old)")).count();
+        assert_eq!(reason, expected.len());
+        verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
+        assert_eq!(store.action_files().unwrap(), expected);
+    }
 }

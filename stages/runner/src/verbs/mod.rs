@@ -2,9 +2,11 @@
 
 mod cancel;
 mod describe;
+mod diff;
 mod gc;
 mod job;
 mod log;
+mod path;
 mod pin;
 mod plan;
 mod run;
@@ -14,9 +16,11 @@ mod why;
 
 pub(crate) use cancel::cancel;
 pub(crate) use describe::describe;
-pub(crate) use gc::gc;
+pub(crate) use diff::diff;
+pub(crate) use gc::{Style, gc};
 pub(crate) use job::job;
 pub(crate) use log::log;
+pub(crate) use path::path;
 pub(crate) use pin::{pin, unpin};
 pub(crate) use plan::plan;
 pub(crate) use run::run;

@@ -1,19 +1,24 @@
 use std::process::ExitCode;
 
-use artifact::{counted, hash_json, print_line, sized};
+use artifact::{counted, hash_json, print_line, print_lines, sized};
 use stage_call::seconds;
 
-use crate::graph::state_word;
+use crate::node_report::PlanReport;
 use crate::plan::{Request, State};
 use crate::session::Session;
 use crate::words::age;
 
 /// Shows every stage with its artifact, age and time.
-pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
+    let states = session.states(&plan)?;
+    if json {
+        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &[]))?);
+        return Ok(ExitCode::SUCCESS);
+    }
     let (jobs, besides) = session.jobs(&plan);
     let mut jobs = jobs.into_iter();
-    for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
+    for (node, state) in plan.nodes.iter().zip(states) {
         let job = jobs.next().flatten().map(|job| job.words());
         let detail = match &state {
             State::Cached(record) => {
@@ -26,7 +31,7 @@ pub(crate) fn status(session: &Session, what: &Request) -> anyhow::Result<ExitCo
             _ => String::new(),
         };
         let detail = job.into_iter().chain((!detail.is_empty()).then_some(detail)).collect::<Vec<_>>().join("; ");
-        print_line!("{:<40} {:<9} {detail}", node.label(), state_word(&state));
+        print_line!("{:<40} {:<9} {detail}", node.label(), state.word());
     }
     if besides > 0 {
         print_line!("queued besides: {}, of pages or of runs with other arguments", counted(besides, "job"));

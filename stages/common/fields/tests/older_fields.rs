@@ -1,0 +1,62 @@
+//! Fields that an older build trained are read and render as they did then: commit 5af0c3e made the files in `goldens/`, of the demo scene at 16 px.
+
+#![allow(missing_docs, reason = "a test")]
+
+use std::path::Path;
+
+use artifact::GivenInput;
+use fields::Members;
+use radiance::{FIELD_FILE, FieldFile, Ray, RayField as _};
+use scene::{Camera, Views};
+
+fn goldens() -> &'static Path {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/goldens"))
+}
+
+/// A folder like the artifact that the older build made; weights are kept compressed.
+fn artifact(name: &str) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::copy(goldens().join(format!("{name}.json")), folder.path().join(FIELD_FILE)).unwrap();
+    let packed = std::fs::File::open(goldens().join(format!("{name}.safetensors.gz"))).unwrap();
+    let mut weights = std::fs::File::create(folder.path().join(FieldFile::member(0))).unwrap();
+    std::io::copy(&mut flate2::read::GzDecoder::new(packed), &mut weights).unwrap();
+    folder
+}
+
+fn rays(camera: &Camera) -> Vec<Ray> {
+    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+    let ray = |i: u32| {
+        let ray = camera.ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
+        Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+    };
+    (0..width * height).map(ray).collect()
+}
+
+/// Compares a render with the EXR file that the older build wrote, whose colours have half precision.
+fn renders_as_before(name: &str) {
+    let folder = artifact(name);
+    let members = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
+    let views: Views = serde_json::from_slice(&std::fs::read(goldens().join("views.json")).unwrap()).unwrap();
+    let expected = pixels::read_exr(&goldens().join(format!("{name}.exr"))).unwrap();
+    let channel = |name: &str| expected.channel(name).unwrap();
+    let rendered = members.render(&rays(&views.views[0].camera)).unwrap();
+    assert_eq!(rendered.len(), channel("A").len());
+    assert!(channel("A").iter().any(|a| *a > 0.5) && channel("A").iter().any(|a| *a < 0.99), "the view shows something");
+    for (i, pixel) in rendered.iter().enumerate() {
+        for (value, name) in pixel.premultiplied.into_iter().chain([pixel.opacity]).zip(["R", "G", "B", "A"]) {
+            let before = channel(name)[i];
+            assert!((value - before).abs() < 1e-3, "pixel {i} {name}: {value} was {before}");
+        }
+    }
+}
+
+#[test]
+fn a_grid_renders_as_before() {
+    renders_as_before("grid");
+}
+
+#[cfg(feature = "torch")]
+#[test]
+fn the_papers_mlps_render_as_before() {
+    renders_as_before("mlp");
+}

@@ -1,0 +1,174 @@
+//! Parameters of a stage whose `field` selects a variant, in every form in which files and command lines give them: with train-ss's own.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::*;
+
+/// The shipped pipeline as far as a training and one that extends it.
+const PIPELINE: &str = "default: [train-ss]
+stages:
+  scene: {}
+  train-ss:
+    inputs: {scene: scene}
+    parameters:
+      rays: 12000000
+  other:
+    extends: train-ss
+    inputs: {scene: scene}
+    parameters:
+      ensemble: 2
+";
+
+fn descriptions() -> BTreeMap<String, Description> {
+    let parameters: Value = serde_json::from_str(include_str!("../../../schemas/parameters/train-ss.json")).unwrap();
+    let described = [
+        json!({"name": "scene", "version": "", "code": "", "summary": "", "parameters": {}, "inputs": {}, "output": {"kind": "scene"}}),
+        json!({"name": "train-ss", "version": "", "code": "", "summary": "", "parameters": parameters,
+               "inputs": {"scene": {"kinds": ["scene"], "summary": ""}},
+               "output": {"kind": "field", "resolved": "training.json"}}),
+    ];
+    let named = |one: Value| (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap());
+    described.into_iter().map(named).collect()
+}
+
+fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
+    let request = Request { parameters: arguments.iter().map(|word| (*word).to_owned()).collect(), ..Request::default() };
+    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+}
+
+/// The trainings of a plan: point and some parameters.
+fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec<Value>)> {
+    let plan = plan_of(text, arguments).unwrap();
+    let nodes = plan.nodes.iter().filter(|node| node.stage == "train-ss");
+    let values = |node: &Node| names.iter().map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent"))).collect();
+    nodes.map(|node| (node.point.clone(), values(node))).collect()
+}
+
+#[test]
+fn every_form_reaches_a_parameter_of_a_variant() {
+    let names = ["field", "rays", "n_levels", "layers", "hidden_dim"];
+    let grid = |rays: u64, n_levels: u32| vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)];
+    let mlp = |rays: Value, layers: u32| vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)];
+    let one = |values: Vec<Value>| vec![(String::new(), values)];
+    let pointed = |points: &[(&str, Vec<Value>)]| -> Vec<(String, Vec<Value>)> {
+        points.iter().map(|(point, values)| ((*point).to_owned(), values.clone())).collect()
+    };
+    let nested = &PIPELINE.replace("rays: 12000000", "field: {grid: {n_levels: 4}}")[..];
+    let beside = &PIPELINE.replace("rays: 12000000", "rays: 12000000\n      n_levels: 4")[..];
+    let paper = &PIPELINE.replace("rays: 12000000", "field: mlp\n      layers: 4")[..];
+    let all = 12_000_000;
+    for (text, arguments, expected) in [
+        (PIPELINE, &[][..], one(grid(all, 8))),
+        (PIPELINE, &["n_levels=4"], one(grid(all, 4))),
+        (PIPELINE, &["train-ss.n_levels=4"], one(grid(all, 4))),
+        (PIPELINE, &["n_levels=5", "train-ss.n_levels=4"], one(grid(all, 4))),
+        (PIPELINE, &["field={\"grid\":{\"n_levels\":4}}"], one(grid(all, 4))),
+        (PIPELINE, &["field=mlp"], one(mlp(json!(all), 8))),
+        (PIPELINE, &["train-ss.field=mlp"], one(mlp(json!(all), 8))),
+        (PIPELINE, &["field=mlp", "layers=4"], one(mlp(json!(all), 4))),
+        (PIPELINE, &["layers=4", "field=mlp"], one(mlp(json!(all), 4))),
+        (PIPELINE, &["field=mlp", "rays="], one(mlp(json!(null), 8))),
+        (PIPELINE, &["field={\"mlp\":{\"layers\":4}}"], one(mlp(json!(all), 4))),
+        (PIPELINE, &["n_levels=4,8"], pointed(&[("n_levels=4", grid(all, 4)), ("n_levels=8", grid(all, 8))])),
+        (PIPELINE, &["field=grid,mlp"], pointed(&[("field=grid", grid(all, 8)), ("field=mlp", mlp(json!(all), 8))])),
+        (PIPELINE, &["field=mlp", "layers=2,4"], pointed(&[("layers=2", mlp(json!(all), 2)), ("layers=4", mlp(json!(all), 4))])),
+        (nested, &[], one(grid(30_000_000, 4))),
+        (nested, &["n_levels=6"], one(grid(30_000_000, 6))),
+        (beside, &[], one(grid(all, 4))),
+        // The variant comes with its own defaults: what the file says for another one isn't meant.
+        (nested, &["field=mlp"], one(mlp(json!(null), 8))),
+        (beside, &["field=mlp"], one(mlp(json!(all), 8))),
+        (beside, &["field=grid,mlp"], pointed(&[("field=grid", grid(all, 4)), ("field=mlp", mlp(json!(all), 8))])),
+        (paper, &[], one(mlp(json!(null), 4))),
+        (paper, &["layers=6"], one(mlp(json!(null), 6))),
+        (paper, &["field=grid"], one(grid(30_000_000, 8))),
+    ] {
+        assert_eq!(trainings(text, arguments, &names), expected, "{arguments:?} over {text}");
+    }
+}
+
+/// A block that extends another has its variant, unless it says otherwise.
+#[test]
+fn a_block_that_extends_follows_the_choice() {
+    let of = |text: &str, arguments: &[&str], name: &str| {
+        let text = text.replace("default: [train-ss]", "default: [train-ss, other]");
+        let plan = plan_of(&text, arguments).unwrap();
+        let node = plan.nodes.iter().find(|node| node.stage == "other").unwrap();
+        node.parameters.get(name).cloned().unwrap_or_default()
+    };
+    let own = &PIPELINE.replace("ensemble: 2", "field: {grid: {n_levels: 3}}")[..];
+    for (text, arguments, name, expected) in [
+        (PIPELINE, &["field=mlp"][..], "field", json!("mlp")),
+        (PIPELINE, &["field=mlp", "layers=4"], "layers", json!(4)),
+        (PIPELINE, &["train-ss.n_levels=4"], "n_levels", json!(4)),
+        (PIPELINE, &["other.n_levels=4"], "n_levels", json!(4)),
+        (own, &["train-ss.n_levels=4"], "n_levels", json!(3)),
+        (own, &["train-ss.field=mlp"], "field", json!("grid")),
+    ] {
+        assert_eq!(of(text, arguments, name), expected, "{arguments:?}");
+    }
+}
+
+#[test]
+fn wrong_foreign_and_old_names_are_refused() {
+    for (arguments, words) in [
+        (&["layers=4"][..], "stage train-ss: parameter layers: belongs to field: mlp; leave it out, or choose field: mlp"),
+        (&["train-ss.layers=4"], "parameter layers: belongs to field: mlp"),
+        (&["field=mlp", "n_levels=4"], "parameter n_levels: belongs to field: grid"),
+        (&["field=grid,mlp", "n_levels=4,8"], "parameter n_levels: belongs to field: grid"),
+        (&["field={\"mlp\":{\"n_levels\":4}}"], "parameter n_levels: belongs to field: grid"),
+        (&["field=voxels"], "parameter field: \"voxels\" is not one of \"grid\", \"mlp\""),
+        (&["field=gird"], "did you mean \"grid\"?"),
+        (&["n_level=4"], "-p n_level: no stage has such a parameter; did you mean n_levels?"),
+        (&["train-ss.n_level=4"], "train-ss has no such parameter; did you mean n_levels?"),
+        (&["grid.n_levels=4"], "no stage \"grid\""),
+        (&["levels=4"], "-p levels: is called n_levels now"),
+        (&["train-ss.levels=4"], "-p train-ss.levels: is called n_levels now"),
+        (&["steps=4"], "is called march_steps now"),
+        (&["haze=0"], "is called floater_loss now"),
+        (&["position_octaves=4"], "is called position_frequencies now"),
+        (&["field=mlp", "noise=1"], "is called density_noise_std now"),
+        (&["hidden_dim=200"], "200 is greater than the maximum of 128"),
+        (&["n_levels=0"], "0 is less than the minimum of 1"),
+        (&["field="], "parameter field: null is not one of"),
+    ] {
+        let problem = plan_of(PIPELINE, arguments).map(|plan| plan.nodes.len()).unwrap_err();
+        assert!(matches!(problem, PlanError::Usage(_)), "{problem:?}");
+        assert!(problem.to_string().contains(words), "{arguments:?}: {problem}");
+    }
+    assert!(plan_of(PIPELINE, &["field=mlp", "hidden_dim=200"]).is_ok());
+}
+
+/// A file's mistakes are named with their lines.
+#[test]
+fn files_with_wrong_variants() {
+    for (from, to, line, words) in [
+        ("rays: 12000000", "layers: 4", 7, "parameter layers: belongs to field: mlp"),
+        ("rays: 12000000", "field: {grid: {layers: 4}}", 6, "parameter layers: belongs to field: mlp"),
+        ("rays: 12000000", "levels: 4", 7, "parameter levels: is called n_levels now"),
+        ("rays: 12000000", "field: {grid: {levels: 4}}", 6, "parameter levels: is called n_levels now"),
+        ("rays: 12000000", "field: {grid: 4}", 7, "parameter field: {\"grid\":4} is not one of"),
+        ("ensemble: 2", "layers: 2", 12, "stage other: parameter layers: belongs to field: mlp"),
+    ] {
+        let problem = plan_of(&PIPELINE.replace(from, to), &[]).map(|plan| plan.nodes.len()).unwrap_err().to_string();
+        assert!(problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words), "{to}: {problem}");
+    }
+}
+
+/// The key has the chosen variant's parameters, each by its name, however they were written.
+#[test]
+fn one_choice_is_one_key() {
+    let key = |text: &str, arguments: &[&str]| {
+        let plan = plan_of(text, arguments).unwrap();
+        artifact::hash_json(&key::parts(&plan.nodes[1], &[], "cpu"))
+    };
+    let nested = PIPELINE.replace("rays: 12000000", "field: {grid: {rays: 12000000, n_levels: 4}}");
+    assert_eq!(key(&nested, &[]), key(PIPELINE, &["n_levels=4"]));
+    assert_eq!(key(PIPELINE, &["field=grid"]), key(PIPELINE, &[]));
+    assert_ne!(key(PIPELINE, &["field=mlp"]), key(PIPELINE, &[]));
+    let plan = plan_of(PIPELINE, &[]).unwrap();
+    let open: Vec<String> = plan.nodes[1].by_scene(Path::new("")).keys().cloned().collect();
+    assert!(["march_steps", "supervision"].iter().all(|name| open.contains(&(*name).to_owned())), "{open:?}");
+}
