@@ -106,7 +106,7 @@ mod tests {
             node("train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
             node("script", "", None),
         ];
-        let found = warnings_by_node(&RunRecord { nodes });
+        let found = warnings_by_node(&RunRecord { home: PathBuf::new(), nodes, failed: Vec::new() });
         let expected = [("register [seed=1]", "cameras have turned far"), ("train-ss", "one"), ("train-ss", "two")];
         assert_eq!(found, expected.map(|(node, warning)| (node.to_owned(), warning.to_owned())));
     }

@@ -117,6 +117,11 @@ impl Axis {
         self.values.iter().flat_map(|value| &value.settings)
     }
 
+    /// Whether each of its values sets one thing.
+    fn is_single(&self) -> bool {
+        self.values.iter().all(|value| value.settings.len() == 1)
+    }
+
     /// Whether both set one and the same thing.
     fn is_of(&self, other: &Self) -> bool {
         self.settings().zip(other.settings()).next().is_some_and(|(one, other)| one.is_of(other))
@@ -135,7 +140,7 @@ impl Scope<'_> {
     /// The axes in the order in which they were given, the last one where several set the same; and what to say of it.
     pub(crate) fn axes(&self, request: &Request) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
         let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
-        let experiment = experiment::axes(self, request)?;
+        let mut experiment = experiment::axes(self, request)?;
         let parameters = request.parameters.iter().map(|text| (Kind::Parameter, text));
         let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
         for (kind, text) in parameters.chain(inputs) {
@@ -143,6 +148,8 @@ impl Scope<'_> {
             if let Some(earlier) = axes.iter().position(|earlier| earlier.is_of(&axis)) {
                 notes.push(format!("{}: overridden by {}", axes.remove(earlier).given, axis.given));
             }
+            // A sweep of the file gives way; what sets several things at once stays, and the command line wins over a part of it.
+            experiment.retain(|earlier| !earlier.is_single() || !earlier.is_of(&axis));
             axes.push(axis);
         }
         // What is said on the command line comes later, and so wins.

@@ -4,14 +4,15 @@ use std::process::ExitCode;
 
 use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
+use garbage::Choice;
+use slurm::Site;
 
-use crate::execute::Options;
+use crate::execute::{Cluster, Executor, JOB_VERB, Local};
 use crate::experiment::Choice as Selection;
-use crate::gc::Choice;
 use crate::graph::{ascii, dot, svg};
 use crate::limits::capped;
 use crate::pipeline::Pipeline;
-use crate::plan::{PlanError, Request};
+use crate::plan::{Devices, PlanError, Request};
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::verbs::{self, Style};
@@ -20,6 +21,8 @@ use crate::verbs::{self, Style};
 const PIPELINE: &str = "pipeline.yaml";
 /// Where stages compute.
 const DEVICE: &str = "cpu";
+/// Who runs them.
+const EXECUTOR: &str = "local";
 
 /// Runs pipeline.yaml: makes what isn't there, skips what is, and says why.
 #[derive(Parser)]
@@ -36,6 +39,18 @@ struct Cli {
     /// Where to compute: cpu or cuda:N
     #[arg(long, global = true, default_value = DEVICE)]
     device: String,
+    /// Who runs the stages. With slurm, a stage that needs GPUs (`resources`) computes on cuda:0
+    #[arg(long, global = true, value_enum, default_value = EXECUTOR, env = "NERF_SR_EXECUTOR")]
+    executor: Choose,
+}
+
+/// An executor's name.
+#[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Choose {
+    /// This machine
+    Local,
+    /// A cluster: a job for each stage that isn't cached
+    Slurm,
 }
 
 #[derive(Args, Default)]
@@ -91,6 +106,22 @@ enum Verb {
         /// Where pages are written [default: out beside the pipeline]
         #[arg(long, value_name = "DIR")]
         out: Option<PathBuf>,
+        /// What a cluster wants besides: partition, account, set-up lines [default: ~/.config/nerf-sr/slurm.yaml if it is there]
+        #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
+        site: Option<PathBuf>,
+    },
+    /// Cancel jobs that were submitted to a cluster, and those that need them
+    Cancel {
+        /// The stage [default: all jobs of this store]
+        stage: Option<String>,
+    },
+    /// Do one task of a submission; the script of its jobs calls this
+    #[command(name = JOB_VERB, hide = true)]
+    Job {
+        /// The submission's folder
+        submission: PathBuf,
+        /// The task's number
+        number: usize,
     },
     /// Show what `run` would do, and run nothing
     Plan {
@@ -238,17 +269,31 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     match &cli.verb {
         Verb::Completions { shell } => return Ok(completions(*shell)),
         Verb::Describe { stage } => return verbs::describe(&Pipeline::read(&cli.pipeline).map_err(PlanError::from)?, stage),
+        Verb::Job { submission, number } => return verbs::job(submission, *number),
         _ => {}
     }
-    let session = Session::open(&cli.pipeline, cli.store.as_deref(), &cli.device)?;
+    let devices = Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
+    let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
-        Verb::Run { what, jobs, threads, keep_going, out } => {
-            let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
-            let (jobs, threads) = at_once(jobs, threads)?;
-            let options = Options { jobs, threads, device: session.device.clone(), keep_going };
+        Verb::Run { what, jobs, threads, keep_going, out, site } => {
+            let executor: Box<dyn Executor> = match cli.executor {
+                Choose::Local => {
+                    let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
+                    let (jobs, threads) = at_once(jobs, threads)?;
+                    Box::new(Local { jobs, threads, keep_going, remedy })
+                }
+                Choose::Slurm if jobs.is_some() || threads.is_some() || keep_going => {
+                    let problem = "--jobs, --threads and --keep-going are for --executor local; say `resources` in the pipeline";
+                    return Err(PlanError::Usage(problem.to_owned()).into());
+                }
+                Choose::Slurm => {
+                    Box::new(Cluster { site: Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))? })
+                }
+            };
             let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
-            verbs::run(&session, &what.into(), &options, &out, &remedy)
+            verbs::run(&session, &what.into(), &out, executor.as_ref())
         }
+        Verb::Cancel { stage } => verbs::cancel(&session.store, stage.as_deref()),
         Verb::Plan { what, json } => verbs::plan(&session, &what.into(), json),
         Verb::Why { stage, what, json } => verbs::why(&session, &stage, &what.into(), json),
         Verb::Status { what, json } => verbs::status(&session, &what.into(), json),
@@ -272,7 +317,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let choice = Choice { keep_days, drop_unfinished, drop_old };
             verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
         }
-        Verb::Completions { .. } | Verb::Describe { .. } => unreachable!("handled before the session"),
+        Verb::Completions { .. } | Verb::Describe { .. } | Verb::Job { .. } => unreachable!("handled before the session"),
     }
 }
 

@@ -51,7 +51,7 @@ impl<'a> Expansion<'a> {
                 self.add_stage(stage, &program)?;
             }
         }
-        Ok(Plan { nodes: self.nodes, sinks, notes: Vec::new() })
+        Ok(Plan { nodes: self.nodes, sinks, ..Plan::default() })
     }
 
     /// A block's inputs less those that the command line replaces.

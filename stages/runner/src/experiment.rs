@@ -29,6 +29,8 @@ pub struct Experiment {
     pub inputs: BTreeMap<String, String>,
     /// Variants, in the order of the table; they form no product.
     pub variants: Vec<Variant>,
+    /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the place of one.
+    pub sweeps: BTreeMap<String, Vec<Value>>,
 }
 
 /// Parameters and inputs that go together.
@@ -82,6 +84,7 @@ impl Experiment {
         self.data = by.data.clone().or_else(|| self.data.take());
         self.presets.extend(by.presets.clone());
         self.inputs.extend(by.inputs.clone());
+        self.sweeps.extend(by.sweeps.clone());
     }
 
     fn is_none(&self) -> bool {
@@ -99,7 +102,9 @@ pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, Pl
     }
     let asked = Asked { scope, experiment, choice };
     let axes = [("scene", asked.scenes()?), ("protocol", asked.protocols()?), ("variant", asked.variants()?)];
-    Ok(axes.into_iter().filter(|(_, values)| !values.is_empty()).map(|(name, values)| Axis::new(name, values)).collect())
+    let axes = axes.into_iter().filter(|(_, values)| !values.is_empty()).map(|(name, values)| Axis::new(name, values));
+    let sweeps = experiment.sweeps.iter().map(|(name, values)| asked.sweep(name, values));
+    axes.map(Ok).chain(sweeps).collect()
 }
 
 /// An experiment and what of it is wanted.
@@ -187,6 +192,17 @@ impl Asked<'_> {
             Ok(AxisValue { text: variant.name.clone(), settings })
         };
         wanted.map(variant).collect()
+    }
+
+    /// A parameter with several values.
+    fn sweep(&self, name: &str, values: &[Value]) -> Result<Axis, PlanError> {
+        let value = |value: &Value| {
+            let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            Ok(AxisValue { text, settings: vec![self.scope.setting(Kind::Parameter, name, value)?] })
+        };
+        let values = values.iter().map(value).collect::<Result<Vec<_>, PlanError>>()?;
+        let name = values.first().and_then(|value| value.settings.first()).map_or(name, |setting| &setting.name).to_owned();
+        Ok(Axis::new(&name, values))
     }
 
     fn parameters(&self, parameters: &Map<String, Value>) -> Result<Vec<Setting>, PlanError> {

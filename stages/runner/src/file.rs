@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 use schemars::JsonSchema;
 use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
+use slurm::Resources;
 
 use crate::experiment::Experiment;
 use crate::pipeline::{Part, PipelineError};
-use crate::{renames, yaml};
+use crate::renames;
 
 /// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.
 ///
@@ -67,6 +68,9 @@ pub struct StageBlock {
     /// Parameters that differ from the stage's defaults. One that selects a variant may hold that variant's own: `field: {grid: {n_levels: 4}}` is
     /// `field: grid` and `n_levels: 4`.
     pub parameters: Map<String, Value>,
+    /// What it needs of a machine, where a cluster runs it.
+    #[serde(skip_serializing_if = "Resources::is_empty")]
+    pub resources: Resources,
     /// What files that extend this one's say of its parameters, one after the other.
     #[serde(skip)]
     pub(crate) changes: Vec<Map<String, Value>>,
@@ -96,6 +100,7 @@ impl StageBlock {
         }
         self.inputs.extend(by.inputs.clone());
         self.changes.extend(by.parameter_layers().filter(|layer| !layer.is_empty()).cloned());
+        self.resources = self.resources.changed(&by.resources);
     }
 }
 
@@ -114,16 +119,16 @@ impl File {
     /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their line.
     pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let fail = |line: Option<usize>, problem: String| PipelineError { place: place(path, line), problem };
-        let text = yaml::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
+        let text = yaml_lines::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
         let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
         // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.
-        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(|e| match yaml::line_of_duplicate(text) {
+        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(|e| match yaml_lines::line_of_duplicate(text) {
             Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
             None => located(e),
         })?;
         let mut document = serde_yaml::Value::Mapping(mapping);
-        let merged = yaml::merge(&mut document).map_err(located)?;
-        let line_of = |keys: &[String]| yaml::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>());
+        let merged = yaml_lines::merge(&mut document).map_err(located)?;
+        let line_of = |keys: &[String]| yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>());
         if let Some((keys, problem)) = problem_of(&document) {
             return Err(fail(line_of(&keys), problem));
         }
@@ -154,13 +159,13 @@ impl File {
 
     /// An error about a key, through nested mappings, with its line.
     pub(crate) fn error(&self, keys: &[&str], problem: String) -> PipelineError {
-        PipelineError { place: place(&self.path, yaml::line_of(&self.text, keys)), problem }
+        PipelineError { place: place(&self.path, yaml_lines::line_of(&self.text, keys)), problem }
     }
 }
 
 /// What is wrong with a file before its types are looked at: the key, and what to do.
 fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
-    if let Some(keys) = yaml::not_finite(document) {
+    if let Some(keys) = yaml_lines::not_finite(document) {
         let problem = format!("{}: a number is neither NaN nor infinite", keys.join("."));
         return Some((keys, problem));
     }

@@ -1,26 +1,17 @@
 //! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are what `why` says. So an
 //! explanation can't drift from the key.
 
-use artifact::Record;
+use artifact::{KEY_VERSION, KEY_VERSION_PART, Record};
 use serde_json::{Map, Value, json};
 
 use crate::changes::{Change, changes};
 use crate::plan::Node;
 
-/// Version of this list: names of parameters changed between 1 and 2.
-pub(crate) const VERSION: u64 = 2;
-pub(crate) const VERSION_PART: &str = "key version";
-
-/// Whether a record's key is of an older version: no plan comes to it any more, though what it names may still be wanted.
-pub(crate) fn is_old(record: &Record) -> bool {
-    record.key_parts.get(VERSION_PART).and_then(Value::as_u64) != Some(VERSION)
-}
-
 /// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host, the block's name.
 pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();
-    parts.insert(VERSION_PART.to_owned(), json!(VERSION));
+    parts.insert(KEY_VERSION_PART.to_owned(), json!(KEY_VERSION));
     parts.insert("stage".to_owned(), json!(description.name));
     parts.insert("code".to_owned(), json!(description.code));
     // cuda:0 and cuda:1 are the same kind of device.

@@ -5,10 +5,10 @@
 //! * [`Plan`]: stages × swept values as nodes in an order that works; what is cached, what will run, what waits. `check` looks at the whole
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
 //! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several things.
-//! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
+//! * `stages`: what each stage says of itself; those that aren't known are asked.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
 //! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all that they were made of.
-//! * `execute`: runs nodes, some at once, each under its key's lock.
+//! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
@@ -18,15 +18,12 @@ mod axes;
 mod changes;
 mod check;
 mod cli;
-mod clock;
 mod counts;
-mod describing;
 mod execute;
 mod expand;
 mod experiment;
 mod extend;
 mod file;
-mod gc;
 mod graph;
 mod key;
 mod limits;
@@ -34,21 +31,17 @@ mod lineage;
 mod node_report;
 mod pipeline;
 mod plan;
-mod process;
 mod publish;
 mod remedy;
 mod renames;
 mod session;
 mod sink;
 mod sources;
-mod stage_log;
 mod stages;
 mod targets;
 mod verbs;
-mod verdict;
 mod waiting;
 mod words;
-mod yaml;
 
 pub use cli::main;
 pub use experiment::{Choice, Experiment, Variant};

@@ -2,12 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::{Manifest, Record, Store};
+use artifact::{Manifest, Record, Store, label};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
 use crate::changes::{Change, changes};
-use crate::plan::label;
 
 /// Metrics of an artifact.
 const METRICS_FILE: &str = "metrics.json";

@@ -2,6 +2,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use slurm::Resources;
+
 use crate::experiment::Experiment;
 use crate::file::{File, StageBlock};
 
@@ -77,6 +79,12 @@ impl Pipeline {
     /// The blocks that a stage's parameters come from, the weightiest last: the one it extends, then its own.
     pub(crate) fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
         self.stages[stage].extends.as_deref().into_iter().chain([stage])
+    }
+
+    /// What a stage needs of a machine: its own words over those of the block it extends.
+    pub(crate) fn resources(&self, stage: &str) -> Resources {
+        let said = self.layers(stage).map(|layer| &self.stages[layer].resources);
+        said.fold(Resources::default(), |all, more| all.changed(more))
     }
 
     /// The project's folder, where the store, pages and `pipelines/` are: the file's own. A file of `pipelines/` shares

@@ -2,19 +2,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Description, Record, Store, Waiting};
+use artifact::{Description, Record, Store, Waiting, hash_json, label};
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+use slurm::Resources;
+use stage_call::Interrupted;
 
 use crate::axes::Scope;
 use crate::check::{self, closure, needs};
-use crate::experiment::Choice;
 use crate::expand::Expansion;
+use crate::experiment::Choice;
 use crate::key;
 use crate::pipeline::{Pipeline, PipelineError};
 use crate::renames::known_blocks;
-use crate::stages::{Asking, Interrupted, Programs, StageProgram};
+use crate::stages::{Asking, Programs, StageProgram};
 
 /// Stages × swept values, in an order in which every node comes after what it needs.
+#[derive(Default)]
 pub struct Plan {
     /// The nodes.
     pub nodes: Vec<Node>,
@@ -22,6 +26,19 @@ pub struct Plan {
     pub(crate) sinks: Vec<Sink>,
     /// What to tell of the command line: what is overridden there, and what is given twice.
     pub notes: Vec<String>,
+    /// Where stages compute.
+    pub(crate) devices: Devices,
+    /// What each stage needs of a machine, where the file says so.
+    pub(crate) resources: BTreeMap<String, Resources>,
+}
+
+/// Where stages compute.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct Devices {
+    /// As the command line says.
+    pub(crate) given: String,
+    /// Whether a stage that needs GPUs computes on the first of its own.
+    pub(crate) by_resources: bool,
 }
 
 /// One action to be: a stage at one point of the sweep.
@@ -40,13 +57,14 @@ pub struct Node {
 }
 
 /// Where an input comes from.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct NodeInput {
     pub(crate) name: String,
     pub(crate) from: Origin,
 }
 
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub(crate) enum Origin {
     /// Another node's artifact, or a folder of it.
     Node { index: usize, subtree: Option<String> },
@@ -109,22 +127,6 @@ pub(crate) enum State {
     Waits { on: Vec<usize> },
 }
 
-impl State {
-    /// In a word.
-    pub(crate) fn word(&self) -> &'static str {
-        match self {
-            Self::Cached(_) => "cached",
-            Self::WillRun { .. } => "will run",
-            Self::Waits { .. } => "waits",
-        }
-    }
-}
-
-/// A stage and a sweep's point, as people read it.
-pub(crate) fn label(stage: &str, point: &str) -> String {
-    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
-}
-
 impl Node {
     /// Stage and point, as people read it.
     pub fn label(&self) -> String {
@@ -152,10 +154,45 @@ impl Node {
 
     /// The nodes it needs.
     pub(crate) fn parents(&self) -> impl Iterator<Item = usize> + '_ {
-        self.inputs.iter().filter_map(|i| match i.from {
+        self.inputs.iter().filter_map(NodeInput::node)
+    }
+}
+
+impl NodeInput {
+    /// The node that makes it.
+    pub(crate) fn node(&self) -> Option<usize> {
+        match self.from {
             Origin::Node { index, .. } => Some(index),
             Origin::Folder(_) => None,
-        })
+        }
+    }
+}
+
+impl State {
+    /// In a word.
+    pub(crate) fn word(&self) -> &'static str {
+        match self {
+            Self::Cached(_) => "cached",
+            Self::WillRun { .. } => "will run",
+            Self::Waits { .. } => "waits",
+        }
+    }
+
+    /// The record, where it is done.
+    pub(crate) fn record(self) -> Option<Record> {
+        match self {
+            Self::Cached(record) => Some(*record),
+            Self::WillRun { .. } | Self::Waits { .. } => None,
+        }
+    }
+
+    /// The key, where it is known.
+    pub(crate) fn key(&self) -> Option<String> {
+        match self {
+            Self::Cached(record) => Some(record.key()),
+            Self::WillRun { key_parts } => Some(hash_json(key_parts)),
+            Self::Waits { .. } => None,
+        }
     }
 }
 
@@ -177,8 +214,14 @@ impl Plan {
         Goal::new(pipeline, request)?.plan(pipeline, &Programs::of(pipeline, descriptions), request)
     }
 
+    /// Where a stage computes.
+    pub(crate) fn device(&self, stage: &str) -> &str {
+        let has_gpu = self.resources.get(stage).is_some_and(Resources::has_gpu);
+        if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
+    }
+
     /// What is known of each node before a run.
-    pub(crate) fn states(&self, store: &Store, device: &str) -> Result<Vec<State>, PlanError> {
+    pub(crate) fn states(&self, store: &Store) -> Result<Vec<State>, PlanError> {
         let mut states: Vec<State> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
             let on: BTreeSet<usize> = node.parents().filter(|&p| !matches!(states[p], State::Cached(_))).collect();
@@ -191,8 +234,8 @@ impl Plan {
                 _ => unreachable!("a node whose parents aren't cached waits"),
             };
             let hashes = input_hashes(node, store, outputs)?;
-            let key_parts = key::parts(node, &hashes, device);
-            states.push(match store.hit(&artifact::hash_json(&key_parts)) {
+            let key_parts = key::parts(node, &hashes, self.device(&node.stage));
+            states.push(match store.hit(&hash_json(&key_parts)) {
                 Some(record) => State::Cached(Box::new(record)),
                 None => State::WillRun { key_parts },
             });
@@ -225,7 +268,8 @@ impl<'a> Goal<'a> {
         let order = check::order(pipeline)?;
         let (axes, notes) = Scope { pipeline, programs, needed: &self.needed }.axes(request)?;
         let plan = Expansion::new(pipeline, programs, &axes).expand(&order, self.targets)?;
-        Ok(Plan { notes, ..plan })
+        let resources = self.needed.iter().map(|stage| (stage.clone(), pipeline.resources(stage)));
+        Ok(Plan { notes, resources: resources.filter(|(_, needs)| !needs.is_empty()).collect(), ..plan })
     }
 }
 
@@ -241,10 +285,15 @@ pub(crate) fn input_hashes(
             let manifest = store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
             Ok(manifest.subtree(folder).identity())
         }
-        Origin::Folder(folder) => crate::sources::hash_source(store, folder)
-            .map_err(|e| PlanError::Source(format!("stage {}: input {}: {e}", node.stage, input.name))),
+        Origin::Folder(folder) => source_hash(store, node, &input.name, folder),
     };
     node.inputs.iter().map(|input| Ok((input.name.clone(), hash(input)?))).collect()
+}
+
+/// Content hash of a folder outside the store, an input of a node.
+pub(crate) fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path) -> Result<String, PlanError> {
+    let problem = |e| PlanError::Source(format!("stage {}: input {input}: {e}", node.stage));
+    crate::sources::hash_source(store, folder).map_err(problem)
 }
 
 #[cfg(test)]

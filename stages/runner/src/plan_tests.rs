@@ -339,3 +339,45 @@ fn files_as_editors_write_them() {
     let problem = refused(&merged, &["again"]).to_string();
     assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.extends"), "{problem}");
 }
+
+#[test]
+fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
+    let text = PIPELINE
+        .replace("  make: {}", "  make: {resources: {cpus: 2}}")
+        .replace("  train:\n", "  train:\n    resources: {gpus: 1, mem: 8G}\n")
+        .replace("    extends: train\n", "    extends: train\n    resources: {mem: 4G}\n");
+    let plan = plan_of(&text, &["again", "report"]).unwrap();
+    let of = |stage: &str| serde_json::to_value(plan.resources.get(stage)).unwrap();
+    assert_eq!([of("make"), of("prep")], [json!({"cpus": 2}), json!(null)]);
+    assert_eq!([of("train"), of("again")], [json!({"gpus": 1, "mem": "8G"}), json!({"gpus": 1, "mem": "4G"})]);
+    for (by_resources, device) in [(false, "cpu"), (true, "cuda:0")] {
+        let devices = Devices { given: "cpu".to_owned(), by_resources };
+        let plan = Plan { devices, resources: plan.resources.clone(), ..Plan::default() };
+        assert_eq!((plan.device("again"), plan.device("prep")), (device, "cpu"));
+    }
+}
+
+/// A task's part of a plan, written and read, is what its job works with.
+#[test]
+fn a_frozen_plan_has_all_that_a_task_needs() {
+    use crate::execute::Frozen;
+    let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "report"]).unwrap();
+    let text = serde_json::to_vec(&Frozen::new(&plan, Path::new("/out"))).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("plan.json"), &text).unwrap();
+    let frozen = Frozen::read(&folder.path().join("plan.json")).unwrap();
+    let ancestors = |plan: &Plan, of: usize| {
+        let mut wanted = BTreeSet::from([of]);
+        (0..=of).rev().filter(|&i| wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some()).count()
+    };
+    for (index, node) in plan.nodes.iter().enumerate() {
+        let part = frozen.part(index).unwrap();
+        let last = part.nodes.last().unwrap();
+        assert_eq!((last.label(), &last.parameters), (node.label(), &node.parameters));
+        let labels = |plan: &Plan, node: &Node| node.parents().map(|p| plan.nodes[p].label()).collect::<Vec<_>>();
+        assert_eq!((labels(&part, last), part.nodes.len()), (labels(&plan, node), ancestors(&plan, index)));
+    }
+    let page = frozen.part(plan.nodes.len()).unwrap();
+    assert_eq!((page.nodes.len(), page.sinks[0].shows.len()), (plan.nodes.len(), 2));
+    assert!(frozen.part(plan.nodes.len() + 1).is_err());
+}

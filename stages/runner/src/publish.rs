@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use artifact::{Locked, MANIFEST_FILE, Manifest, StoreError, list_files};
+use stage_call::StageFailure;
 
-use crate::process::StageFailure;
 use crate::waiting::until_held;
 
 /// In a published folder: the identity of what it shows.

@@ -4,9 +4,11 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Store, check_device, report_text};
+use slurm::{Job, Queue, Slurm};
 
+use crate::execute::identities;
 use crate::pipeline::Pipeline;
-use crate::plan::{Plan, PlanError, Request, State};
+use crate::plan::{Devices, Plan, PlanError, Request, State};
 use crate::renames::known_blocks;
 use crate::stages::Asking;
 use crate::targets;
@@ -15,12 +17,12 @@ use crate::targets;
 pub(crate) struct Session {
     pub(crate) pipeline: Pipeline,
     pub(crate) store: Store,
-    pub(crate) device: String,
+    pub(crate) devices: Devices,
 }
 
 impl Session {
-    pub(crate) fn open(pipeline: &Path, store: Option<&Path>, device: &str) -> anyhow::Result<Self> {
-        check_device(device).map_err(PlanError::Usage)?;
+    pub(crate) fn open(pipeline: &Path, store: Option<&Path>, devices: Devices) -> anyhow::Result<Self> {
+        check_device(&devices.given).map_err(PlanError::Usage)?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
         let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
         std::fs::create_dir_all(&root)
@@ -28,7 +30,7 @@ impl Session {
         // Stages get absolute paths, whatever folder they run in.
         let root = root.canonicalize().with_context(|| root.display().to_string())?;
         let store = Store::open(&root).context("cannot open the store; name another with --store")?;
-        Ok(Self { pipeline, store, device: device.to_owned() })
+        Ok(Self { pipeline, store, devices })
     }
 
     /// The plan, to look at: no program is started that isn't the runner's own.
@@ -44,12 +46,28 @@ impl Session {
     fn plan_asking(&self, what: &Request, asking: Asking) -> anyhow::Result<Plan> {
         let (pipeline, targets) = targets::find(&self.pipeline, &what.targets)?;
         let plan = Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, asking)?;
+        let plan = Plan { devices: self.devices.clone(), ..plan };
         plan.notes.iter().for_each(|note| report_text(note));
         Ok(plan)
     }
 
+    /// The queued or running job of each node, where there is one, and how many there are besides. Slurm is asked once, and only where this store has had jobs.
+    pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
+        let queue = Queue::look(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
+            report_text(&format!("nerf-sr: whether jobs are queued isn't known: {error}"));
+            Queue::default()
+        });
+        if queue.jobs.is_empty() {
+            return (Vec::new(), 0);
+        }
+        let identities = identities(plan, &self.store).unwrap_or_default();
+        let jobs: Vec<Option<Job>> = identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
+        let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
+        (jobs, besides)
+    }
+
     pub(crate) fn states(&self, plan: &Plan) -> anyhow::Result<Vec<State>> {
-        Ok(plan.states(&self.store, &self.device)?)
+        Ok(plan.states(&self.store)?)
     }
 }
 

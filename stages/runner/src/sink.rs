@@ -5,29 +5,39 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
+use stage_call::{Call, Display, StageFailure};
 
-use crate::execute::{Display, Options, Outcome};
 use crate::plan::{Plan, Sink};
-use crate::process::{Call, StageFailure};
 use crate::publish;
 
-/// The record of the nodes that a sink shows and all they were made of.
-fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<RunRecord> {
-    let mut wanted: BTreeSet<usize> = sink.shows.iter().copied().collect();
+/// The record of the nodes that a sink shows and all they were made of; none where some of that isn't there, unless the sink shows what there
+/// is.
+fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> Option<RunRecord> {
+    let mut is_whole: Vec<bool> = Vec::with_capacity(plan.nodes.len());
+    for (node, record) in plan.nodes.iter().zip(records) {
+        is_whole.push(record.is_some() && node.parents().all(|parent| is_whole[parent]));
+    }
+    let (shown, missing): (Vec<usize>, Vec<usize>) = sink.shows.iter().partition(|&&index| is_whole[index]);
+    if !missing.is_empty() && !sink.program.description.partial {
+        return None;
+    }
+    let mut wanted: BTreeSet<usize> = shown.iter().copied().collect();
     for index in (0..plan.nodes.len()).rev() {
         if wanted.contains(&index) {
             wanted.extend(plan.nodes[index].parents());
         }
     }
     let position = |index: usize| wanted.iter().position(|&i| i == index);
-    let nodes = wanted.iter().map(|&index| {
-        let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
+    let nodes = wanted.iter().filter_map(|&index| {
+        let (node, record) = (&plan.nodes[index], records[index].as_ref()?);
         let folder = store.object(&record.output);
         Some(RunNode {
             stage: node.stage.clone(),
             point: node.point.clone(),
+            values: node.values.clone(),
+            is_shown: shown.contains(&index),
             kind: node.program.description.output.kind.clone(),
             key: record.key(),
             output: record.output.clone(),
@@ -38,9 +48,26 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
             started_unix: record.started_unix,
             seconds: record.seconds,
             threads: record.threads,
+            host: record.host.clone(),
         })
     });
-    Some(RunRecord { nodes: nodes.collect::<Option<Vec<_>>>()? })
+    let nodes = nodes.collect();
+    let failed = missing.into_iter().map(|index| &plan.nodes[index]);
+    let failed = failed.map(|node| FailedPoint { stage: node.stage.clone(), point: node.point.clone() }).collect();
+    let home = std::path::absolute(out).unwrap_or_else(|_| out.to_path_buf());
+    let home = home.ancestors().find(|folder| folder.is_dir()).map(Path::to_path_buf).unwrap_or_default();
+    Some(RunRecord { home, nodes, failed })
+}
+
+/// By what a page is known to show a record.
+fn identity(sink: &Sink, record: &RunRecord) -> String {
+    hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}))
+}
+
+/// Whether a sink's page shows these records already.
+pub(crate) fn is_shown(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> bool {
+    let record = record(plan, sink, records, store, out);
+    record.is_some_and(|record| publish::shows(&out.join(&sink.stage), &identity(sink, &record)))
 }
 
 /// What became of a sink.
@@ -60,17 +87,17 @@ pub(crate) struct Showing<'a> {
     pub(crate) run: &'a RunFile,
     /// Where pages go.
     pub(crate) out: &'a Path,
-    pub(crate) options: &'a Options,
+    pub(crate) threads: usize,
     pub(crate) stop: &'a AtomicBool,
 }
 
 /// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Result<Shown, StageFailure> {
-    let Showing { plan, store, run, out, options, stop } = showing;
+pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>]) -> Result<Shown, StageFailure> {
+    let Showing { plan, store, run, out, threads, stop } = *showing;
     let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
-    let Some(record) = record(plan, sink, outcome, store) else { return Ok(Shown::Missing) };
+    let Some(record) = record(plan, sink, records, store, out) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
-    let identity = hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}));
+    let identity = identity(sink, &record);
     if publish::shows(&target, &identity) {
         return Ok(Shown::UpToDate(target));
     }
@@ -85,14 +112,15 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> Res
     let inputs = [("run".to_owned(), folder)];
     let call = Call {
         label: &sink.stage,
-        program: &sink.program,
+        program: &sink.program.path,
+        description: &sink.program.description,
         params: &params,
         inputs: &inputs,
         hashes: &[],
         output: &output,
         work: None,
-        device: &options.device,
-        threads: options.threads,
+        device: plan.device(&sink.stage),
+        threads,
         lock: None,
     };
     let result = call.run(&scratch.join("log"), &view, stop);

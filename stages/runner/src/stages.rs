@@ -13,8 +13,8 @@ use std::time::UNIX_EPOCH;
 use artifact::{Description, Schema, Store, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+use stage_call::{Answers, Interrupted, ask_all};
 
-use crate::describing::{Answers, ask_all};
 use crate::file::StageBlock;
 use crate::pipeline::{Part, Pipeline, PipelineError};
 
@@ -27,7 +27,7 @@ pub(crate) struct StageProgram {
 }
 
 impl StageProgram {
-    fn new(path: &Path, description: Description) -> Result<Self, String> {
+    pub(crate) fn new(path: &Path, description: Description) -> Result<Self, String> {
         description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
         let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
@@ -52,10 +52,6 @@ pub(crate) enum Asking<'a> {
     /// The runner's own.
     Look,
 }
-
-/// The asking was interrupted.
-#[derive(Debug, PartialEq, Eq)]
-pub(crate) struct Interrupted;
 
 /// The stages' programs, or why they aren't known.
 pub(crate) struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);

@@ -4,9 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Entered, Holder, Locked, Store, StoreError, host_name};
-
-use crate::execute::seconds;
-use crate::process::StageFailure;
+use stage_call::{StageFailure, seconds};
 
 /// Between two attempts.
 const PAUSE: Duration = Duration::from_millis(20);

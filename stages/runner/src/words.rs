@@ -5,9 +5,9 @@ use std::path::PathBuf;
 
 use artifact::{Record, hash_json};
 use serde_json::Value;
+use stage_call::seconds;
 
 use crate::changes::short;
-use crate::execute::seconds;
 use crate::key;
 use crate::plan::{Node, Plan, Sink, State};
 use crate::session::Session;

@@ -36,6 +36,9 @@ pub struct Params {
     /// The row that others are compared with, by its keys: a further column has their PSNR minus its own.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
+    /// Values whose mean, standard deviation, least and greatest are stated over all results.
+    #[schemars(extend("x-default" = "none of them"))]
+    pub spread: Vec<String>,
     /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
@@ -50,6 +53,7 @@ impl Default for Params {
             columns: Vec::new(),
             values: values.map(str::to_owned).into(),
             relative_to: BTreeMap::new(),
+            spread: Vec::new(),
             methods: BTreeMap::new(),
         }
     }
@@ -63,6 +67,7 @@ impl Stage for Table {
     const NAME: &'static str = "table";
     const SUMMARY: &'static str = "Shows figures of an experiment as Markdown, CSV and JSON.";
     const SINK: bool = true;
+    const PARTIAL: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![("run", Input::required(&["run"], "folder with run.json: the record of what was scored"))]

@@ -1,5 +1,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::process::Command;
 
 use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
@@ -10,17 +11,26 @@ pub type Row = Map<String, Value>;
 
 /// A row for every result of a run, in the order of the run.
 pub(crate) fn rows(run: &RunRecord, methods: &BTreeMap<String, String>) -> anyhow::Result<Vec<Row>> {
+    let commit = commit(&run.home);
     let scored = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown);
     let rows = scored.map(|(index, node)| {
         let mut row: Row = node.values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
         row.insert("method".to_owned(), json!(methods.get(&node.stage).unwrap_or(&node.stage)));
         row.extend(scores(node)?);
         row.extend(times(run, index)?);
-        row.insert("commit".to_owned(), json!(run.commit));
-        row.insert("machine".to_owned(), json!(run.machine));
+        row.insert("commit".to_owned(), json!(commit));
+        row.insert("machine".to_owned(), json!(node.host));
         Ok(row)
     });
     rows.collect()
+}
+
+/// The commit of the pipeline's folder, `-dirty` where it differs; nothing where it isn't under git.
+fn commit(home: &Path) -> String {
+    let git =
+        Command::new("git").arg("-C").arg(home).args(["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]).output();
+    let said = git.ok().filter(|output| output.status.success()).map(|output| output.stdout).unwrap_or_default();
+    String::from_utf8_lossy(&said).trim().to_owned()
 }
 
 /// What a result's own file says: means of metrics, or what a refiner's training says of itself.

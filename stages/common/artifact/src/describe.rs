@@ -34,6 +34,9 @@ pub struct Description {
     /// A sink shows a run (times, hashes) and is never cached; its input `run` is the run's record.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub sink: bool,
+    /// A sink that shows what there is, where some of it couldn't be made.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub partial: bool,
     /// What parameters and inputs must be together.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rules: Vec<Rule>,

@@ -83,6 +83,7 @@ mod tests {
             output: Output::kind("x"),
             environment: Vec::new(),
             sink: false,
+            partial: false,
             rules: Vec::new(),
         };
         let expected = "\

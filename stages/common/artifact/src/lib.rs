@@ -83,11 +83,11 @@ pub use printable::printable;
 pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
 pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
 pub use rules::{GivenInputs, Rule};
-pub use run_record::{RunInput, RunNode, RunRecord};
+pub use run_record::{FailedPoint, RunInput, RunNode, RunRecord};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{Attempt, Checked, Record, Store, StoreError, Unfinished};
+pub use store::{Attempt, Checked, KEY_VERSION, KEY_VERSION_PART, Record, Store, StoreError, Unfinished, label};
 pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.

@@ -110,6 +110,7 @@ mod tests {
             output: Output::kind("x"),
             environment: Vec::new(),
             sink: false,
+            partial: false,
             rules: vec![
                 Rule::new("weights are needed").when("method", methods).needs("weights"),
                 Rule::new("the scale must be whole")

@@ -9,8 +9,24 @@ use serde_json::{Map, Value};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunRecord {
+    /// The folder in which pages are written, or the nearest above it.
+    #[serde(default)]
+    pub home: PathBuf,
     /// Every node that what is shown was made of; parents come before their children.
     pub nodes: Vec<RunNode>,
+    /// What should be shown and wasn't made, where the sink shows what there is.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub failed: Vec<FailedPoint>,
+}
+
+/// A node that failed, or that waits for one that did.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct FailedPoint {
+    /// Name of the stage's block.
+    pub stage: String,
+    /// The sweep's point.
+    pub point: String,
 }
 
 /// One finished node of a run.
@@ -21,6 +37,12 @@ pub struct RunNode {
     pub stage: String,
     /// The sweep's point; empty without a sweep.
     pub point: String,
+    /// The values of the sweep's or experiment's axes that reach it, by the axes' names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub values: BTreeMap<String, String>,
+    /// Whether the sink shows it; else something that is shown was made of it.
+    #[serde(default)]
+    pub is_shown: bool,
     /// Kind of its artifact.
     pub kind: String,
     /// The action's key.
@@ -42,6 +64,9 @@ pub struct RunNode {
     pub seconds: f64,
     /// Threads it had.
     pub threads: usize,
+    /// Where it ran.
+    #[serde(default)]
+    pub host: String,
 }
 
 /// Where an input came from: another node of the list, or a folder outside the store.

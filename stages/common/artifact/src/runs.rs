@@ -193,11 +193,12 @@ impl Store {
         self.root().join("pins").join(format!("{name}.jsonl"))
     }
 
-    /// Removes a run's file, and what its sinks left.
+    /// Removes a run's file, what its sinks left, and what it submitted to a cluster.
     pub fn remove_run(&self, id: &str) -> Result<(), StoreError> {
         let (path, scratch) = (self.root().join("runs").join(format!("{id}.jsonl")), self.scratch(id));
         // A sink's leftovers have no value.
         fs::remove_dir_all(&scratch).ok();
+        fs::remove_dir_all(self.root().join("slurm").join(id)).ok();
         at(&path, fs::remove_file(&path))
     }
 

@@ -44,6 +44,8 @@ pub trait Stage {
     const SUMMARY: &'static str;
     /// Whether it shows a run and is never cached.
     const SINK: bool = false;
+    /// Whether it shows what there is of a run, some of which failed.
+    const PARTIAL: bool = false;
     /// Environment variables that change the result.
     const ENVIRONMENT: &'static [&'static str] = &[];
 
@@ -75,6 +77,7 @@ pub trait Stage {
             output: Self::output(),
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
+            partial: Self::PARTIAL,
             rules: Self::rules(),
         }
     }

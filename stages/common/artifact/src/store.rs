@@ -56,7 +56,22 @@ pub struct Record {
     pub host: String,
 }
 
+/// Version of a key's list of parts: names of parameters changed between 1 and 2.
+pub const KEY_VERSION: u64 = 2;
+/// The part that holds it.
+pub const KEY_VERSION_PART: &str = "key version";
+
+/// A stage and a sweep's point, as people read it.
+pub fn label(stage: &str, point: &str) -> String {
+    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
+}
+
 impl Record {
+    /// Whether its key is of an older version: no plan comes to it any more, though what it names may still be wanted.
+    pub fn has_old_key(&self) -> bool {
+        self.key_parts.get(KEY_VERSION_PART).and_then(Value::as_u64) != Some(KEY_VERSION)
+    }
+
     /// The action's key.
     pub fn key(&self) -> String {
         hash_json(&self.key_parts)

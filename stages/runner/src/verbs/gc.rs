@@ -1,11 +1,11 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, hash_json, print_line, print_lines, report_line, stop_on_signals};
+use artifact::{Failure, print_line, print_lines, report_line, stop_on_signals};
+use garbage::{Choice, Root, Verdict, judge};
 use serde_json::json;
+use stage_call::seconds;
 
-use crate::execute::seconds;
-use crate::gc::{Choice, Root, Verdict, judge};
-use crate::plan::{Request, State};
+use crate::plan::Request;
 use crate::session::Session;
 use crate::waiting::until_held;
 
@@ -61,14 +61,9 @@ fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
     let plan = session.plan(what)?;
     let mut root = Root { why: "the pipeline needs it".to_owned(), ..Root::default() };
     for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
-        match state {
-            State::Cached(record) => {
-                root.keys.insert(record.key());
-            }
-            State::WillRun { key_parts } => {
-                root.keys.insert(hash_json(&key_parts));
-            }
-            State::Waits { .. } => root.waiting.push(node.waiting()),
+        match state.key() {
+            Some(key) => _ = root.keys.insert(key),
+            None => root.waiting.push(node.waiting()),
         }
     }
     Ok(root)

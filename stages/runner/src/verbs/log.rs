@@ -2,10 +2,11 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Store, StoreError, hash_json, print_line, print_lines};
+use artifact::{Store, StoreError, label, print_line, print_lines};
+use stage_call::utc;
 
-use crate::clock::utc;
-use crate::plan::{Plan, Request, State, label};
+use crate::execute::identities;
+use crate::plan::{Plan, Request, State};
 use crate::session::{Session, of_stage};
 
 /// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
@@ -36,19 +37,27 @@ pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Res
 fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, PathBuf, String)> {
     // What can't be known, say of a folder that is gone, may still have a log from before.
     let Ok(states) = session.states(plan) else { return Vec::new() };
+    let jobs = job_logs(session, plan);
     let mut logs = Vec::new();
     for &node in nodes {
-        let path = match &states[node] {
-            State::Cached(record) => session.store.action(&record.key(), "log"),
-            State::WillRun { key_parts } => attempt_log(&session.store, &hash_json(key_parts)),
-            State::Waits { .. } => continue,
-        };
-        if path.is_file() {
+        let stages = states[node].key().map(|key| match states[node] {
+            State::Cached(_) => session.store.action(&key, "log"),
+            _ => attempt_log(&session.store, &key),
+        });
+        for path in stages.into_iter().chain(jobs.get(node).cloned().flatten()).filter(|path| path.is_file()) {
             let text = text_of(&path);
             logs.push((plan.nodes[node].label(), path, text));
         }
     }
     logs
+}
+
+/// What the newest job of each node said, where nodes were submitted.
+fn job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
+    let logs = slurm::job_logs(session.store.root()).unwrap_or_default();
+    // Without submissions no source is hashed.
+    let identities = (!logs.is_empty()).then(|| identities(plan, &session.store).unwrap_or_default());
+    identities.into_iter().flatten().map(|identity| logs.get(&identity).cloned()).collect()
 }
 
 fn attempt_log(store: &Store, key: &str) -> PathBuf {

@@ -1,8 +1,10 @@
 //! What the command line can ask for, a file each.
 
+mod cancel;
 mod describe;
 mod diff;
 mod gc;
+mod job;
 mod log;
 mod path;
 mod pin;
@@ -12,9 +14,11 @@ mod status;
 mod verify;
 mod why;
 
+pub(crate) use cancel::cancel;
 pub(crate) use describe::describe;
 pub(crate) use diff::diff;
 pub(crate) use gc::{Style, gc};
+pub(crate) use job::job;
 pub(crate) use log::log;
 pub(crate) use path::path;
 pub(crate) use pin::{pin, unpin};

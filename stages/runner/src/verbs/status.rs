@@ -1,8 +1,8 @@
 use std::process::ExitCode;
 
-use artifact::{hash_json, print_line, print_lines, sized};
+use artifact::{counted, hash_json, print_line, print_lines, sized};
+use stage_call::seconds;
 
-use crate::execute::seconds;
 use crate::node_report::PlanReport;
 use crate::plan::{Request, State};
 use crate::session::Session;
@@ -16,7 +16,10 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
         print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &[]))?);
         return Ok(ExitCode::SUCCESS);
     }
+    let (jobs, besides) = session.jobs(&plan);
+    let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(states) {
+        let job = jobs.next().flatten().map(|job| job.words());
         let detail = match &state {
             State::Cached(record) => {
                 let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
@@ -27,7 +30,11 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
             }
             _ => String::new(),
         };
+        let detail = job.into_iter().chain((!detail.is_empty()).then_some(detail)).collect::<Vec<_>>().join("; ");
         print_line!("{:<40} {:<9} {detail}", node.label(), state.word());
+    }
+    if besides > 0 {
+        print_line!("queued besides: {}, of pages or of runs with other arguments", counted(besides, "job"));
     }
     Ok(ExitCode::SUCCESS)
 }

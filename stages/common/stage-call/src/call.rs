@@ -1,3 +1,5 @@
+//! One call of a stage: its process, its pipes, its end.
+
 use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt as _;
@@ -6,12 +8,11 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Event, KeyLock, SUMMARY_FILE, counted, printable};
+use artifact::{Description, Event, KeyLock, SUMMARY_FILE, counted, printable};
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 
-use crate::execute::seconds;
-use crate::stage_log::{StageLog, Tenths};
-use crate::stages::StageProgram;
+use crate::clock::seconds;
+use crate::log::{StageLog, Tenths};
 use crate::verdict::{End, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
@@ -32,30 +33,39 @@ const ENVIRONMENT: [&str; 10] = [
 const TAIL: usize = 8;
 
 /// One call of a stage by the contract.
-pub(crate) struct Call<'a> {
+pub struct Call<'a> {
     /// Block and point, for the log.
-    pub(crate) label: &'a str,
-    pub(crate) program: &'a StageProgram,
-    pub(crate) params: &'a Path,
-    pub(crate) inputs: &'a [(String, PathBuf)],
+    pub label: &'a str,
+    /// The program.
+    pub program: &'a Path,
+    /// What it says of itself.
+    pub description: &'a Description,
+    /// `--params`.
+    pub params: &'a Path,
+    /// `--input`, by name.
+    pub inputs: &'a [(String, PathBuf)],
     /// What the inputs' contents are, where that is known; for the log.
-    pub(crate) hashes: &'a [(String, String)],
-    pub(crate) output: &'a Path,
-    pub(crate) work: Option<&'a Path>,
-    pub(crate) device: &'a str,
-    pub(crate) threads: usize,
+    pub hashes: &'a [(String, String)],
+    /// `--output`.
+    pub output: &'a Path,
+    /// `--work`; none for a sink.
+    pub work: Option<&'a Path>,
+    /// `--device`.
+    pub device: &'a str,
+    /// `--threads`.
+    pub threads: usize,
     /// The key's lock, which the stage holds on to as its standard input.
-    pub(crate) lock: Option<&'a KeyLock>,
+    pub lock: Option<&'a KeyLock>,
 }
 
 /// How a stage ended, if not well.
 #[derive(Debug, Clone, thiserror::Error)]
 #[error("{message}")]
-pub(crate) struct StageFailure {
+pub struct StageFailure {
     /// Its exit code; 1 where a signal ended it.
-    pub(crate) code: u8,
+    pub code: u8,
     /// Why, on one line.
-    pub(crate) message: String,
+    pub message: String,
 }
 
 impl StageFailure {
@@ -65,15 +75,17 @@ impl StageFailure {
 }
 
 /// What to do with a stage's output while it runs. Control characters in it are spelled out.
-pub(crate) trait Watcher: Sync {
+pub trait Watcher: Sync {
+    /// How far it is.
     fn progress(&self, event: &Event);
+    /// A line that it said on stderr.
     fn said(&self, line: &str);
 }
 
 impl Call<'_> {
     /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When `stop` is set the stage is asked to
     /// end, so that it leaves a checkpoint.
-    pub(crate) fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
+    pub fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
         let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
         self.log_start(&log);
         let started = Instant::now();
@@ -92,8 +104,12 @@ impl Call<'_> {
 
     fn log_start(&self, log: &StageLog) {
         log.start(self.label);
-        let StageProgram { path, description, .. } = self.program;
-        log.line(format_args!("program: {} {}, {}", path.display(), description.version, counted(self.threads, "thread")));
+        log.line(format_args!(
+            "program: {} {}, {}",
+            self.program.display(),
+            self.description.version,
+            counted(self.threads, "thread")
+        ));
         log.line(format_args!("device: {}", self.device));
         let parameters = std::fs::read(self.params).ok().and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
         log.line(format_args!("parameters: {}", parameters.unwrap_or_default()));
@@ -104,7 +120,7 @@ impl Call<'_> {
     }
 
     fn carry_out(&self, log: &StageLog, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
-        let fail = |e: std::io::Error| StageFailure::at(&self.program.path, &e);
+        let fail = |e: std::io::Error| StageFailure::at(self.program, &e);
         let stdin = match self.lock {
             Some(lock) => Stdio::from(lock.share().map_err(fail)?),
             None => Stdio::null(),
@@ -124,7 +140,7 @@ impl Call<'_> {
             Ok(())
         } else {
             let end = End { status, stated, tail, asked: stop.load(Ordering::Relaxed) };
-            Err(end.failure(&self.program.description.name))
+            Err(end.failure(&self.description.name))
         };
         // Not twice: as what it said, and as the reason.
         let is_reason = |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
@@ -135,7 +151,7 @@ impl Call<'_> {
     }
 
     fn command(&self) -> Command {
-        let mut command = Command::new(&self.program.path);
+        let mut command = Command::new(self.program);
         command.arg("--params").arg(self.params).arg("--output").arg(self.output);
         for (name, folder) in self.inputs {
             let mut text = std::ffi::OsString::from(format!("{name}="));
@@ -146,7 +162,7 @@ impl Call<'_> {
             command.arg("--work").arg(work);
         }
         command.args(["--device", self.device, "--threads", &self.threads.to_string(), "--progress", "json"]);
-        let declared = self.program.description.environment.iter().map(String::as_str);
+        let declared = self.description.environment.iter().map(String::as_str);
         let passed = ENVIRONMENT.into_iter().chain(declared).filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
         command.env_clear().envs(passed).env(artifact::RUNNER_VARIABLE, std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end, once.

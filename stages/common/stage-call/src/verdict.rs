@@ -6,7 +6,7 @@ use std::process::ExitStatus;
 
 use artifact::{MEMORY_REMEDY, out_of_memory};
 
-use crate::process::StageFailure;
+use crate::call::StageFailure;
 
 /// How a stage ended.
 pub(crate) struct End {

@@ -1,47 +1,56 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::{Run, Store, StoreError, Waiting, unix_time};
+use slurm::{Queue, Slurm};
 
-use super::contents::Contents;
-use crate::key;
+use crate::contents::Contents;
 
 /// Something that is needed, and why.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Root {
+pub struct Root {
     /// As people read it after "stays:".
-    pub(crate) why: String,
+    pub why: String,
     /// Keys of actions.
-    pub(crate) keys: BTreeSet<String>,
+    pub keys: BTreeSet<String>,
     /// Nodes that any fitting record may belong to.
-    pub(crate) waiting: Vec<Waiting>,
+    pub waiting: Vec<Waiting>,
     /// Whether it needs the actions that those were made of, too. A plan or a run names them itself.
-    pub(crate) with_inputs: bool,
+    pub with_inputs: bool,
 }
 
 /// What the person who collects garbage chooses.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Choice {
+pub struct Choice {
     /// What was used within so many days stays.
-    pub(crate) keep_days: u64,
+    pub keep_days: u64,
     /// Whether checkpoints of actions that nobody works on go.
-    pub(crate) drop_unfinished: bool,
+    pub drop_unfinished: bool,
     /// Whether artifacts whose keys are of an older version go.
-    pub(crate) drop_old: bool,
+    pub drop_old: bool,
 }
 
 impl Choice {
     /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be kept for its age.
-    pub(super) fn is_recent(self, unix: u64) -> bool {
+    pub(crate) fn is_recent(self, unix: u64) -> bool {
         unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
     }
 }
 
 /// All roots of a store; where several hold a thing, the first says why.
-pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choice) -> Result<Vec<Root>, StoreError> {
+pub(crate) fn roots(
+    store: &Store,
+    contents: &Contents,
+    plan: Root,
+    choice: Choice,
+    runs: &[Run],
+    outstanding: &BTreeMap<String, String>,
+) -> Result<Vec<Root>, StoreError> {
     let mut roots = vec![plan];
     roots.extend(store.pins()?.into_iter().map(|pin| of_run(format!("pinned as {}", pin.id), pin)));
-    for run in store.runs()? {
-        if run.in_progress {
+    for run in runs.iter().cloned() {
+        if let Some(why) = outstanding.get(&run.id) {
+            roots.push(of_run(why.clone(), run));
+        } else if run.in_progress {
             let process = run.holder.as_ref().map_or(0, |holder| holder.pid);
             roots.push(of_run(format!("process {process} is running it"), run));
         } else if choice.is_recent(run.used_unix()) {
@@ -55,7 +64,7 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
         roots.push(one(format!("made {}", ago(record.started_unix)), key));
     }
     if !choice.drop_old {
-        let old = contents.records.iter().filter(|(_, record)| key::is_old(record));
+        let old = contents.records.iter().filter(|(_, record)| record.has_old_key());
         roots.extend(old.map(|(key, _)| one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)));
     }
     if !choice.drop_unfinished {
@@ -63,6 +72,20 @@ pub(super) fn roots(store: &Store, contents: &Contents, plan: Root, choice: Choi
         roots.extend(with_checkpoint.map(|key| one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)));
     }
     Ok(roots)
+}
+
+/// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every one.
+pub(crate) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
+    let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| ids.map(|id| (id.to_owned(), why.to_owned())).collect();
+    match Queue::look(&Slurm::default(), store.root()) {
+        Ok(queue) => Ok(all("a submitted job needs it", &mut queue.submissions().into_iter())),
+        Err(error) => {
+            let path = store.root().join("slurm");
+            let submissions = slurm::all(store.root()).map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
+            let why = format!("a submitted job may need it, for {error}");
+            Ok(all(&why, &mut submissions.iter().map(|(id, _)| id.as_str())))
+        }
+    }
 }
 
 fn of_run(why: String, run: Run) -> Root {

@@ -1,22 +1,22 @@
 use std::collections::BTreeMap;
 
-use super::contents::Contents;
-use super::roots::Root;
+use crate::contents::Contents;
+use crate::roots::Root;
 
 /// What roots reach, and why it stays.
 #[derive(Debug, Default)]
-pub(super) struct Kept {
+pub(crate) struct Kept {
     /// By key.
-    pub(super) records: BTreeMap<String, String>,
+    pub(crate) records: BTreeMap<String, String>,
     /// By identity.
-    pub(super) objects: BTreeMap<String, String>,
+    pub(crate) objects: BTreeMap<String, String>,
     /// By key.
-    pub(super) unfinished: BTreeMap<String, String>,
+    pub(crate) unfinished: BTreeMap<String, String>,
 }
 
 /// From the roots to the records and unfinished actions that they name and, where a root asks for it, on to the actions that those
 /// were made of.
-pub(super) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
+pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
     let mut kept = Kept::default();
     for root in roots {
         let fitting = contents.records.iter().filter(|(_, record)| root.waiting.iter().any(|node| node.may_be(record)));

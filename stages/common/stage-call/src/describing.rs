@@ -11,8 +11,6 @@ use std::time::{Duration, Instant};
 
 use artifact::Description;
 
-use crate::stages::Interrupted;
-
 /// After so long a program that has said nothing is taken to hang.
 const LONGEST: Duration = Duration::from_secs(120);
 /// Asking that takes longer than this is said.
@@ -20,11 +18,15 @@ const SILENCE: Duration = Duration::from_secs(1);
 /// Descriptions are some kilobytes.
 const MOST_BYTES: u64 = 1 << 24;
 
+/// The asking was interrupted.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Interrupted;
+
 /// What came of asking, by path.
-pub(crate) type Answers = BTreeMap<PathBuf, Result<Description, String>>;
+pub type Answers = BTreeMap<PathBuf, Result<Description, String>>;
 
 /// Asks programs, as many at once as there are cores.
-pub(crate) fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
+pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
     let is_stopped = || stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
     let next = AtomicUsize::new(0);

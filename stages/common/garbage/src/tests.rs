@@ -3,12 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
-use artifact::{KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time};
+use artifact::{
+    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time,
+};
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
 
 use super::{Choice, Root, judge};
-use crate::key::{VERSION, VERSION_PART};
 
 /// An action of a random store. Numbers name earlier actions, modulo how many there are.
 #[derive(Debug, Clone)]
@@ -302,7 +303,7 @@ fn what_an_older_version_made_stays_until_it_is_dropped() {
     let action = |content| Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes };
     let map = |parts: Value| parts.as_object().unwrap().clone();
     let old = make_action(&store, &action(1), &map(json!({"key version": 1, "parameter lr": 100})), &[]);
-    let now = map(json!({VERSION_PART: VERSION, "parameter lr_width": 100}));
+    let now = map(json!({KEY_VERSION_PART: KEY_VERSION, "parameter lr_width": 100}));
     make_action(&store, &action(2), &now, &[]);
     for (drop_old, expected) in [(false, vec![old]), (true, vec![])] {
         let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false, drop_old }).unwrap();

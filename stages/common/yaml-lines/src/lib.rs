@@ -7,7 +7,7 @@ use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, Seq
 use serde_yaml::Value;
 
 /// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and what to do.
-pub(crate) fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
+pub fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
     let is_utf16 = bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) || bytes.iter().take(2).any(|b| *b == 0);
     if is_utf16 {
         return Err((None, "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)".to_owned()));
@@ -20,7 +20,7 @@ pub(crate) fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
 }
 
 /// Replaces merge keys (`<<: *anchor`) by what they stand for; whether there were any.
-pub(crate) fn merge(document: &mut Value) -> Result<bool, serde_yaml::Error> {
+pub fn merge(document: &mut Value) -> Result<bool, serde_yaml::Error> {
     let mut merged = false;
     // What is merged may bring a merge key of its own.
     while has_merge_key(document) {
@@ -40,7 +40,7 @@ fn has_merge_key(value: &Value) -> bool {
 }
 
 /// Where a number stands that JSON doesn't have: `.nan` or `.inf`.
-pub(crate) fn not_finite(value: &Value) -> Option<Vec<String>> {
+pub fn not_finite(value: &Value) -> Option<Vec<String>> {
     match value {
         Value::Number(number) if !number.as_f64().is_none_or(f64::is_finite) => Some(Vec::new()),
         Value::Mapping(entries) => entries.iter().find_map(|(key, value)| {
@@ -63,13 +63,13 @@ fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
 }
 
 /// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of the last one that is.
-pub(crate) fn line_of(text: &str, path: &[&str]) -> Option<usize> {
+pub fn line_of(text: &str, path: &[&str]) -> Option<usize> {
     let search = |length: usize| Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text));
     (1..=path.len()).rev().find_map(|length| line_found(search(length)))
 }
 
 /// The line on which a key stands that its mapping has already.
-pub(crate) fn line_of_duplicate(text: &str) -> Option<usize> {
+pub fn line_of_duplicate(text: &str) -> Option<usize> {
     line_found(Duplicates.deserialize(serde_yaml::Deserializer::from_str(text)))
 }
 

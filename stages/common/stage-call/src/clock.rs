@@ -1,5 +1,12 @@
+//! Times as people say them.
+
+/// A duration as people say it.
+pub fn seconds(s: f64) -> String {
+    if s < 90.0 { format!("{s:.1} s") } else { format!("{:.1} min", s / 60.0) }
+}
+
 /// A time, seconds since 1970, as `2026-11-24 23:23:05 UTC`.
-pub(crate) fn utc(unix: u64) -> String {
+pub fn utc(unix: u64) -> String {
     let (days, seconds) = (unix / 86_400, unix % 86_400);
     // Years that begin in March, so that the leap day comes last; from 1 March 0000.
     let days = days + 719_468;

@@ -3,19 +3,19 @@ use std::collections::BTreeMap;
 use artifact::{Record, Store, StoreError, Unfinished};
 
 /// What lies in a store.
-pub(super) struct Contents {
+pub(crate) struct Contents {
     /// Records by key.
-    pub(super) records: BTreeMap<String, Record>,
+    pub(crate) records: BTreeMap<String, Record>,
     /// Keys of all files beside the records, those that can't be read among them.
-    pub(super) action_files: Vec<String>,
+    pub(crate) action_files: Vec<String>,
     /// Bytes of the objects, by identity.
-    pub(super) objects: BTreeMap<String, u64>,
+    pub(crate) objects: BTreeMap<String, u64>,
     /// Actions that haven't finished, by key; where known, what they are.
-    pub(super) unfinished: BTreeMap<String, Option<Unfinished>>,
+    pub(crate) unfinished: BTreeMap<String, Option<Unfinished>>,
 }
 
 impl Contents {
-    pub(super) fn of(store: &Store) -> Result<Self, StoreError> {
+    pub(crate) fn of(store: &Store) -> Result<Self, StoreError> {
         let objects = store.objects()?.into_iter();
         Ok(Self {
             records: store.records()?.into_iter().map(|record| (record.key(), record)).collect(),

@@ -1,6 +1,7 @@
 //! Garbage collection by reachability: what roots reach stays, everything else goes.
 //!
 //! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress and recent runs.
+//! * Submissions with jobs are roots, too; where a cluster can't be asked, all of them are.
 //! * `contents`: what lies in the store.
 //! * `reach`: from the roots to what they name, and to what that was made of.
 
@@ -12,37 +13,37 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use artifact::{Closed, Record, Store, StoreError, unix_time};
+use artifact::{Closed, Record, Store, StoreError, label, unix_time};
 use serde::Serialize;
 
-use crate::changes::short;
-use crate::plan::label;
-
-pub(crate) use roots::{Choice, Root};
+pub use roots::{Choice, Root};
 
 use contents::Contents;
 use reach::Kept;
 
 /// What stays and what goes, for people and for [`Verdict::carry_out`].
-pub(crate) struct Verdict {
+pub struct Verdict {
     contents: Contents,
     kept: Kept,
     runs_to_go: Vec<String>,
 }
 
 /// Decides what goes. `plan` is what the pipeline needs.
-pub(crate) fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
+pub fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
     let contents = Contents::of(store)?;
-    let roots = roots::roots(store, &contents, plan, choice)?;
+    let runs = store.runs()?;
+    // After the runs were read: whoever had submitted by then has left jobs.
+    let outstanding = roots::outstanding(store)?;
+    let roots = roots::roots(store, &contents, plan, choice, &runs, &outstanding)?;
     let kept = reach::reach(&contents, &roots);
-    let is_over = |run: &&artifact::Run| !run.in_progress && !choice.is_recent(run.used_unix());
-    let runs_to_go = store.runs()?.iter().filter(is_over).map(|run| run.id.clone()).collect();
+    let is_kept = |run: &artifact::Run| run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix());
+    let runs_to_go = runs.iter().filter(|run| !is_kept(run)).map(|run| run.id.clone()).collect();
     Ok(Verdict { contents, kept, runs_to_go })
 }
 
 impl Verdict {
     /// What becomes of each artifact and each unfinished action.
-    pub(crate) fn fates(&self) -> Vec<Fate> {
+    pub fn fates(&self) -> Vec<Fate> {
         let mut makers: BTreeMap<&str, &Record> = BTreeMap::new();
         for record in self.contents.records.values() {
             makers.entry(&record.output).or_insert(record);
@@ -74,7 +75,7 @@ impl Verdict {
     }
 
     /// Bytes that go, and bytes that stay.
-    pub(crate) fn bytes(&self) -> (u64, u64) {
+    pub fn bytes(&self) -> (u64, u64) {
         let sum = |stays: bool| {
             let objects = self.contents.objects.iter().filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
             objects.map(|(_, bytes)| bytes).sum()
@@ -84,7 +85,7 @@ impl Verdict {
 
     /// Removes what goes: records first, so that none names an object that is gone. The store is closed meanwhile; deleting
     /// ([`Store::empty_trash`]) can wait until it is open again.
-    pub(crate) fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
+    pub fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
         let goes = |kept: &BTreeMap<String, String>, key: &String| !kept.contains_key(key);
         for key in self.contents.action_files.iter().filter(|key| goes(&self.kept.records, key)) {
             store.remove_record(key)?;
@@ -107,9 +108,14 @@ impl Verdict {
     }
 }
 
+/// The beginning of a hash, as people see it.
+fn short(hash: &str) -> &str {
+    hash.get(..10).unwrap_or(hash)
+}
+
 /// What becomes of an artifact, or of an unfinished action.
 #[derive(Debug, Serialize)]
-pub(crate) struct Fate {
+pub struct Fate {
     /// The artifact's identity, or the action's key.
     hash: String,
     /// The artifact's size; an unfinished action has none.

@@ -1,0 +1,58 @@
+//! The script of a submission's jobs. A job's argument is the number of its task.
+
+use std::ffi::OsStr;
+
+use crate::site::Site;
+
+/// The script: the site's lines, and then the command in the shell's place. So Slurm's signals reach the command.
+pub(crate) fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
+    let mut text = b"#!/bin/bash\n# One task of a submission; its number is the argument.\nset -e\n".to_vec();
+    for line in &site.setup {
+        text.extend_from_slice(line.as_bytes());
+        text.push(b'\n');
+    }
+    text.extend_from_slice(b"exec");
+    for word in command {
+        text.push(b' ');
+        text.extend(quoted(word.as_encoded_bytes()));
+    }
+    text.extend_from_slice(b" \"$1\"\n");
+    text
+}
+
+/// A word as a shell reads it, whatever is in it.
+fn quoted(word: &[u8]) -> Vec<u8> {
+    let mut quoted = vec![b'\''];
+    for &byte in word {
+        if byte == b'\'' {
+            quoted.extend_from_slice(br"'\''");
+        } else {
+            quoted.push(byte);
+        }
+    }
+    quoted.push(b'\'');
+    quoted
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::process::Command;
+
+    /// The shell itself says what it read.
+    #[test]
+    fn a_shell_reads_the_words_that_were_meant() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("job.sh");
+        let site = Site { setup: vec!["export GREETING='good day'".to_owned()], ..Site::default() };
+        let awkward = "a b'c\"$HOME`x`\\*";
+        let print = "printf '[%s]' \"$GREETING\" \"$@\"";
+        let words = ["sh", "-c", print, "sh", awkward].map(OsStr::new);
+        std::fs::write(&path, script(&site, &words)).unwrap();
+        let output = Command::new("bash").arg(&path).arg("17").output().unwrap();
+        assert_eq!(String::from_utf8_lossy(&output.stdout), format!("[good day][{awkward}][17]"));
+        let failing = Site { setup: vec!["false".to_owned()], ..Site::default() };
+        std::fs::write(&path, script(&failing, &[OsStr::new("true")])).unwrap();
+        assert!(!Command::new("bash").arg(&path).status().unwrap().success(), "a set-up line that fails ends the job");
+    }
+}

@@ -1,0 +1,130 @@
+//! A plan as a file: what is queued stays what was submitted, whatever becomes of pipeline.yaml meanwhile.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use anyhow::{Context as _, anyhow};
+use artifact::Description;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use slurm::Resources;
+
+use crate::plan::{Devices, Node, NodeInput, Origin, Plan, Sink};
+use crate::stages::StageProgram;
+
+/// A plan without what can be made again from the rest.
+#[derive(Serialize, Deserialize)]
+pub(crate) struct Frozen {
+    /// Where pages go.
+    pub(crate) out: PathBuf,
+    devices: Devices,
+    resources: BTreeMap<String, Resources>,
+    programs: BTreeMap<PathBuf, Description>,
+    nodes: Vec<FrozenNode>,
+    sinks: Vec<FrozenSink>,
+}
+
+#[derive(Serialize, Deserialize)]
+struct FrozenNode {
+    stage: String,
+    point: String,
+    values: BTreeMap<String, String>,
+    parameters: Value,
+    inputs: Vec<NodeInput>,
+    program: PathBuf,
+}
+
+#[derive(Serialize, Deserialize)]
+struct FrozenSink {
+    stage: String,
+    parameters: Value,
+    shows: Vec<usize>,
+    program: PathBuf,
+}
+
+impl Frozen {
+    pub(crate) fn new(plan: &Plan, out: &Path) -> Self {
+        let programs = plan.nodes.iter().map(|node| &node.program).chain(plan.sinks.iter().map(|sink| &sink.program));
+        let nodes = plan.nodes.iter().map(|node| FrozenNode {
+            stage: node.stage.clone(),
+            point: node.point.clone(),
+            values: node.values.clone(),
+            parameters: node.parameters.clone(),
+            inputs: node.inputs.clone(),
+            program: node.program.path.clone(),
+        });
+        let sinks = plan.sinks.iter().map(|sink| FrozenSink {
+            stage: sink.stage.clone(),
+            parameters: sink.parameters.clone(),
+            shows: sink.shows.clone(),
+            program: sink.program.path.clone(),
+        });
+        Self {
+            out: out.to_path_buf(),
+            devices: plan.devices.clone(),
+            resources: plan.resources.clone(),
+            programs: programs.map(|program| (program.path.clone(), program.description.clone())).collect(),
+            nodes: nodes.collect(),
+            sinks: sinks.collect(),
+        }
+    }
+
+    pub(crate) fn read(path: &Path) -> anyhow::Result<Self> {
+        let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+        serde_json::from_slice(&bytes).with_context(|| format!("{}: another nerf-sr wrote it; submit it again", path.display()))
+    }
+
+    /// The plan of one task: the nodes that it needs, and itself at the end. Sinks are counted after the nodes.
+    pub(crate) fn part(&self, number: usize) -> anyhow::Result<Plan> {
+        let absent = || anyhow!("the submission has no task {number}");
+        let sink = number.checked_sub(self.nodes.len()).map(|index| self.sinks.get(index).ok_or_else(absent)).transpose()?;
+        let mut wanted: BTreeSet<usize> = sink.map_or_else(|| [number].into(), |sink| sink.shows.iter().copied().collect());
+        for index in (0..self.nodes.len()).rev() {
+            if wanted.contains(&index) {
+                wanted.extend(self.nodes[index].inputs.iter().filter_map(NodeInput::node));
+            }
+        }
+        let position: BTreeMap<usize, usize> = wanted.iter().enumerate().map(|(at, &index)| (index, at)).collect();
+        let mut programs = BTreeMap::new();
+        let mut nodes = Vec::with_capacity(wanted.len());
+        for node in wanted.iter().map(|&index| &self.nodes[index]) {
+            let FrozenNode { stage, point, values, parameters, inputs, program } = node;
+            let (stage, point, values, parameters) = (stage.clone(), point.clone(), values.clone(), parameters.clone());
+            let inputs = inputs.iter().map(|input| input.moved(&position)).collect();
+            nodes.push(Node { stage, point, values, parameters, inputs, program: self.program(program, &mut programs)? });
+        }
+        let mut sinks = Vec::new();
+        if let Some(FrozenSink { stage, parameters, shows, program }) = sink {
+            let (stage, parameters) = (stage.clone(), parameters.clone());
+            let shows = shows.iter().map(|index| position[index]).collect();
+            sinks.push(Sink { stage, parameters, shows, program: self.program(program, &mut programs)? });
+        }
+        Ok(Plan { nodes, sinks, notes: Vec::new(), devices: self.devices.clone(), resources: self.resources.clone() })
+    }
+
+    fn program<'a>(
+        &'a self,
+        path: &'a Path,
+        known: &mut BTreeMap<&'a Path, Arc<StageProgram>>,
+    ) -> anyhow::Result<Arc<StageProgram>> {
+        if let Some(program) = known.get(path) {
+            return Ok(Arc::clone(program));
+        }
+        let description = self.programs.get(path).with_context(|| format!("nothing describes {}", path.display()))?;
+        let program = Arc::new(StageProgram::new(path, description.clone()).map_err(anyhow::Error::msg)?);
+        known.insert(path, Arc::clone(&program));
+        Ok(program)
+    }
+}
+
+impl NodeInput {
+    /// The same input where nodes have other places.
+    fn moved(&self, position: &BTreeMap<usize, usize>) -> Self {
+        let from = match &self.from {
+            Origin::Node { index, subtree } => Origin::Node { index: position[index], subtree: subtree.clone() },
+            Origin::Folder(folder) => Origin::Folder(folder.clone()),
+        };
+        Self { name: self.name.clone(), from }
+    }
+}

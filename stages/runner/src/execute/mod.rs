@@ -1,0 +1,37 @@
+//! Who sees to it that a plan's nodes are made: this process, or a cluster's jobs.
+
+mod frozen;
+mod local;
+mod node;
+mod slurm;
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
+
+use artifact::RunFile;
+
+use crate::plan::Plan;
+use crate::session::Session;
+
+pub(crate) use frozen::Frozen;
+pub(crate) use local::Local;
+pub(crate) use node::NodeJob;
+pub(crate) use slurm::{Cluster, JOB_VERB, identities};
+
+/// Carries out plans.
+pub(crate) trait Executor {
+    /// Makes what isn't there and shows it, or sees to it that this is done; the run's exit code.
+    fn carry_out(&self, work: &Work<'_>) -> anyhow::Result<ExitCode>;
+}
+
+/// What is to be carried out.
+pub(crate) struct Work<'a> {
+    pub(crate) session: &'a Session,
+    pub(crate) plan: &'a Plan,
+    /// Where it stands what the run needs.
+    pub(crate) run: &'a RunFile,
+    /// Where pages go.
+    pub(crate) out: &'a Path,
+    pub(crate) stop: &'a AtomicBool,
+}

@@ -1,0 +1,138 @@
+//! Makes one node, under its key's lock.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
+use stage_call::{Call, Display, StageFailure, seconds};
+
+use crate::key;
+use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
+use crate::waiting::{by, enter, until_held};
+
+/// A node's inputs: where each lies, and the hash of its content.
+struct Inputs {
+    folders: Vec<(String, PathBuf)>,
+    hashes: Vec<(String, String)>,
+}
+
+/// One node's work.
+pub(crate) struct NodeJob<'a> {
+    pub(crate) plan: &'a Plan,
+    pub(crate) node: &'a Node,
+    pub(crate) store: &'a Store,
+    pub(crate) file: &'a RunFile,
+    pub(crate) threads: usize,
+    pub(crate) display: &'a Display,
+    pub(crate) stop: &'a AtomicBool,
+}
+
+impl NodeJob<'_> {
+    /// Finds the record or makes it; whether it had to. `parents` are the records of the nodes that it needs.
+    pub(crate) fn run(&self, parents: &BTreeMap<usize, Record>) -> Result<(Record, bool), StageFailure> {
+        let output_of = |index: usize| parents[&index].output.clone();
+        let hashes = input_hashes(self.node, self.store, output_of).map_err(|e| match e {
+            PlanError::Source(message) => StageFailure { code: 3, message },
+            other => fail(other),
+        })?;
+        let key_parts = key::parts(self.node, &hashes, self.device());
+        let key = hash_json(&key_parts);
+        if let Some(record) = self.find(&key)? {
+            return Ok((record, false));
+        }
+        let lock = until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || self.store.try_lock(&key))?;
+        let action = Unfinished {
+            stage: self.node.stage.clone(),
+            point: self.node.point.clone(),
+            key_parts,
+            made_of: parents.values().map(Record::key).collect(),
+            started_unix: unix_time(),
+        };
+        let attempt = {
+            let entered = self.enter()?;
+            // Another runner may have made it while this one waited.
+            let kind = &self.node.program.description.output.kind;
+            if let Some(record) = self.store.hit_or_repair(&entered, &key, kind) {
+                return Ok((record, false));
+            }
+            self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
+        };
+        let folders = self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, &output_of))).collect();
+        self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
+    }
+
+    /// The record, if the action was done. Either way it is written down that this run needs it, so that it can't go meanwhile.
+    fn find(&self, key: &str) -> Result<Option<Record>, StageFailure> {
+        let entered = self.enter()?;
+        self.file.needs(&entered, &self.node.stage, key).map_err(fail)?;
+        Ok(self.store.hit(key))
+    }
+
+    fn device(&self) -> &str {
+        self.plan.device(&self.node.stage)
+    }
+
+    fn enter(&self) -> Result<Entered, StageFailure> {
+        enter(self.store, self.stop, &|text| self.display.line(&format!("{}: {text}", self.node.label())))
+    }
+
+    fn say_waiting(&self, holder: Option<&Holder>, waited: Duration) {
+        let waited = seconds(waited.as_secs_f64());
+        self.display.line(&format!("{}: is being made{}; waits for it, for {waited} now", self.node.label(), by(holder)));
+    }
+
+    /// Calls the stage and takes in what it made.
+    fn make(&self, lock: &KeyLock, attempt: Attempt, action: Unfinished, inputs: &Inputs) -> Result<Record, StageFailure> {
+        let label = self.node.label();
+        let call = Call {
+            label: &label,
+            program: &self.node.program.path,
+            description: &self.node.program.description,
+            params: &attempt.params,
+            inputs: &inputs.folders,
+            hashes: &inputs.hashes,
+            output: &attempt.output,
+            work: Some(&attempt.work),
+            device: self.device(),
+            threads: self.threads,
+            lock: Some(lock),
+        };
+        let view = self.display.start(&label);
+        let started = Instant::now();
+        let result = call.run(&attempt.log, &view, self.stop);
+        view.end();
+        result?;
+        let record = Record {
+            stage: action.stage,
+            point: action.point,
+            key_parts: action.key_parts,
+            made_of: action.made_of,
+            output: String::new(),
+            started_unix: action.started_unix,
+            seconds: (started.elapsed().as_secs_f64() * 1e3).round() / 1e3,
+            threads: self.threads,
+            host: host_name(),
+        };
+        let checked = self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
+        let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
+        self.display.line(&format!("{label}: done in {} → {}", seconds(record.seconds), &record.output[..10]));
+        Ok(record)
+    }
+
+    fn folder_of(&self, input: &NodeInput, output_of: &dyn Fn(usize) -> String) -> PathBuf {
+        match &input.from {
+            Origin::Node { index, subtree } => {
+                let object = self.store.object(&output_of(*index));
+                subtree.as_ref().map_or(object.clone(), |s| object.join(s))
+            }
+            Origin::Folder(folder) => folder.clone(),
+        }
+    }
+}
+
+/// A failure that is neither the input's nor the numbers'.
+fn fail(error: impl std::fmt::Display) -> StageFailure {
+    StageFailure { code: 1, message: error.to_string() }
+}

@@ -1,0 +1,125 @@
+//! The Slurm executor: a job for each node that isn't known to be cached, and for each sink. Then it leaves.
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::atomic::Ordering;
+
+use anyhow::Context as _;
+use artifact::{Failure, Record, Store, counted, hash_json, print_line, report_line};
+use serde_json::json;
+use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
+
+use super::{Executor, Frozen, Work};
+use crate::counts;
+use crate::key;
+use crate::plan::{Origin, Plan, PlanError, State, source_hash};
+use crate::sink::is_shown;
+
+/// The verb that a job calls.
+pub(crate) const JOB_VERB: &str = "job";
+
+/// A cluster that shares this store.
+pub(crate) struct Cluster {
+    /// What it wants besides.
+    pub(crate) site: Site,
+}
+
+impl Executor for Cluster {
+    fn carry_out(&self, work: &Work<'_>) -> anyhow::Result<ExitCode> {
+        let root = work.session.store.root();
+        let out = std::path::absolute(work.out)?;
+        let submission = Submission::new(root, work.run.id(), tasks(work.plan, &work.session.store, &out)?);
+        if let Some((task, problem)) = submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?))) {
+            return Err(PlanError::Usage(format!("stage {}: {problem}", task.stage)).into());
+        }
+        let runner = std::env::current_exe().and_then(|exe| exe.canonicalize()).context("the runner's own path")?;
+        let terms = Terms {
+            slurm: &Slurm::default(),
+            site: &self.site,
+            command: &[runner.as_os_str(), JOB_VERB.as_ref()],
+            plan: &serde_json::to_vec(&Frozen::new(work.plan, &out)).context("the plan can't be written down")?,
+            folder: &std::env::current_dir()?,
+            is_stopped: &|| work.stop.load(Ordering::Relaxed),
+        };
+        let submitted = submission.submit(root, &terms, || done(work, &out))?;
+        self.say(work, &submission, &submitted)
+    }
+}
+
+impl Cluster {
+    fn say(&self, work: &Work<'_>, submission: &Submission, submitted: &Submitted) -> anyhow::Result<ExitCode> {
+        let Submitted { jobs, queued, left, error } = submitted;
+        for (number, id) in jobs {
+            print_line!("{}: job {id}", submission.tasks[*number].label);
+        }
+        if jobs.is_empty() && *queued + *left == 0 {
+            print_line!("{}", counts::all_cached(work.plan.nodes.len()));
+        } else {
+            print_line!("{} submitted, {queued} queued before", counted(jobs.len(), "job"));
+        }
+        if work.stop.load(Ordering::Relaxed) {
+            return Err(Failure::Interrupted.into());
+        }
+        if *left > 0 {
+            let most = self.site.max_submit;
+            let why = error
+                .as_ref()
+                .map_or_else(|| format!("at most {most} jobs are queued at once (max_submit)"), ToString::to_string);
+            report_line!("nerf-sr: {} left: {why}; run this again to go on", counted(*left, "job"));
+        }
+        Ok(if error.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
+    }
+}
+
+/// What there is to do: nodes, and after them sinks.
+fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError> {
+    let identities = identities(plan, store)?;
+    let resources = |stage: &str| plan.resources.get(stage).cloned().unwrap_or_default();
+    let nodes = plan.nodes.iter().zip(&identities).map(|(node, identity)| Task {
+        stage: node.stage.clone(),
+        label: node.label(),
+        identity: identity.clone(),
+        parents: node.parents().collect(),
+        resources: resources(&node.stage),
+    });
+    let sinks = plan.sinks.iter().map(|sink| {
+        let shows: Vec<&String> = sink.shows.iter().map(|&index| &identities[index]).collect();
+        let code = &sink.program.description.code;
+        let parts = json!({"sink": sink.stage, "code": code, "parameters": sink.parameters, "shows": shows, "out": out});
+        Task {
+            stage: sink.stage.clone(),
+            label: sink.stage.clone(),
+            identity: hash_json(&parts),
+            parents: sink.shows.clone(),
+            resources: resources(&sink.stage),
+        }
+    });
+    Ok(nodes.chain(sinks).collect())
+}
+
+/// By what nodes are known before their keys are: a key's parts, with what a parent is in the place of what it made.
+pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, PlanError> {
+    let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
+    for node in &plan.nodes {
+        let mut inputs = Vec::new();
+        for input in &node.inputs {
+            let from = match &input.from {
+                Origin::Node { index, subtree } => {
+                    format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
+                }
+                Origin::Folder(folder) => source_hash(store, node, &input.name, folder)?,
+            };
+            inputs.push((input.name.clone(), from));
+        }
+        identities.push(hash_json(&key::parts(node, &inputs, plan.device(&node.stage))));
+    }
+    Ok(identities)
+}
+
+/// Which tasks need no job.
+fn done(work: &Work<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
+    let (plan, store) = (work.plan, &work.session.store);
+    let records: Vec<Option<Record>> = plan.states(store)?.into_iter().map(State::record).collect();
+    let sinks: Vec<bool> = plan.sinks.iter().map(|sink| is_shown(plan, sink, &records, store, out)).collect();
+    Ok(records.iter().map(Option::is_some).chain(sinks).collect())
+}

@@ -1,0 +1,121 @@
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context as _;
+use artifact::{Record, RunFile, Store, print_line, report_line, report_text, stop_on_signals};
+use signal_hook::consts::SIGUSR1;
+use slurm::{Slurm, Submission};
+use stage_call::{Display, StageFailure, ask_all};
+
+use super::run::register;
+use crate::execute::{Frozen, NodeJob};
+use crate::plan::{Node, Plan, Sink, State};
+use crate::sink::{Showing, Shown, show};
+use crate::stages::StageProgram;
+
+/// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a sink.
+pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
+    let stop = stop_on_signals()?;
+    let is_time_up = Arc::new(AtomicBool::new(false));
+    for flag in [&stop, &is_time_up] {
+        signal_hook::flag::register(SIGUSR1, Arc::clone(flag))?;
+    }
+    let root = folder.ancestors().nth(2).context("a submission lies in a store's folder `slurm`")?;
+    let store = Store::open(root)?;
+    let frozen = Frozen::read(&Submission::plan(folder))?;
+    let plan = frozen.part(number)?;
+    let result = register(&store, &plan, &stop).and_then(|run| {
+        let result = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop }.carry_out();
+        run.end().ok();
+        result
+    });
+    let Err(failure) = result else { return Ok(ExitCode::SUCCESS) };
+    report_text(&format!("nerf-sr: {}", failure.message));
+    if is_time_up.load(Ordering::Relaxed) && failure.code == 130 {
+        go_on_later(&plan, &store)?;
+    }
+    Ok(ExitCode::from(failure.code))
+}
+
+/// Puts the job into the queue once more, where its stage has left something to go on from.
+fn go_on_later(plan: &Plan, store: &Store) -> anyhow::Result<()> {
+    let state = plan.states(store)?.pop();
+    let has_checkpoint = state.and_then(|state| state.key()).is_some_and(|key| store.has_checkpoint(&key));
+    let Some(id) = slurm::this_job().filter(|_| has_checkpoint) else {
+        report_line!("nerf-sr: its time is up, and it left no checkpoint to go on from; give it more (resources: time)");
+        return Ok(());
+    };
+    report_line!("nerf-sr: its time is up; job {id} goes on from the checkpoint later");
+    Slurm::default().requeue(&id).context("it can't be put into the queue again; run it again to go on")
+}
+
+/// What a job does.
+struct Task<'a> {
+    plan: &'a Plan,
+    store: &'a Store,
+    run: &'a RunFile,
+    out: &'a Path,
+    stop: &'a AtomicBool,
+}
+
+impl Task<'_> {
+    fn carry_out(&self) -> Result<(), StageFailure> {
+        let states = self.plan.states(self.store).map_err(|e| StageFailure { code: 3, message: e.to_string() })?;
+        let records: Vec<Option<Record>> = states.into_iter().map(State::record).collect();
+        match (self.plan.sinks.first(), self.plan.nodes.last()) {
+            (Some(sink), _) => self.show(sink, &records),
+            (None, Some(node)) => self.make(node, &records),
+            (None, None) => Ok(()),
+        }
+    }
+
+    fn make(&self, node: &Node, records: &[Option<Record>]) -> Result<(), StageFailure> {
+        if records.last().is_some_and(Option::is_some) {
+            print_line!("{}: is cached", node.label());
+            return Ok(());
+        }
+        self.check(&node.label(), node.parents(), records)?;
+        self.check_program(&node.program)?;
+        let parents = node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
+        let (threads, display) = (slurm::cores(), Display::new());
+        let Self { plan, store, run: file, stop, .. } = *self;
+        NodeJob { plan, node, store, file, threads, display: &display, stop }.run(&parents).map(drop)
+    }
+
+    fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
+        self.check(&sink.stage, sink.shows.iter().copied(), records)?;
+        self.check_program(&sink.program)?;
+        let Self { plan, store, run, out, stop } = *self;
+        let showing = Showing { plan, store, run, out, threads: slurm::cores(), stop };
+        if let Shown::Written(folder) | Shown::UpToDate(folder) = show(&showing, sink, records)? {
+            print_line!("{}: {}", sink.stage, folder.display());
+        }
+        Ok(())
+    }
+
+    /// Checks that what it needs is there. That its turn has come says little: Slurm takes a forgotten job for one that went well.
+    fn check(&self, label: &str, parents: impl Iterator<Item = usize>, records: &[Option<Record>]) -> Result<(), StageFailure> {
+        let mut missing = parents.filter(|&parent| records[parent].is_none());
+        missing.next().map_or(Ok(()), |parent| {
+            let parent = self.plan.nodes[parent].label();
+            let message =
+                format!("{label} needs {parent}, which isn't there: its job failed, was cancelled or is forgotten; run it again");
+            Err(StageFailure { code: 3, message })
+        })
+    }
+
+    /// Checks that the program is the one that was submitted; its code is in the key.
+    fn check_program(&self, program: &StageProgram) -> Result<(), StageFailure> {
+        let path = std::slice::from_ref(&program.path);
+        let answers =
+            ask_all(path, Some(self.stop)).map_err(|_| StageFailure { code: 130, message: "interrupted".to_owned() })?;
+        let message = match &answers[&program.path] {
+            Ok(now) if now.code == program.description.code => return Ok(()),
+            Ok(_) => format!("{} was built anew since this was submitted; run it again", program.path.display()),
+            Err(problem) => problem.clone(),
+        };
+        Err(StageFailure { code: 2, message })
+    }
+}

@@ -1,0 +1,480 @@
+//! The Slurm executor: on a real cluster of one node, and against programs that play Slurm's.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Instant;
+
+use common::{Finished, Project, root, wait_until};
+
+/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a checkpoint when it is asked to end. While a file
+/// is there that `hold` names, it waits at the step that stands in it.
+const STEP: &str = r#"#!/usr/bin/env python3
+import hashlib, json, os, pathlib, signal, sys, time
+here = pathlib.Path(__file__).parent
+def number(default): return {"type": "number", "default": default}
+def word(): return {"type": "string", "default": ""}
+if sys.argv[1] == "describe":
+    text = {"kinds": ["text"], "summary": "a text", "optional": True}
+    print(json.dumps({"name": "step", "version": "1", "code": "1", "summary": "Steps.", "inputs": {"a": text, "b": text},
+        "parameters": {"type": "object", "additionalProperties": False, "properties": {
+            "steps": number(1), "pause": number(0), "seed": number(0), "fails": number(0), "hold": word()}},
+        "output": {"kind": "text"}}))
+    sys.exit()
+given = {"input": []}
+for name, value in zip(sys.argv[1::2], sys.argv[2::2]):
+    if name == "--input": given["input"].append(value.split("=", 1))
+    else: given[name] = value
+params = json.load(open(given["--params"]))
+with open(here / "ran", "a") as ran: print(os.path.basename(os.path.dirname(given["--params"])), given["--device"], given["--threads"], file=ran)
+if params["fails"]:
+    sys.exit("step: asked to fail" if params["fails"] == 1 else int(params["fails"]))
+asked = []
+signal.signal(signal.SIGTERM, lambda *_: asked.append(1))
+checkpoint = pathlib.Path(given["--work"]) / "checkpoint"
+def is_held():
+    try: return params["hold"] and done >= int((here / params["hold"]).read_text() or 0)
+    except FileNotFoundError: return False
+done, state = 0, hashlib.sha256(str(params["seed"]).encode()).hexdigest()
+for name, folder in sorted(given["input"]):
+    state = hashlib.sha256((state + pathlib.Path(folder, "text").read_text()).encode()).hexdigest()
+if checkpoint.exists(): done, state = json.loads(checkpoint.read_text())
+while done < params["steps"]:
+    while is_held() and not asked: time.sleep(0.05)
+    if asked:
+        checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        checkpoint.write_text(json.dumps([done, state]))
+        print("stopped at", done, file=sys.stderr)
+        sys.exit(130)
+    time.sleep(params["pause"])
+    done, state = done + 1, hashlib.sha256(state.encode()).hexdigest()
+os.makedirs(given["--output"])
+pathlib.Path(given["--output"], "text").write_text(state)
+"#;
+
+/// A sink in plain Python.
+const PAGE: &str = r#"#!/usr/bin/env python3
+import json, os, pathlib, sys
+if sys.argv[1] == "describe":
+    print(json.dumps({"name": "page", "version": "1", "code": "1", "summary": "Shows.", "sink": True, "parameters": {"type": "object"},
+        "inputs": {"run": {"kinds": ["run"], "summary": "a run"}}, "output": {"kind": "page"}}))
+    sys.exit()
+given = dict(zip(sys.argv[1::2], sys.argv[2::2]))
+record = json.load(open(given["--input"].split("=", 1)[1] + "/run.json"))
+os.makedirs(given["--output"])
+pathlib.Path(given["--output"], "index.html").write_text(" ".join(node["output"] for node in record["nodes"]))
+"#;
+
+const SWEEP: &str = "
+default: [page]
+stages:
+  prep: {run: ./step, resources: {cpus: 2}}
+  train: {run: ./step, inputs: {a: prep}, resources: {cpus: 1, mem: 64M, time: 1h}}
+  eval: {run: ./step, inputs: {a: train, b: prep}}
+  page: {run: ./page, inputs: {run: eval}}
+";
+
+/// A program, written by another process: one that this one has open can't be started.
+fn program(project: &Project, file: &str, text: &str) {
+    project.write(".source", text);
+    let to = project.path(file);
+    std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+    assert!(Command::new("install").args(["-m", "755"]).arg(project.path(".source")).arg(to).status().unwrap().success());
+}
+
+fn project(pipeline: &str) -> Project {
+    let project = Project::new(pipeline);
+    program(&project, "step", STEP);
+    program(&project, "page", PAGE);
+    project
+}
+
+/// A cluster of one node; it ends with this.
+struct Cluster {
+    dir: tempfile::TempDir,
+}
+
+impl Cluster {
+    /// A new one; without Slurm's programs it says so and is none.
+    fn start() -> Option<Self> {
+        static STARTED: AtomicU32 = AtomicU32::new(0);
+        let path = std::env::var("PATH").unwrap_or_default() + ":/usr/sbin";
+        let has = |name: &str| path.split(':').any(|folder| Path::new(folder).join(name).exists());
+        if let Some(missing) = ["slurmctld", "slurmd", "munged"].into_iter().find(|name| !has(name)) {
+            eprintln!("skipped: no {missing}");
+            return None;
+        }
+        // Socket paths are short: not in a test's own deep folder.
+        let cluster = Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
+        let port = 20_000 + (std::process::id() % 1000) * 20 + STARTED.fetch_add(1, Ordering::Relaxed) * 2;
+        let mut script = cluster.script("start");
+        script.env("MINI_SLURM_PORT", port.to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
+        // The daemons would hold a pipe open.
+        assert!(script.stdout(Stdio::null()).status().unwrap().success(), "the cluster doesn't start");
+        Some(cluster)
+    }
+
+    fn script(&self, verb: &str) -> Command {
+        let mut command = Command::new(root().join("tests/mini-slurm.sh"));
+        command.arg(verb).arg(self.dir.path());
+        command
+    }
+
+    /// A command that works with this cluster.
+    fn with(&self, command: Command) -> Command {
+        with_environment(command, "SLURM_CONF", &self.dir.path().join("slurm.conf"))
+    }
+
+    #[track_caller]
+    fn slurm(&self, program: &str, arguments: &[&str]) -> String {
+        let mut command = Command::new(program);
+        command.args(arguments);
+        let finished = Finished::of(self.with(command).output().unwrap());
+        assert_eq!(finished.code, 0, "{program}: {}", finished.stderr);
+        finished.stdout.trim().to_owned()
+    }
+
+    fn run(&self, project: &Project, arguments: &[&str]) -> Finished {
+        Finished::of(self.with(command(project, arguments)).output().unwrap())
+    }
+
+    #[track_caller]
+    fn ok(&self, project: &Project, arguments: &[&str]) -> String {
+        let finished = self.run(project, arguments);
+        assert_eq!(finished.code, 0, "{}\n{}", finished.stdout, finished.stderr);
+        finished.stdout
+    }
+
+    /// The jobs of a submission by the names of their tasks.
+    #[track_caller]
+    fn submit(&self, project: &Project, arguments: &[&str]) -> BTreeMap<String, String> {
+        jobs(&self.ok(project, &[&["run"], arguments].concat()))
+    }
+
+    /// Waits until the queue is empty.
+    #[track_caller]
+    fn drain(&self) {
+        wait_until(|| self.slurm("squeue", &["-h"]).is_empty());
+        assert_eq!(self.slurm("squeue", &["-h"]), "", "{}", self.slurm("scontrol", &["show", "job"]));
+    }
+
+    /// Slurm's word on a job: `COMPLETED 0:0`.
+    fn state(&self, job: &str) -> String {
+        let shown = self.slurm("scontrol", &["-o", "show", "job", job]);
+        let of = |key: &str| shown.split_whitespace().find_map(|word| word.strip_prefix(key)).unwrap_or_default().to_owned();
+        format!("{} {}", of("JobState="), of("ExitCode="))
+    }
+}
+
+impl Drop for Cluster {
+    fn drop(&mut self) {
+        self.script("stop").status().ok();
+    }
+}
+
+fn with_environment(mut command: Command, name: &str, value: &Path) -> Command {
+    command.env(name, value);
+    command
+}
+
+/// The runner with the Slurm executor, and no settings of whoever runs the tests.
+fn command(project: &Project, arguments: &[&str]) -> Command {
+    let mut command = project.command(arguments);
+    command.env("NERF_SR_EXECUTOR", "slurm").env_remove("NERF_SR_SITE").env("HOME", project.path("."));
+    command
+}
+
+fn jobs(said: &str) -> BTreeMap<String, String> {
+    said.lines().filter_map(|line| line.rsplit_once(": job ")).map(|(label, id)| (label.to_owned(), id.to_owned())).collect()
+}
+
+/// How often stages ran.
+fn ran(project: &Project) -> Vec<String> {
+    std::fs::read_to_string(project.path("ran")).unwrap_or_default().lines().map(str::to_owned).collect()
+}
+
+/// The objects that a stage's nodes have now.
+fn outputs(project: &Project, stage: &str, arguments: &[&str]) -> Vec<String> {
+    project.output_of(stage, arguments)
+}
+
+const SIX: [&str; 2] = ["-p", "train.seed=1,2,3,4,5,6"];
+
+#[test]
+fn a_sweep_submitted_twice_at_once_runs_once_and_ends_as_locally() {
+    let Some(cluster) = Cluster::start() else { return };
+    let (shared, local) = (project(SWEEP), project(SWEEP));
+    let both = [0, 1].map(|_| {
+        let mut command = cluster.with(command(&shared, &[&["run"][..], &SIX].concat()));
+        command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    });
+    let started = Instant::now();
+    let said: Vec<Finished> = both.into_iter().map(|child| Finished::of(child.wait_with_output().unwrap())).collect();
+    for one in &said {
+        assert_eq!(one.code, 0, "{}{}", one.stdout, one.stderr);
+    }
+    let submitted: usize = said.iter().map(|one| jobs(&one.stdout).len()).sum();
+    assert_eq!(submitted, 14, "{}{}", said[0].stdout, said[1].stdout);
+    let status = cluster.ok(&shared, &[&["status"][..], &SIX].concat());
+    assert!(status.contains(" pending: Dependency"), "{status}");
+    cluster.drain();
+    eprintln!("14 jobs, 4 hops, on four places: {:.1} s", started.elapsed().as_secs_f64());
+    assert_eq!(ran(&shared).len(), 13, "each stage ran once");
+    local.ok(&[&["run"][..], &SIX].concat());
+    for stage in ["prep", "train", "eval"] {
+        assert_eq!(outputs(&shared, stage, &SIX), outputs(&local, stage, &SIX), "{stage}");
+    }
+    let page = |project: &Project| std::fs::read_to_string(project.path("out/page/index.html")).unwrap();
+    assert_eq!(page(&shared), page(&local));
+    assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
+    assert!(cluster.ok(&shared, &[&["run"][..], &SIX].concat()).contains("nothing to run"), "and a page that is there");
+    // `cpus` leads to as many threads.
+    assert!(ran(&shared)[0].ends_with(" cpu 2"), "{:?}", ran(&shared));
+}
+
+#[test]
+fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = project(SWEEP);
+    let arguments = ["eval", "-p", "train.fails=0,7", "-p", "eval.seed=3"];
+    let jobs = cluster.submit(&project, &arguments);
+    cluster.drain();
+    for (label, state) in [
+        ("prep", "COMPLETED 0:0"),
+        ("train [fails=0]", "COMPLETED 0:0"),
+        ("eval [fails=0]", "COMPLETED 0:0"),
+        ("train [fails=7]", "FAILED 7:0"),
+        ("eval [fails=7]", "CANCELLED 0:0"),
+    ] {
+        assert_eq!(cluster.state(&jobs[label]), state, "{label}");
+    }
+    let log = cluster.ok(&project, &[&["log", "train"][..], &arguments].concat());
+    assert!(log.contains("failed after") && log.contains("slurm/") && log.contains("ended with exit code 7"), "{log}");
+    // Once more: what failed, and what needs it.
+    let again = cluster.submit(&project, &arguments);
+    assert_eq!(again.keys().collect::<Vec<_>>(), ["eval [fails=7]", "train [fails=7]"]);
+    cluster.drain();
+    // A stage that comes out as before leaves the rest cached: the job ends as a hit.
+    let hit = ["eval", "-p", "prep.pause=0.01", "-p", "train.fails=0", "-p", "eval.seed=3"];
+    let jobs = cluster.submit(&project, &hit);
+    assert_eq!(jobs.len(), 3);
+    cluster.drain();
+    assert_eq!(cluster.state(&jobs["eval"]), "COMPLETED 0:0");
+    assert!(cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: is cached"));
+    assert_eq!(ran(&project).len(), 6, "{:?}", ran(&project));
+}
+
+const ONE: &str = "default: [last]\nstages:\n  first: {run: ./step}\n  last: {run: ./step, inputs: {a: first}}\n";
+
+#[test]
+fn an_outstanding_submission_is_seen_kept_and_cancelled() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = project(&format!("{ONE}  other: {{run: ./step, parameters: {{seed: 9}}}}\n"));
+    cluster.ok(&project, &["run", "other", "--executor", "local"]);
+    project.write("hold", "");
+    let first = ["first", "-p", "first.seed=5"];
+    cluster.submit(&project, &first);
+    cluster.drain();
+    let held = ["-p", "first.seed=5", "-p", "last.hold=hold"];
+    let jobs = cluster.submit(&project, &held);
+    assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "what is cached is not submitted");
+    let running = || cluster.ok(&project, &[&["status"][..], &held].concat()).contains(&format!("job {} running", jobs["last"]));
+    wait_until(running);
+    assert!(running());
+    let second = cluster.ok(&project, &[&["run"][..], &held].concat());
+    assert!(second.contains("0 jobs submitted, 1 queued before"), "{second}");
+    // What the job needs stays, though the plan without arguments doesn't name it.
+    let said = cluster.ok(&project, &["gc", "other", "--keep-days", "0", "--drop-unfinished"]);
+    assert!(said.lines().any(|line| line.contains("first") && line.contains("a submitted job needs it")), "{said}");
+    // Edits meanwhile change nothing of what was submitted; a job that waits for the held one is queued with it.
+    let more = cluster.submit(&project, &[&["other"][..], &["-p", "other.hold=hold", "-p", "other.seed=1"]].concat());
+    std::fs::write(
+        project.path("pipeline.yaml"),
+        ONE.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs"),
+    )
+    .unwrap();
+    std::fs::remove_file(project.path("hold")).unwrap();
+    cluster.drain();
+    assert_eq!([&jobs["last"], &more["other"]].map(|job| cluster.state(job)), ["COMPLETED 0:0", "COMPLETED 0:0"]);
+    std::fs::write(project.path("pipeline.yaml"), ONE).unwrap();
+    assert!(cluster.ok(&project, &[&["plan"][..], &held].concat()).matches("cached").count() >= 2);
+    // Without jobs the submissions are runs like others.
+    cluster.ok(&project, &["gc", "first", "--keep-days", "0"]);
+    assert!(std::fs::read_dir(project.path(".nerf-sr/slurm")).unwrap().all(|e| e.unwrap().file_name() == "lock"));
+    project.write("hold", "");
+    let jobs = cluster.submit(&project, &["-p", "first.hold=hold"]);
+    assert_eq!(jobs.len(), 2);
+    let said = cluster.ok(&project, &["cancel", "first"]);
+    assert!(said.contains("cancelled 1 job of first"), "{said}");
+    cluster.drain();
+    assert!(cluster.state(&jobs["last"]).starts_with("CANCELLED") && cluster.state(&jobs["first"]).starts_with("CANCELLED"));
+    assert!(cluster.ok(&project, &["cancel"]).contains("cancelled 0 jobs"));
+}
+
+/// Five ends of its time, the first by Slurm's own clock; the bytes are those of an undisturbed run.
+#[test]
+fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
+    let Some(cluster) = Cluster::start() else { return };
+    let pipeline =
+        "default: [first]\nstages:\n  first: {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
+    let (shared, local) = (project(pipeline), project(pipeline));
+    shared.write("site.yaml", "notice: 56s\nsetup: ['echo set-up is done']\n");
+    shared.write("hold", "10");
+    let job = cluster.submit(&shared, &["--site", "site.yaml"])["first"].clone();
+    let log = || cluster.ok(&shared, &["log", "first"]);
+    let state = || cluster.state(&job);
+    for round in 1..=5 {
+        wait_until(|| ran(&shared).len() == round);
+        assert_eq!(ran(&shared).len(), round, "{} {}", state(), log());
+        if round > 1 {
+            std::thread::sleep(std::time::Duration::from_millis(300));
+            cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
+        }
+        wait_until(|| log().matches("goes on from the checkpoint later").count() == round && state().starts_with("PENDING"));
+        assert!(state().starts_with("PENDING"), "{} {}", state(), log());
+        shared.write("hold", &(10 * (round + 1)).to_string());
+        // Slurm waits two minutes with what is queued again. At once it would take the old credential for the new one's.
+        cluster.slurm("scontrol", &["update", &format!("JobId={job}"), "StartTime=now+2"]);
+    }
+    std::fs::remove_file(shared.path("hold")).unwrap();
+    cluster.drain();
+    assert_eq!((ran(&shared).len(), state().as_str()), (6, "COMPLETED 0:0"), "{}", log());
+    assert!(
+        log().contains("set-up is done") && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))),
+        "{}",
+        log()
+    );
+    local.ok(&["run"]);
+    assert_eq!(outputs(&shared, "first", &[]), outputs(&local, "first", &[]));
+    assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
+}
+
+#[test]
+fn a_dependency_that_slurm_has_forgotten_is_caught() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = project(ONE);
+    cluster.submit(&project, &[]);
+    cluster.drain();
+    // Both have gone: a hit of the last wouldn't need the first.
+    let objects = ["first", "last"].map(|stage| project.artifact(stage, &[]));
+    objects.iter().for_each(|object| std::fs::remove_dir_all(object).unwrap());
+    let submissions = std::fs::read_dir(project.path(".nerf-sr/slurm")).unwrap().map(|e| e.unwrap().path());
+    let script: PathBuf = submissions.filter(|path| path.is_dir()).map(|path| path.join("job.sh")).next().unwrap();
+    let log = project.path("log");
+    let output = format!("--output={}", log.display());
+    // Slurm takes a job that it doesn't know for one that went well.
+    let arguments =
+        ["--parsable", "--dependency=afterok:99999", "--kill-on-invalid-dep=yes", &output, script.to_str().unwrap(), "1"];
+    let job = cluster.slurm("sbatch", &arguments);
+    cluster.drain();
+    assert_eq!(cluster.state(&job), "FAILED 3:0");
+    let said = std::fs::read_to_string(log).unwrap();
+    assert!(said.contains("last needs first, which isn't there"), "{said}");
+}
+
+/// A stage that asks for a GPU computes on the first of its own; here that is another kind of device, and so another key.
+#[test]
+fn a_stage_with_a_gpu_computes_on_it() {
+    let Some(cluster) = Cluster::start() else { return };
+    let project = project(&ONE.replace("last: {", "last: {resources: {gpus: 1}, "));
+    let jobs = cluster.submit(&project, &[]);
+    cluster.drain();
+    assert_eq!(cluster.state(&jobs["last"]), "COMPLETED 0:0");
+    let devices: Vec<String> = ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
+    assert_eq!(devices, ["cpu", "cuda:0"]);
+    assert!(cluster.ok(&project, &["run"]).contains("nothing to run"));
+    let why = project.ok(&["why", "last"]);
+    assert!(why.contains("device: \"cuda\" → \"cpu\""), "{why}");
+}
+
+/// A program of Slurm's that writes down how it was called.
+fn fake(project: &Project, name: &str, more: &str) {
+    let here = project.path(".").display().to_string();
+    program(project, &format!("bin/{name}"), &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"));
+}
+
+#[test]
+fn what_slurm_is_told() {
+    let project = project(
+        "default: [page]\nstages:\n  first: {run: ./step, resources: {cpus: 4, mem: 8G, gpus: 1, time: 2h}}\n  \
+         last: {extends: first, inputs: {a: first}, resources: {gpus: 0}}\n  page: {run: ./page, inputs: {run: last}}\n",
+    );
+    fake(&project, "sbatch", "echo $((40 + $(wc -l < sbatch.called)))");
+    fake(&project, "squeue", "cat queue 2>/dev/null || true");
+    fake(&project, "scancel", "");
+    let path = format!("{}:{}", project.path("bin").display(), std::env::var("PATH").unwrap());
+    let run = |arguments: &[&str]| {
+        let command = with_environment(command(&project, arguments), "PATH", Path::new(&path));
+        let mut command = with_environment(command, "NERF_SR_SITE", Path::new("site.yaml"));
+        Finished::of(command.output().unwrap())
+    };
+    project.write("site.yaml", "partition: gpu\nmax_submit: 2\nsetup: [module load cuda]\n");
+    let said = run(&["run"]);
+    assert_eq!(
+        (said.code, said.stdout.as_str()),
+        (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 queued before\n"),
+        "{}",
+        said.stderr
+    );
+    assert!(
+        said.stderr.contains("1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"),
+        "{}",
+        said.stderr
+    );
+    let called = std::fs::read_to_string(project.path("sbatch.called")).unwrap();
+    let lines: Vec<&str> = called.lines().collect();
+    for (line, words) in [
+        (lines[0], " --cpus-per-task=4 --mem=8192M --gres=gpu:1 --time=120 --partition=gpu /"),
+        (
+            lines[1],
+            " --cpus-per-task=4 --mem=8192M --time=120 --partition=gpu --dependency=afterok:41 --kill-on-invalid-dep=yes /",
+        ),
+    ] {
+        assert!(line.contains(words) && line.contains("--requeue") && line.contains("--signal=B:USR1@90"), "{line}");
+    }
+    // The same again, while both are queued, and when there is room.
+    let script = lines[0].split_whitespace().find(|word| word.ends_with("job.sh")).unwrap();
+    project.write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
+    assert!(run(&["run"]).stdout.contains("0 jobs submitted, 2 queued before"));
+    project.write("site.yaml", "max_submit: 3\n");
+    let said = run(&["run"]);
+    assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 queued before\n");
+    assert!(std::fs::read_to_string(project.path("sbatch.called")).unwrap().contains("--dependency=afterok:42 "));
+    let status = run(&["status"]).stdout;
+    assert!(status.contains("job 41 running") && status.contains("job 42 pending: Dependency"), "{status}");
+    assert!(run(&["cancel", "last"]).stdout.contains("cancelled 1 job of last"));
+    assert_eq!(std::fs::read_to_string(project.path("scancel.called")).unwrap(), "42\n");
+    // Refusals are one line, and nothing is lost.
+    fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
+    project.write("queue", "");
+    run(&["run"]).fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
+    run(&["run", "-j", "2"]).fails(2, &["--jobs, --threads and --keep-going are for --executor local"]);
+    project.write("site.yaml", "partitions: gpu\n");
+    run(&["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
+    std::fs::remove_file(project.path("bin/squeue")).unwrap();
+    let mut alone = with_environment(command(&project, &["gc", "--keep-days", "0"]), "PATH", Path::new("/nowhere"));
+    let said = Finished::of(alone.output().unwrap());
+    assert_eq!(said.code, 0, "{}", said.stderr);
+    assert!(project.path(".nerf-sr/slurm").read_dir().unwrap().count() > 1, "where Slurm can't be asked, submissions stay");
+}
+
+#[test]
+fn resources_are_checked_with_the_file() {
+    for (block, words) in [
+        ("{mem: 8}", "pipeline.yaml:3: stages.first.resources.mem: \"8\" is no amount of memory; write a number with M, G or T"),
+        ("{time: 2 hours}", "pipeline.yaml:3: stages.first.resources.time: \"2 hours\" is no time"),
+        ("{cores: 2}", "unknown field `cores`, expected one of `cpus`, `mem`, `gpus`, `time`"),
+    ] {
+        let project = project(&format!("default: [first]\nstages:\n  first: {{run: ./step, resources: {block}}}\n"));
+        project.run(&["plan"]).fails(2, &[words]);
+    }
+    // No resource is part of a key.
+    let project = project("default: [first]\nstages:\n  first: {run: ./step}\n");
+    project.ok(&["run"]);
+    project.replace("run: ./step", "run: ./step, resources: {cpus: 2, mem: 1G, gpus: 0, time: 1h}");
+    assert!(project.ok(&["run"]).contains("nothing to run"));
+}
