@@ -6,7 +6,7 @@ mod common;
 use std::path::Path;
 
 use common::{Project, manifest, stage};
-use pixels::{Filter, Picture, read_exr, read_premultiplied, resize_pillow};
+use pixels::{Filter, Image, read_exr, read_premultiplied, resize_pillow};
 
 /// A project whose LR views are enlarged.
 fn project() -> Project {
@@ -43,7 +43,7 @@ fn views_are_enlarged_and_scored() {
         let after = read_exr(&large.join("images").join(&name)).unwrap();
         assert_eq!((after.width, after.height, after.channel("Z")), (48, 48, None));
         // Pillow's own bicubic filter on 8 bits, but for half precision.
-        let expected = Picture::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
+        let expected = Image::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
         let worst = (0..4).flat_map(|c| {
             let found = after.channel(["R", "G", "B", "A"][c]).unwrap();
             expected.channel(c).into_iter().zip(found).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>()
@@ -95,7 +95,7 @@ fn the_table_has_every_method_side_by_side() {
     let table = std::fs::read_to_string(project.path("out/table.md")).unwrap();
     for words in [
         "By other metrics: ssim_valid",
-        "| NeRF-Swin | other pictures | weights not given: swinir_x2.safetensors |",
+        "| NeRF-Swin | other images | weights not given: swinir_x2.safetensors |",
         "equal epochs",
         "conventions",
         "GiB",

@@ -1,10 +1,10 @@
 //! `train-refine`: trains the network that refines rendered views, from views whose truth is known.
 //!
-//! In the pipeline those are of a rehearsal: a field trained from LR pictures that were shrunk once more, rendered at LR size, beside
-//! the LR pictures themselves. So it sees LR pictures alone, and the scene it is for.
+//! In the pipeline those are of a rehearsal: a field trained from LR images that were shrunk once more, rendered at LR size, beside
+//! the LR images themselves. So it sees LR images alone, and the scene it is for.
 //!
 //! For views that will be refined by references, it sees references in training, too: other views of the rehearsal, of which every one has
-//! its true picture.
+//! its true image.
 //!
 //! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's split, they agree with those before the
 //! network sees them; so do the views that it learns from.
@@ -318,7 +318,7 @@ fn examples(
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;
     if all.is_empty() {
         return Err(
-            Failure::BadInput("input views: none of them has a picture, by name and pose, in input truth".to_owned()).into()
+            Failure::BadInput("input views: none of them has an image, by name and pose, in input truth".to_owned()).into()
         );
     }
     if all.len() == 1 {

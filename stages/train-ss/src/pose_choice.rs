@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use pixels::{Picture, psnr_of};
+use pixels::{Image, psnr_of};
 use poses::{Shot, disagreement};
 use scene::Camera;
 
@@ -49,7 +49,7 @@ pub(crate) fn train(member: &Member<'_>, data: &TrainingData<'_>) -> anyhow::Res
 struct Judge<'a> {
     member: &'a Member<'a>,
     data: &'a TrainingData<'a>,
-    photographs: Vec<Picture>,
+    photographs: Vec<Image>,
     background: f32,
 }
 
@@ -57,12 +57,7 @@ impl<'a> Judge<'a> {
     fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
         let photographs = Photographs::read(data.input)?.over_background();
         let background = photographs.views.background.shown();
-        Ok(Self {
-            member,
-            data,
-            photographs: photographs.pictures.into_iter().map(scene::Photograph::known).collect(),
-            background,
-        })
+        Ok(Self { member, data, photographs: photographs.images.into_iter().map(scene::Photograph::known).collect(), background })
     }
 
     /// How far photographs are from their neighbours by what a training found; none where there is nothing to compare.

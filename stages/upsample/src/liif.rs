@@ -51,8 +51,8 @@ impl Liif {
     }
 
     /// Features of each pixel, with those around it: places × channels.
-    fn features(&self, picture: &Tensor) -> Result<Tensor, TchError> {
-        let first = self.head.forward(&picture.f_sub_scalar(0.5)?.f_div_scalar(0.5)?, 1, 1)?;
+    fn features(&self, image: &Tensor) -> Result<Tensor, TchError> {
+        let first = self.head.forward(&image.f_sub_scalar(0.5)?.f_div_scalar(0.5)?, 1, 1)?;
         let mut x = first.shallow_clone();
         for [one, two] in &self.blocks {
             x = two.forward(&one.forward(&x, 1, 1)?.f_relu()?, 1, 1)?.f_add(&x)?;
@@ -86,12 +86,12 @@ impl Network for Liif {
         None
     }
 
-    fn enlarge(&self, picture: &Tensor, [rows, columns]: [i64; 2]) -> Result<Tensor, TchError> {
-        let [_, _, low_rows, low_columns] = picture.size()[..] else {
-            return Err(TchError::Shape("a picture has four dimensions".to_owned()));
+    fn enlarge(&self, image: &Tensor, [rows, columns]: [i64; 2]) -> Result<Tensor, TchError> {
+        let [_, _, low_rows, low_columns] = image.size()[..] else {
+            return Err(TchError::Shape("an image has four dimensions".to_owned()));
         };
         let (first, others) = self.layers.split_first().ok_or_else(|| TchError::Shape("no layers".to_owned()))?;
-        let features = self.features(picture)?;
+        let features = self.features(image)?;
         let width = features.size()[1];
         // The first layer is linear: what features give it is the same for all pixels that take them, and so is the cell.
         let known = first.part(&features, 0, width)?;

@@ -1,7 +1,7 @@
 use std::error::Error;
 
 use glam::DVec3;
-use pixels::Picture;
+use pixels::Image;
 use radiance::RayField;
 use scene::Camera;
 
@@ -13,7 +13,7 @@ pub struct Shot<'a> {
     /// Its pixels are the photograph's.
     pub camera: &'a Camera,
     /// RGB over its background; NaN where nothing is known.
-    pub photograph: &'a Picture,
+    pub photograph: &'a Image,
     /// What the photograph's channels are multiplied by to have the field's exposure.
     pub exposure: [f32; 3],
 }

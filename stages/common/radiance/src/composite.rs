@@ -50,7 +50,7 @@ pub(crate) struct Regularisers {
 /// How far apart colours at most are for matter to pass for the background.
 pub const LIKE_BACKGROUND: f32 = 0.1;
 
-/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether it is there no picture
+/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether it is there no image
 /// tells that sees it before the background alone.
 pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
     let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();

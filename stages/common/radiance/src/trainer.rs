@@ -533,7 +533,7 @@ mod tests {
         }
     }
 
-    /// A white cloud before white is as good as nothing to the pictures, and stays; by the haze loss it goes.
+    /// A white cloud before white is as good as nothing to the images, and stays; by the haze loss it goes.
     #[test]
     fn what_passes_for_the_background_goes() {
         let architecture =

@@ -90,8 +90,8 @@ pub enum CameraError {
         /// The number.
         value: f64,
     },
-    /// Distortion by which a place in the picture would belong to no ray, or to several.
-    #[error("lens distortion {0} can't be undone within the picture; are its coefficients right?")]
+    /// Distortion by which a place in the image would belong to no ray, or to several.
+    #[error("lens distortion {0} can't be undone within the image; are its coefficients right?")]
     Distortion(Distortion),
     /// An image without pixels.
     #[error("image size {width}×{height}; both must be at least 1")]
@@ -173,7 +173,7 @@ impl Camera {
         let straight = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
         let [x, y] = k.distort(straight);
         if !k.distortion.is_none() {
-            // A distortion may fold back into the picture what lies outside.
+            // A distortion may fold back into the image what lies outside.
             let [u, v] = k.undistort([x, y]);
             let off = (u - straight[0]).hypot(v - straight[1]);
             if off.is_nan() || off > 1e-3 {
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_distortion_would_fold_into_the_picture_is_not_seen() {
+    fn what_a_distortion_would_fold_into_the_image_is_not_seen() {
         let mut camera = camera(DVec3::Z, 0.0, DVec3::ZERO);
         camera.intrinsics.distortion.radial[0] = -0.4;
         camera.check().unwrap();

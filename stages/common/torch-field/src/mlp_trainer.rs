@@ -51,7 +51,7 @@ fn shards(rays: usize) -> usize {
 const CHUNK_SAMPLES: usize = 4096;
 /// So many steps in a row in which a network is stuck are a collapse: no gradient leads out of it.
 const STUCK_STEPS: u64 = 200;
-/// Less of the light than this stopped by all samples: the background alone explains the pictures, and ReLU has no gradient there.
+/// Less of the light than this stopped by all samples: the background alone explains the images, and ReLU has no gradient there.
 const CLEAR: f64 = 1e-3;
 /// More of the light than this stopped by the first sample: what is left is of rays whose second happens to be drawn close to it, and
 /// what lies behind gets no gradient.
