@@ -100,7 +100,7 @@ fn a_block_follows_the_one_it_extends() {
 #[test]
 fn views_agree_with_their_own_photographs() {
     let project = project();
-    let at_low_resolution = |more: &[&str]| -> Vec<f64> {
+    let at_lr = |more: &[&str]| -> Vec<f64> {
         project.ok(&[&["run", "refined"], more].concat());
         let rows: serde_json::Value =
             serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
@@ -113,9 +113,9 @@ fn views_agree_with_their_own_photographs() {
     let is_trained_so = |more: &[&str]| -> bool {
         project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"].as_bool().unwrap()
     };
-    let given = at_low_resolution(&[]);
+    let given = at_lr(&[]);
     assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
-    let papers = at_low_resolution(&["-p", "split=paper"]);
+    let papers = at_lr(&["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
     assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
     // The network has learnt on views that agree, too; what hasn't is said to be another task.
@@ -170,12 +170,12 @@ fn views_are_means_with_their_enlarged_photographs() {
         let file = folder.join(format!("images/{name}.exr"));
         pixels::read_premultiplied(&file).unwrap().over(1.0).channel(1)
     };
-    let (plain, mean, large) = (green(&plain), green(&mean), green(&enlarged));
-    for (i, ((plain, mean), large)) in plain.iter().zip(&mean).zip(&large).enumerate() {
-        let expected = if i % 48 < 24 { 0.5 * (plain + large) } else { *plain };
-        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {large}");
+    let (plain, mean, enlarged) = (green(&plain), green(&mean), green(&enlarged));
+    for (i, ((plain, mean), enlarged)) in plain.iter().zip(&mean).zip(&enlarged).enumerate() {
+        let expected = if i % 48 < 24 { 0.5 * (plain + enlarged) } else { *plain };
+        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {enlarged}");
     }
-    assert!(plain.iter().zip(&large).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
+    assert!(plain.iter().zip(&enlarged).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
     // Of another size.
     refine("no", Some(&photographs)).0.fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
 }

@@ -5,7 +5,7 @@
 //! * `lpips`: by SqueezeNet, AlexNet and VGG-16, each where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
 //! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
-//! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR images or is taken to have made them. Where
+//! * [`LrScores`]: the same of the render shrunk to LR, by the kernel that made the LR images or is taken to have made them. Where
 //!   photographs are all there is, no HR truth exists, and this alone can be known.
 //!
 //! Means over views are means of per-view values. Open backgrounds are scored on white. Where a view has a mask, what doesn't count is taken
@@ -118,13 +118,13 @@ pub struct Scores {
     pub warp: Option<WarpScore>,
     /// The shrunk render against the view's LR image, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub low_resolution: Option<LowScores>,
+    pub low_resolution: Option<LrScores>,
 }
 
 /// A render shrunk to LR against the view's LR image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct LowScores {
+pub struct LrScores {
     /// Peak signal-to-noise ratio in dB.
     pub psnr: f64,
     /// Structural similarity.
@@ -281,7 +281,7 @@ impl ScoringJob<'_> {
             low_resolution: shrunk
                 .iter()
                 .zip(&lr)
-                .map(|(shrunk, lr)| LowScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
+                .map(|(shrunk, lr)| LrScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
@@ -370,7 +370,7 @@ fn mean_of(views: &[ViewScores]) -> Scores {
             .map(|(psnr, seen)| WarpScore { psnr, seen }),
         low_resolution: mean(&|s| s.low_resolution.map(|l| l.psnr))
             .zip(mean(&|s| s.low_resolution.map(|l| l.ssim)))
-            .map(|(psnr, ssim)| LowScores { psnr, ssim }),
+            .map(|(psnr, ssim)| LrScores { psnr, ssim }),
     }
 }
 

@@ -26,14 +26,14 @@ pub(crate) fn mask_reach(kernel: Kernel) -> usize {
 
 /// An LR image as its kernel gives it.
 #[derive(Clone, Debug, PartialEq)]
-pub enum LowResolution {
+pub enum LrImage {
     /// Rounded to 8 bits, alpha straight.
     Bytes(Rgba8),
     /// Not rounded, alpha premultiplied.
     Floats(Image),
 }
 
-impl LowResolution {
+impl LrImage {
     /// The same shrunk once more, by the same kernel.
     pub(crate) fn shrunk(&self, (width, height): (usize, usize), kernel: Kernel) -> Self {
         match self {
@@ -66,13 +66,13 @@ impl LowResolution {
 ///
 /// # Panics
 /// With [`Kernel::Average`] when the sizes aren't whole multiples.
-pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResolution) {
+pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LrImage) {
     let size = |(w, h): (u32, u32)| (w as usize, h as usize);
     let (hr_size, lr_size) = (size(sizes.hr), size(sizes.lr));
     let hr = resize_pillow(image, hr_size.0, hr_size.1, Filter::Lanczos);
     let lr = match kernel {
         Kernel::Lanczos | Kernel::Bicubic | Kernel::Box => {
-            LowResolution::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
+            LrImage::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
         }
         Kernel::Average => {
             let pooled = average_pool(&hr, hr_size.0 / lr_size.0, hr_size.1 / lr_size.1);
@@ -81,7 +81,7 @@ pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResol
             for p in floats.data.chunks_exact_mut(4) {
                 (0..3).for_each(|c| p[c] *= p[3]);
             }
-            LowResolution::Floats(floats)
+            LrImage::Floats(floats)
         }
     };
     (hr, lr)

@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
-pub use degrade::{LowResolution, degrade};
+pub use degrade::{LrImage, degrade};
 pub use hull::{GRID, carve};
 pub use sizes::{SizeError, Sizes, enlarged, sizes};
 
@@ -366,7 +366,7 @@ fn mask_name(frame: &Frame) -> Option<String> {
 
 /// What is made of a frame to train on.
 struct TrainingImage {
-    image: LowResolution,
+    image: LrImage,
     mask: Option<Mask>,
 }
 
@@ -426,26 +426,26 @@ impl Job<'_> {
             .map(|(i, frame)| -> anyhow::Result<TrainingImage> {
                 self.context.check_interrupt()?;
                 let (hr, lr) = self.images(frame)?;
-                self.write_low("train/images", &frame.name, &lr)?;
+                self.write_lr("train/images", &frame.name, &lr)?;
                 let mask = frame.mask().bad_input(frame_name(frame))?;
-                let low_mask = mask.as_ref().map(|mask| self.low_mask(mask, &lr));
-                low_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
+                let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
+                lr_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
                 if let Some(hr) = hr.filter(|_| references.contains(&i)) {
-                    self.write_high("references", &frame.name, &hr)?;
+                    self.write_hr("references", &frame.name, &hr)?;
                     mask.iter()
                         .try_for_each(|m| self.write_mask("references", &frame.name, &m.resized((hr.width, hr.height), 0)))?;
                 }
                 progress.add(1);
-                Ok(TrainingImage { image: lr, mask: low_mask })
+                Ok(TrainingImage { image: lr, mask: lr_mask })
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
-        let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
+        let lr_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
         let mut views = Views::new(background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
             .zip(train)
             .map(|(c, frame)| View {
-                image: Some(low_name(&c.name)),
+                image: Some(lr_name(&c.name)),
                 mask: mask_name(frame),
                 ..View::camera_only(self.resized(c, |s| s.lr))
             })
@@ -474,15 +474,15 @@ impl Job<'_> {
             self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &degradation)?;
         }
 
-        let high = |c: &Camera| self.resized(c, |s| s.hr);
-        let enlarged = train_cameras.iter().map(|c| View::camera_only(high(c))).collect();
+        let at_hr = |c: &Camera| self.resized(c, |s| s.hr);
+        let enlarged = train_cameras.iter().map(|c| View::camera_only(at_hr(c))).collect();
         self.context.write_json(&format!("train-cameras/{VIEWS_FILE}"), &Views::new(background, bounds, enlarged))?;
         let reference_views = references
             .iter()
             .map(|&i| View {
                 image: Some(format!("images/{}.png", train[i].name)),
                 mask: mask_name(train[i]),
-                ..View::camera_only(high(&train_cameras[i]))
+                ..View::camera_only(at_hr(&train_cameras[i]))
             })
             .collect();
         if !references.is_empty() {
@@ -495,13 +495,13 @@ impl Job<'_> {
                 self.context.check_interrupt()?;
                 let (hr, lr) = self.images(frame)?;
                 if let Some(hr) = &hr {
-                    self.write_high("truth", &frame.name, hr)?;
+                    self.write_hr("truth", &frame.name, hr)?;
                 }
-                self.write_low("truth/low", &frame.name, &lr)?;
+                self.write_lr("truth/low", &frame.name, &lr)?;
                 if let Some(mask) = frame.mask().bad_input(frame_name(frame))? {
                     let mask = match &hr {
                         Some(hr) => mask.resized((hr.width, hr.height), 0),
-                        None => self.low_mask(&mask, &lr),
+                        None => self.lr_mask(&mask, &lr),
                     };
                     self.write_mask("truth", &frame.name, &mask)?;
                 }
@@ -516,7 +516,7 @@ impl Job<'_> {
             .iter()
             .zip(test)
             .map(|(c, frame)| View {
-                camera: high(c),
+                camera: at_hr(c),
                 image: self.making.has_truth.then(|| format!("images/{}.png", c.name)),
                 mask: mask_name(frame),
                 depth: frame.depth.as_ref().filter(|_| self.making.has_truth).map(|_| format!("depth/{}.exr", c.name)),
@@ -538,9 +538,9 @@ impl Job<'_> {
             self.context.check_interrupt()?;
             let k = &view.camera.intrinsics;
             let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
-            let small = image.shrunk((width as usize, height as usize), kernel);
-            self.write_low("downscaled/images", &view.camera.name, &small)?;
-            let mask = mask.as_ref().map(|mask| self.low_mask(mask, &small));
+            let downscaled = image.shrunk((width as usize, height as usize), kernel);
+            self.write_lr("downscaled/images", &view.camera.name, &downscaled)?;
+            let mask = mask.as_ref().map(|mask| self.lr_mask(mask, &downscaled));
             mask.iter().try_for_each(|mask| self.write_mask("downscaled", &view.camera.name, mask))?;
             Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
         };
@@ -566,10 +566,10 @@ impl Job<'_> {
     }
 
     /// The HR image, where there is one, and the LR image.
-    fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LowResolution)> {
+    fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
         let image = frame.photograph().bad_input(frame_name(frame))?;
         if !self.making.has_truth {
-            return Ok((None, LowResolution::Bytes(image)));
+            return Ok((None, LrImage::Bytes(image)));
         }
         let (hr, lr) = degrade(&image, &self.sizes_of(&frame.intrinsics()), self.making.kernel);
         Ok((Some(hr), lr))
@@ -595,7 +595,7 @@ impl Job<'_> {
         }
     }
 
-    fn write_high(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
+    fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
         write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image).map_err(Into::into)
     }
 
@@ -604,17 +604,17 @@ impl Job<'_> {
     }
 
     /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
-    fn low_mask(&self, mask: &Mask, image: &LowResolution) -> Mask {
+    fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
         let size = image.size();
         let around = if size == (mask.width, mask.height) { 0 } else { degrade::mask_reach(self.making.kernel) };
         mask.resized(size, around)
     }
 
-    fn write_low(&self, folder: &str, name: &str, image: &LowResolution) -> anyhow::Result<()> {
+    fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
         let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.making.kernel)))?;
         match image {
-            LowResolution::Bytes(image) => write_png(&path, image)?,
-            LowResolution::Floats(image) => {
+            LrImage::Bytes(image) => write_png(&path, image)?,
+            LrImage::Floats(image) => {
                 let channels = ["R", "G", "B", "A"].map(|name| Channel { name, sample_type: SampleType::Float });
                 write_exr(
                     &path,

@@ -130,7 +130,7 @@ impl Registered {
 
 /// The LR photograph of a view, or the only one there is.
 fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
-    Ok(match view.read_low_resolution(input)? {
+    Ok(match view.read_lr(input)? {
         Some(photograph) => Some(photograph),
         None => view.read_photograph(input)?,
     })

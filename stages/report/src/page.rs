@@ -183,7 +183,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
             let image = file.as_ref().map(|f| colour(folder, f, background)).transpose()?;
             Ok(image.map(|i| (shown_in_gallery(&i), i.width)))
         };
-        let low = embedded(&truth, &true_view.low_resolution, truths.background)?;
+        let lr = embedded(&truth, &true_view.low_resolution, truths.background)?;
         let found = embedded(&rendered, &view.image, views.background)?;
         let expected = embedded(&truth, &true_view.image, truths.background)?;
         let map = |key: &str| -> anyhow::Result<Option<String>> {
@@ -205,7 +205,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         rows.push(html! {
             h3 { "View " (name) " " small { "PSNR " (number("/psnr", 2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr", 2)) " dB" } }
             div class="row" {
-                (figure("lr", low.clone().map(|l| l.0), caption("LR", &low)))
+                (figure("lr", lr.clone().map(|l| l.0), caption("LR", &lr)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
                 (figure("px", error, if expected.is_some() { "error" } else { "error at LR" }.to_owned()))

@@ -105,7 +105,7 @@ mod tests {
         Photographs { views, images: vec![image.into()] }
     }
 
-    fn fine() -> Image {
+    fn hr() -> Image {
         let sample = |i: usize| {
             let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
             0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
@@ -115,18 +115,18 @@ mod tests {
 
     #[test]
     fn exposures_are_taken_back_and_other_images_are_left_out() {
-        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
+        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr()));
         let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
             let said = std::cell::RefCell::new(String::new());
-            let mut image = fine();
+            let mut image = hr();
             image.data.iter_mut().for_each(|v| *v = change(*v));
             let kept = checked(photographs(name, image), &lr(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
             (kept.images.into_iter().next().map(|p| p.image), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);
-        assert!(same.unwrap().data == fine().data && views == 1 && said.is_empty(), "{said}");
+        assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
         let (dark, views, said) = checked("a", &|v| 0.6 * v + 0.1);
-        let off = dark.unwrap().data.iter().zip(&fine().data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let off = dark.unwrap().data.iter().zip(&hr().data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"), "{off} {said}");
         let (other, views, said) = checked("a", &|v| 1.0 - v);
         assert!(other.is_none() && views == 0 && said.contains("left out"), "{said}");
@@ -170,12 +170,12 @@ mod tests {
     #[test]
     fn exposures_are_taken_back_from_under_alpha() {
         let image = |gain: f32, offset: f32| {
-            let fine = fine();
+            let hr = hr();
             let pixel = |(i, p): (usize, &[f32])| {
                 let alpha = [1.0, 0.5, 0.0][(i % 32 / 4) % 3];
                 [0, 1, 2].map(|c| alpha * (gain * p[c] + offset)).into_iter().chain([alpha])
             };
-            Image::new(32, 32, 4, fine.data.chunks_exact(3).enumerate().flat_map(pixel).collect())
+            Image::new(32, 32, 4, hr.data.chunks_exact(3).enumerate().flat_map(pixel).collect())
         };
         let mut dark = image(0.6, 0.1);
         Exposure { gain: [0.6; 3], offset: [0.1; 3] }.take_back(&mut dark);

@@ -540,7 +540,7 @@ mod tests {
         }
     }
 
-    fn fine_image(width: usize, height: usize) -> Image {
+    fn hr_image(width: usize, height: usize) -> Image {
         let sample = |i: usize| (60 + (i * 37 + i / 7 * 11) % 130) as f32 / 255.0;
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
@@ -634,7 +634,7 @@ mod tests {
     /// Once the field renders the true HR image, the kernel is content: no loss and no gradient. The average isn't.
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
-        let truth = fine_image(10, 8);
+        let truth = hr_image(10, 8);
         let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
         let worst = |kind| {
             let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
@@ -745,11 +745,11 @@ mod tests {
         let given = |name: &str, width: usize, height: usize| {
             let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-            Photographs { views, images: vec![fine_image(width, height).into()] }
+            Photographs { views, images: vec![hr_image(width, height).into()] }
         };
         // The last column of blocks overlaps the one before it.
         let (width, height) = (9, 8);
-        let truth = fine_image(width, height);
+        let truth = hr_image(width, height);
         let camera = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
             let mut joined = Supersampling::new(given("a", 5, 4), Some(given("a", width, height)), &options(kind, [2.0, 2.0]));
@@ -800,8 +800,8 @@ mod tests {
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // Of a larger one no more is drawn.
-        let large = Supersampling::new(given("a", 5, 4), Some(given("a", 20, 16)), &options(Supervision::Kernel, [2.0, 2.0]));
-        assert_eq!(large.pixels, 20 + 80);
+        let larger = Supersampling::new(given("a", 5, 4), Some(given("a", 20, 16)), &options(Supervision::Kernel, [2.0, 2.0]));
+        assert_eq!(larger.pixels, 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);

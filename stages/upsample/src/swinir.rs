@@ -42,7 +42,7 @@ enum Head {
     /// Shuffled at once; the lightweight models.
     Direct { up: Conv, by: i64 },
     /// Pixels repeated and filtered; the real-world models.
-    Repeated { before: Conv, steps: Vec<Conv>, high: Conv, last: Conv },
+    Repeated { before: Conv, steps: Vec<Conv>, hr: Conv, last: Conv },
 }
 
 /// Attention within windows, then a network of two layers, each added to what came in.
@@ -100,8 +100,8 @@ impl Network for SwinIr {
             x = group.forward(&x, self.window, &mask)?;
         }
         let deep = self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
-        let large = self.head.forward(&deep)?.f_add(&mean)?;
-        large.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
+        let hr = self.head.forward(&deep)?.f_add(&mean)?;
+        hr.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
     }
 }
 
@@ -182,8 +182,8 @@ impl Head {
         if weights.has("conv_up1.weight") {
             let steps = count(weights, 1, |i| format!("conv_up{i}.weight"));
             let read = (1..=steps).map(|i| conv(&format!("conv_up{i}"), middle, middle)).collect::<Result<Vec<_>, _>>()?;
-            let high = conv("conv_hr", middle, middle)?;
-            return Ok((Self::Repeated { before, steps: read, high, last }, 1 << steps.min(8)));
+            let hr = conv("conv_hr", middle, middle)?;
+            return Ok((Self::Repeated { before, steps: read, hr, last }, 1 << steps.min(8)));
         }
         let (mut scale, mut steps) = (1, Vec::new());
         for i in 0..count(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
@@ -205,13 +205,13 @@ impl Head {
                 }
                 last.forward(&x, 1, 1)
             }
-            Self::Repeated { before, steps, high, last } => {
+            Self::Repeated { before, steps, hr, last } => {
                 let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
                 for conv in steps {
                     let repeated = x.f_repeat_interleave_self_int(2, 2, None)?.f_repeat_interleave_self_int(2, 3, None)?;
                     x = leaky(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
                 }
-                last.forward(&leaky(&high.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
+                last.forward(&leaky(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
             }
         }
     }

@@ -204,15 +204,15 @@ mod tests {
     #[test]
     fn inverse_undoes_the_map() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
-            for (fine, coarse) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
-                let map = AxisTaps::new(filter, fine, coarse);
+            for (hr, lr) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
+                let map = AxisTaps::new(filter, hr, lr);
                 let inverse = map.inverse(40);
-                let scale = fine as f32 / coarse as f32;
-                for a in 0..coarse {
-                    for b in 0..coarse {
-                        let entry: f32 = (0..fine).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
+                let scale = hr as f32 / lr as f32;
+                for a in 0..lr {
+                    for b in 0..lr {
+                        let entry: f32 = (0..hr).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
                         let expected = f32::from(u8::from(a == b));
-                        assert!((entry - expected).abs() < 0.06, "{filter:?} {fine} → {coarse}: {a} {b} {entry}");
+                        assert!((entry - expected).abs() < 0.06, "{filter:?} {hr} → {lr}: {a} {b} {entry}");
                     }
                 }
             }

@@ -293,14 +293,14 @@ mod tests {
             prop_assert!(camera.project(ray.at(-t)).is_none());
         }
 
-        /// A half-pixel shift would show here: the s×s pixels of a finer image have their mean at the coarse pixel's centre.
+        /// A half-pixel shift would show here: the s×s pixels of an HR image have their mean at the LR pixel's centre.
         #[test]
         fn resizing_keeps_pixel_footprints(i in 0u32..37, j in 0u32..23, s in 1u32..6) {
-            let coarse = camera(DVec3::Z, 0.3, DVec3::ONE);
-            let fine = coarse.resized(37 * s, 23 * s);
+            let lr = camera(DVec3::Z, 0.3, DVec3::ONE);
+            let hr = lr.resized(37 * s, 23 * s);
             for (corner_x, corner_y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
                 let (x, y) = (f64::from(i + corner_x), f64::from(j + corner_y));
-                let difference = coarse.ray(x, y).direction - fine.ray(x * f64::from(s), y * f64::from(s)).direction;
+                let difference = lr.ray(x, y).direction - hr.ray(x * f64::from(s), y * f64::from(s)).direction;
                 prop_assert!(difference.length() < 1e-12);
             }
             let offsets: f64 = (0..s).map(|a| (f64::from(i * s + a) + 0.5) / f64::from(s)).sum();

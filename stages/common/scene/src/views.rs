@@ -63,7 +63,7 @@ impl View {
     }
 
     /// The same at low resolution; a pixel of it counts where all that lies under it does.
-    pub fn read_low_resolution(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+    pub fn read_lr(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.low_resolution else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
         let mask = self.mask.as_ref().map(|file| read_png(&input.path(file))).transpose()?;
