@@ -379,7 +379,7 @@ fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Op
     let on = match truth.background {
         Background::Black => "black",
         Background::White | Background::Alpha => "white",
-        Background::Opaque => "none: the images are opaque",
+        Background::Opaque => "none: the pictures are opaque",
     };
     MetricConventions {
         background: on.to_owned(),
@@ -389,11 +389,11 @@ fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Op
             .to_owned(),
         lpips: perceptual.convention(),
         depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
-        warp: "the true image of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
+        warp: "the true picture of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
                both see the same surface (depths within 2 %, or within a pixel as the view sees them; opacity at least one half)"
             .to_owned(),
         low_resolution: format!(
-            "the render shrunk by {}, against the view's LR image",
+            "the render shrunk by {}, against the view's LR picture",
             made.map_or_else(|| "a box, for want of a better guess".to_owned(), |d| format!("{:?}", d.kernel).to_lowercase())
         ),
         error_maps: format!("mean absolute error of R, G, B; brightest at {}", params.error_range),

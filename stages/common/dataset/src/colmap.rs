@@ -104,7 +104,7 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
         return Err(DatasetError::format(&list, reason));
     }
     if let Some(first) = missing.first() {
-        notes.push(format!("{} of {} images have no file and are left out, first {first}", missing.len(), model.images.len()));
+        notes.push(format!("{} of {} images have no picture and are left out, first {first}", missing.len(), model.images.len()));
     }
     for (frame, name) in frames.iter_mut().zip(names(&list, &files)?) {
         frame.name = name;
@@ -502,7 +502,7 @@ mod tests {
             assert!(message.contains(words), "{message}");
         }
         let gone = reads(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
-        assert!(gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no file"), "{:?}", gone.notes);
+        assert!(gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"), "{:?}", gone.notes);
         let forged = reads(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
         assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
         let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();

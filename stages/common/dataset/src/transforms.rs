@@ -77,7 +77,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let Read { frames, missing, split } = read_file(folder, &path, Missing::LeftOut)?.not_empty(&path)?;
     let mut notes = vec![format!("transforms.json (instant-ngp, nerfstudio): {}", counted(frames.len(), "photograph"))];
     if let (Some(first), count) = missing {
-        notes.push(format!("{count} of {} frames have no image and are left out, first {first}", frames.len() + count));
+        notes.push(format!("{count} of {} frames have no picture and are left out, first {first}", frames.len() + count));
     }
     let masked = frames.iter().filter(|f| f.mask.is_some()).count();
     if masked > 0 {
@@ -282,7 +282,7 @@ mod tests {
         assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
         assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
         assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
-        assert!(set.notes.iter().any(|n| n.contains("1 of 3 frames have no image") && n.contains("gone.png")), "{:?}", set.notes);
+        assert!(set.notes.iter().any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")), "{:?}", set.notes);
     }
 
     /// Numbers for the original hold for a smaller copy of it.
