@@ -10,7 +10,7 @@ Methods:
     nerf-epochs   the same with as many epochs: a pixel is seen as often, by one ray instead of four
     bicubic, imdn, liif, swinir
                   plain NeRF rendered at LR, enlarged by a 2-D method (upsample)
-    ss            ours: supersampling, the mean of sub-rays as in the paper
+    ss            ours: supersampling, the mean of sub-pixel rays as in the paper
     kernel        ours: supersampling through the known kernel
     refine        ours: kernel, refined by a network that learnt from the same LR images
     hr            trained on HR images: what could be reached

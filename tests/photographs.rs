@@ -235,7 +235,7 @@ fn exposures_are_found() {
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
 }
 
-/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets fog.
+/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets floaters.
 #[test]
 fn lenses_are_followed_or_undone() {
     let project = Project::tiny();

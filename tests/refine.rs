@@ -98,7 +98,7 @@ fn a_block_follows_the_one_it_extends() {
 
 /// In the paper's split all views are trained on, so each one's LR image is known; where views are withheld, none is.
 #[test]
-fn views_agree_with_their_own_photographs() {
+fn views_are_consistent_with_their_own_photographs() {
     let project = project();
     let at_lr = |more: &[&str]| -> Vec<f64> {
         project.ok(&[&["run", "refined"], more].concat());
@@ -118,7 +118,7 @@ fn views_agree_with_their_own_photographs() {
     let papers = at_lr(&["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
     assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
-    // The network has learnt on views that agree, too; what hasn't is said to be another task.
+    // The network has learnt on consistent views, too; what hasn't is said to be another task.
     assert!(is_trained_so(&["-p", "split=paper"]) && !is_trained_so(&[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
@@ -128,10 +128,10 @@ fn views_agree_with_their_own_photographs() {
         .args([("views", &views), ("refiner", &refiner)].map(|(input, folder)| format!("--input={input}={}", folder.display())));
     let alone = Finished::of(command.output().unwrap());
     assert_eq!(alone.code, 0, "{}", alone.stderr);
-    assert!(alone.stderr.contains("trained on views that agree with LR photographs of their own"), "{}", alone.stderr);
+    assert!(alone.stderr.contains("trained on views consistent with LR photographs of their own"), "{}", alone.stderr);
 }
 
-/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and agrees with the photograph.
+/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and is consistent with the photograph.
 #[test]
 fn views_are_means_with_their_enlarged_photographs() {
     let project = project();

@@ -8,7 +8,7 @@
 //! What a network that learnt from other images makes of a view's own photograph (input `enlarged`) errs in another way: the mean of both is taken.
 //!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
-//! as it takes to agree with that; before, too, where the network learnt on views that do.
+//! as it takes to be consistent with that; before, too, where the network learnt on views that are.
 //!
 //! Colours change; opacity, depth and cameras stay what the field made them.
 
@@ -65,7 +65,7 @@ impl Stage for Refine {
             ("reference-views", Input::optional(&["views"], "those views as rendered")),
             (
                 "photographs",
-                Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made to agree with its own"),
+                Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made consistent with its own"),
             ),
             (
                 "enlarged",
@@ -92,7 +92,7 @@ impl Stage for Refine {
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.max_references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(LrObservations::read).transpose()?;
-        // Those that the network learnt by agreed, too.
+        // Those that the network learnt by were consistent, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
             let consistent =
                 |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.make_consistent(rendered)?, truth });
@@ -129,7 +129,7 @@ impl Stage for Refine {
             progress.add(1);
         }
         if job.takes_consistent && consistent < views.views.len() {
-            context.say("the network was trained on views that agree with LR photographs of their own, which some of these haven't: train one without");
+            context.say("the network was trained on views consistent with LR photographs of their own, which some of these haven't: train one without");
         }
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
@@ -250,10 +250,10 @@ impl AnyRefiner {
     }
 }
 
-/// Something must be wrong with a reference that is trusted with less than this share of what those of the rehearsal were.
+/// Something must be wrong with a reference whose confidence is less than this share of that in those of the downscaled field.
 const LITTLE: f64 = 0.75;
 
-/// Unless it is trusted so many times as much as with all depths nearer or farther by that share.
+/// Unless the confidence in it is so many times as high as with all depths nearer or farther by that share.
 const SENSITIVE: f64 = 1.1;
 const ELSEWHERE: f32 = 0.1;
 
@@ -343,8 +343,8 @@ impl RefineJob<'_> {
         }
     }
 
-    /// Leaves references out that look otherwise than what is rendered: those that are trusted with less than a share of what they see, unless they would
-    /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
+    /// Leaves references out that look otherwise than what is rendered: those in which confidence is less than a share of what they see, unless it would
+    /// be clearly less still were all depths others. Then depths are right, and confidence is low for another reason: seen from
     /// far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
         let confidence = self.confidence(&self.references, views, guidance, 1.0)?;
@@ -363,7 +363,7 @@ impl RefineJob<'_> {
             }
             let name = &reference.rendered.camera.name;
             self.context.say(format!(
-                "reference {name} looks otherwise than what is rendered ({:.0} % agree) and is left out: wrong depth, a wrong pose, or \
+                "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and is left out: wrong depth, a wrong pose, or \
                  something that moved?",
                 100.0 * share
             ));
@@ -371,7 +371,7 @@ impl RefineJob<'_> {
         Ok(())
     }
 
-    /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
+    /// Confidence in each reference, as a share of what it sees of some views spread over all, were depths so many times what they are.
     fn confidence(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];

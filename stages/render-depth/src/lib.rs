@@ -187,7 +187,7 @@ impl RenderJob<'_> {
     }
 }
 
-/// The middle one of the sub-rays' distances, and its z-depth per distance: a mean would invent a surface between two.
+/// The middle one of the sub-pixel rays' distances, and its z-depth per distance: a mean would invent a surface between two.
 fn middle(distances: &mut [(f32, f32)]) -> (f32, f32) {
     distances.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
     distances[(distances.len() - 1) / 2]

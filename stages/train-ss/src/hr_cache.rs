@@ -143,7 +143,7 @@ impl HrCache {
         own
     }
 
-    /// Remembers the fresh sub-rays of an LR pixel.
+    /// Remembers the fresh sub-pixel rays of an LR pixel.
     pub(crate) fn remember(&mut self, view: usize, x: usize, y: usize, colours: &[[f32; 3]]) {
         // A block at the edge may lie off its LR pixel's centre.
         const REACH: usize = HrCache::REACH + 1;

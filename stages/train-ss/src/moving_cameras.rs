@@ -16,7 +16,7 @@ pub(crate) struct MovingCameras {
 /// Rounds of a training.
 const ROUNDS: u32 = 24;
 /// Shares of the training at the first and after the last round. It begins early, before the field has explained photographs that don't fit
-/// by haze, and ends before weights are averaged.
+/// by floaters, and ends before weights are averaged.
 const FIRST: f64 = 0.02;
 const LAST: f64 = 0.7;
 /// Share at which photographs are compared at their own size; before it at smaller ones, since a field that isn't sharp yet pulls from afar.

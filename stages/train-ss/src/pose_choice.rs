@@ -2,7 +2,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use pixels::{Image, psnr_of};
-use poses::{Shot, disagreement};
+use poses::{Shot, photometric_error};
 use scene::Camera;
 
 use crate::field_trainer::read;
@@ -70,6 +70,6 @@ impl<'a> Judge<'a> {
         let shots = cameras.iter().zip(&self.photographs).enumerate();
         let shots: Vec<Shot<'_>> =
             shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
-        disagreement(&*field, &shots, self.background).map_err(|e| anyhow::anyhow!(e))
+        photometric_error(&*field, &shots, self.background).map_err(|e| anyhow::anyhow!(e))
     }
 }

@@ -20,7 +20,7 @@ use crate::order::{Focus, detailed, shuffled};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Supervision {
-    /// The mean of its sub-rays, whatever made the LR images: the paper's (eq. 4).
+    /// The mean of its sub-pixel rays, whatever made the LR images: the paper's (eq. 4).
     Average,
     /// The same, with the LR images filtered once so that they look as if averaging had made them.
     Refiltered,
@@ -38,15 +38,15 @@ pub enum Order {
     Epochs,
 }
 
-/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-rays are cast through it.
+/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel rays are cast through it.
 ///
 /// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
 /// y + (A - K)·Uy, where A averages, K is the operator that made the LR images y, and U enlarges. `kernel` minimises the
 /// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
 /// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
-/// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
+/// sub-pixel ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
 ///
-/// Of an HR reference a block of pixels is drawn at a time, one for each sub-ray to meet, and altogether four times as many blocks as an LR image has
+/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and altogether four times as many blocks as an LR image has
 /// pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
@@ -55,7 +55,7 @@ pub struct Supersampling {
     lr_views: usize,
     pixels: u64,
     background: Background,
-    /// Sub-rays along x and y, when all are cast and now.
+    /// Sub-pixel rays along x and y, when all are cast and now.
     full: [usize; 2],
     side: [usize; 2],
     supersample_warmup: f64,
@@ -115,7 +115,7 @@ pub struct SupersamplingOptions {
     pub scale: [f64; 2],
     /// The filter that made the LR images.
     pub filter: Filter,
-    /// Share of the training during which fewer sub-rays are cast.
+    /// Share of the training during which fewer sub-pixel rays are cast.
     pub supersample_warmup: f64,
     /// In which order pixels are drawn.
     pub order: Order,
@@ -228,7 +228,7 @@ impl Supersampling {
         }
     }
 
-    /// Sub-rays of an LR pixel along x and y, once all are cast.
+    /// Sub-pixel rays of an LR pixel along x and y, once all are cast.
     pub fn full_side(&self) -> [usize; 2] {
         self.full
     }
@@ -407,7 +407,7 @@ fn block_means(image: &Image, block: [usize; 2]) -> Image {
     Image::new(width, height, image.channels, data)
 }
 
-/// How often the sub-rays along a side double before all are cast: as many stages has the coarse share of the rays.
+/// How often the sub-pixel rays along a side double before all are cast: as many stages has the warm-up of the rays.
 pub(crate) fn warmup_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
@@ -432,7 +432,7 @@ impl radiance::Supervisor for Supersampling {
         let view = &self.views[index];
         let background = self.behind(bundle);
         let (x, y) = (pixel % view.image.width, pixel / view.image.width);
-        // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
+        // Where the sub-pixel rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.hr) {
             (Some(cache), _) => cache.block_in_pixels(index, x, y),
             (None, Some(hr)) => {
@@ -559,9 +559,9 @@ mod tests {
         (Supersampling::new(photographs, None, &options(supervision, scale)), camera)
     }
 
-    /// The sub-rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
+    /// The sub-pixel rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
     #[test]
-    fn sub_rays_are_the_finer_cameras_pixel_rays() {
+    fn sub_pixel_rays_are_the_finer_cameras_pixel_rays() {
         let cases = [
             (Supervision::Average, [3.0, 3.0]),
             (Supervision::Kernel, [3.0, 3.0]),
@@ -676,9 +676,9 @@ mod tests {
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
-    /// 1, 2, 4 … sub-rays a side, each for an equal part of the coarse share, and then all.
+    /// 1, 2, 4 … sub-pixel rays a side, each for an equal part of the warm-up, and then all.
     #[test]
-    fn sub_rays_double_until_all_are_cast() {
+    fn sub_pixel_rays_double_until_all_are_cast() {
         let rays_at = |scale: f64, done: f64| {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
             supersampling.supersample_warmup = 0.3;
@@ -738,7 +738,7 @@ mod tests {
         assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
     }
 
-    /// References join LR images as they are: whatever made those, each sub-ray is a reference's pixel, and all are met by some.
+    /// References join LR images as they are: whatever made those, each sub-pixel ray is a reference's pixel, and all are met by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
@@ -767,7 +767,7 @@ mod tests {
                     (0..72).find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6).expect("a pixel's ray")
                 });
                 pixels.iter().for_each(|&pixel| seen[pixel] = true);
-                // A tenth too bright in the last sub-ray's red, and right in all else.
+                // A tenth too bright in the last sub-pixel ray's red, and right in all else.
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
@@ -780,7 +780,7 @@ mod tests {
                 joined.remember(bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
-            // With fewer sub-rays they meet the block's mean together.
+            // With fewer sub-pixel rays they meet the block's mean together.
             joined.supersample_warmup = 0.5;
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();

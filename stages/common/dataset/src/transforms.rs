@@ -282,7 +282,11 @@ mod tests {
         assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
         assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
         assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
-        assert!(set.notes.iter().any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")), "{:?}", set.notes);
+        assert!(
+            set.notes.iter().any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")),
+            "{:?}",
+            set.notes
+        );
     }
 
     /// Numbers for the original hold for a smaller copy of it.

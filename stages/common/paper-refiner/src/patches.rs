@@ -171,7 +171,7 @@ mod tests {
         KnownView { rendered, truth: image(width as usize, height as usize, 3) }
     }
 
-    /// Before a wall, all pixels of a patch agree on where a reference shows it; a reference that doesn't look there has none.
+    /// Before a wall, a reference shows all pixels of a patch at one place; a reference that doesn't look there has none.
     #[test]
     fn reference_patches_show_the_same_place() {
         let (view, right, away) = (known(0.0), known(20.0), known(400.0));

@@ -2,7 +2,7 @@
 //!
 //! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
 //! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
-//! * [`Moved`]: how far cameras have gone, in words for a log; [`disagreement`]: whether that was for the better.
+//! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that was for the better.
 //! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
 //!
 //! A photograph's own gradient says how each of its pixels would change if what it shows moved in the image, and the rendered depth how
@@ -27,7 +27,7 @@
 //! assert!(found == camera && before == after);
 //! ```
 
-mod agreement;
+mod photometric;
 
 use std::error::Error;
 use std::fmt;
@@ -38,7 +38,7 @@ use pixels::{Filter, Image, Resampling};
 use radiance::{Ray, RayField};
 use scene::Camera;
 
-pub use agreement::{Shot, disagreement};
+pub use photometric::{Shot, photometric_error};
 
 /// A photograph at several sizes.
 #[derive(Clone, Debug)]

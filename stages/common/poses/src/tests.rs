@@ -133,7 +133,7 @@ fn moved_cameras_come_back() {
     }
 }
 
-/// What says nothing moves nothing: grey walls, unknown pixels, a field of fog, numbers that aren't.
+/// What says nothing moves nothing: grey walls, unknown pixels, a semi-transparent field, numbers that aren't.
 #[test]
 fn what_says_nothing_moves_nothing() {
     struct Everywhere(Pixel);
@@ -199,9 +199,9 @@ fn common_motion_is_taken_back() {
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
 }
 
-/// By the true surfaces photographs agree from where they were taken, and not from beside; exposures that are known are no difference.
+/// By the true surfaces the photometric error is small from where photographs were taken, and not from beside; exposures that are known are no difference.
 #[test]
-fn photographs_agree_from_where_they_were_taken() {
+fn photometric_error_is_least_from_where_photographs_were_taken() {
     let cameras: Vec<Camera> = (0..6).map(camera).collect();
     let mut photographs: Vec<Image> = cameras.iter().map(photograph).collect();
     photographs[2].data.iter_mut().for_each(|v| *v *= 0.5);
@@ -211,7 +211,7 @@ fn photographs_agree_from_where_they_were_taken() {
         let shots = cameras.iter().zip(&photographs).enumerate();
         let shots: Vec<Shot> =
             shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
-        disagreement(&BallAndWall, &shots, 1.0).unwrap()
+        photometric_error(&BallAndWall, &shots, 1.0).unwrap()
     };
     let right = judged(&cameras, &exposure).unwrap();
     assert!(right < 3e-4, "{right}");
@@ -221,6 +221,6 @@ fn photographs_agree_from_where_they_were_taken() {
     let wrong = judged(&off, &exposure).unwrap();
     assert!(wrong > 5.0 * right, "{wrong} {right}");
     assert!(judged(&cameras, &|_| [1.0; 3]).unwrap() > 5.0 * right);
-    // One alone has nobody to agree with.
+    // One alone has none to be compared with.
     assert_eq!(judged(&cameras[..1], &exposure), None);
 }

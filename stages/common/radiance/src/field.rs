@@ -173,7 +173,7 @@ pub enum FieldError {
 pub(crate) const CHUNK_RAYS: usize = 64;
 
 impl Field {
-    /// A field before training: faint fog, drawn from a seed.
+    /// A field before training: faint density, drawn from a seed.
     pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
         let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {

@@ -62,10 +62,10 @@ pub struct RefinerFile {
     pub rendered_psnr: f64,
     /// Mean PSNR of those views refined, in dB.
     pub refined_psnr: f64,
-    /// Share of what references saw of those views that they were trusted with, where the network knows references.
+    /// Confidence in references, as a share of what they saw of those views, where the network knows references.
     #[serde(default)]
     pub trusted: Option<f64>,
-    /// Whether the network takes views that agree with LR photographs of their own.
+    /// Whether the network takes views that are consistent with LR photographs of their own.
     #[serde(default)]
     pub agreeing: bool,
 }
@@ -304,7 +304,7 @@ mod tests {
         }
     }
 
-    /// A rehearsal with little to learn pushes features below 0 everywhere. What the network adds must still follow what it sees, or it would never
+    /// Internal learning from little pushes features below 0 everywhere. What the network adds must still follow what it sees, or it would never
     /// learn again.
     #[test]
     fn a_network_does_not_fall_silent() {

@@ -126,9 +126,9 @@ impl ReferenceFeatures {
                 });
                 // The best counts most. What has no confidence fades, as if it weren't seen.
                 let weight = confidence.powi(4);
-                let agrees = confidence / visibility.max(f32::MIN_POSITIVE);
-                (0..3).for_each(|c| sum[c] += weight * agrees * difference[c]);
-                (0..3).for_each(|c| lacks[c] += weight * agrees * lacking[c]);
+                let share = confidence / visibility.max(f32::MIN_POSITIVE);
+                (0..3).for_each(|c| sum[c] += weight * share * difference[c]);
+                (0..3).for_each(|c| lacks[c] += weight * share * lacking[c]);
                 *weights += weight;
                 *best = best.max(confidence);
             }

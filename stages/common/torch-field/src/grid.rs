@@ -353,7 +353,7 @@ mod tests {
         difference / norm(&mut judge.iter().map(|&b| f64::from(b))).max(1e-12)
     }
 
-    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and hashed levels, thin fog and
+    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and hashed levels, faint density and
     /// walls, and the same field on a GPU where there is one.
     #[test]
     fn agrees_with_the_hand_written_field() {
