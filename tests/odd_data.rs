@@ -1,5 +1,5 @@
-//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used, what can't be is refused by a line
-//! that names it, and what is likely wrong is warned of.
+//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used, what can't be is refused by
+//! a line that names it, and what is likely wrong is warned of.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;

@@ -1,4 +1,5 @@
-//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR images.
+//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR
+//! images.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;

@@ -131,7 +131,8 @@ fn views_are_consistent_with_their_own_photographs() {
     assert!(alone.stderr.contains("trained on views consistent with LR photographs of their own"), "{}", alone.stderr);
 }
 
-/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and is consistent with the photograph.
+/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and is consistent with the
+/// photograph.
 #[test]
 fn views_are_means_with_their_enlarged_photographs() {
     let project = project();
@@ -399,8 +400,8 @@ fn references_join_a_training() {
     };
     println!("{:.2} dB from LR images, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
-    // Half as many rays do, where the training goes on from what LR images gave and both fields, or their weights' mean, are kept. Few rays, or one
-    // reference alone, lose nothing of that.
+    // Half as many rays do, where the training goes on from what LR images gave and both fields, or their weights' mean, are
+    // kept. Few rays, or one reference alone, lose nothing of that.
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
         let on = |rays: &str, references: &str| {

@@ -29,8 +29,8 @@ pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Op
     Ok((whole && image.channel("Z").is_some() && image.channel("A").is_some()).then_some(image))
 }
 
-/// Brings the neighbour's image over to a view and compares. The image shows what was brought over; what the neighbour doesn't see is
-/// red. Images have the sizes of the views. `None` where it sees nothing.
+/// Brings the neighbour's image over to a view and compares. The image shows what was brought over; what the neighbour doesn't
+/// see is red. Images have the sizes of the views. `None` where it sees nothing.
 pub(crate) fn warp(view: (&Camera, &ExrImage, &Image), other: (&Camera, &ExrImage, &Image)) -> Option<(WarpScore, Rgba8)> {
     const UNSEEN: [u8; 4] = [120, 20, 30, 255];
     let from = surface(view.0, view.1)?;

@@ -1,11 +1,12 @@
 //! `refine`: gives rendered views the detail they systematically lack, by a network that `train-refine` trained.
 //!
-//! A network that was trained with references takes them from the inputs `references` (true images at HR) and `reference-views` (the
-//! same views as rendered, for what the field sees where).
+//! A network that was trained with references takes them from the inputs `references` (true images at HR) and `reference-views`
+//! (the same views as rendered, for what the field sees where).
 //!
 //! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches instead of adding to the view.
 //!
-//! What a network that learnt from other images makes of a view's own photograph (input `enlarged`) errs in another way: the mean of both is taken.
+//! What a network that learnt from other images makes of a view's own photograph (input `enlarged`) errs in another way: the
+//! mean of both is taken.
 //!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
 //! as it takes to be consistent with that; before, too, where the network learnt on views that are.
@@ -203,7 +204,8 @@ impl<'a> Enlarged<'a> {
         Ok(Self { input, views: Views::read(input)? })
     }
 
-    /// The mean of an image and what was made of the same camera's photograph, where its mask leaves it; the image where there is none.
+    /// The mean of an image and what was made of the same camera's photograph, where its mask leaves it; the image where there
+    /// is none.
     fn mean(&self, mut image: Image, camera: &Camera) -> anyhow::Result<Image> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(image) };
         let place = || format!("input enlarged: view {}", camera.name);
@@ -343,9 +345,9 @@ impl RefineJob<'_> {
         }
     }
 
-    /// Leaves references out that look otherwise than what is rendered: those in which confidence is less than a share of what they see, unless it would
-    /// be clearly less still were all depths others. Then depths are right, and confidence is low for another reason: seen from
-    /// far aside, surfaces look otherwise.
+    /// Leaves references out that look otherwise than what is rendered: those in which confidence is less than a share of what
+    /// they see, unless it would be clearly less still were all depths others. Then depths are right, and confidence is low for
+    /// another reason: seen from far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
         let confidence = self.confidence(&self.references, views, guidance, 1.0)?;
         let references = std::mem::take(&mut self.references);
@@ -371,7 +373,8 @@ impl RefineJob<'_> {
         Ok(())
     }
 
-    /// Confidence in each reference, as a share of what it sees of some views spread over all, were depths so many times what they are.
+    /// Confidence in each reference, as a share of what it sees of some views spread over all, were depths so many times what
+    /// they are.
     fn confidence(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];

@@ -4,7 +4,8 @@ use scene::Intrinsics;
 
 use super::*;
 
-/// A painted wall. Images of fewer pixels than `whole` show it shifted; those of more say nothing of depth, so that nothing moves by them.
+/// A painted wall. Images of fewer pixels than `whole` show it shifted; those of more say nothing of depth, so that nothing
+/// moves by them.
 struct Wall {
     whole: usize,
     shift: f64,

@@ -245,7 +245,8 @@ mod tests {
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any scale, also where the block is news.
+    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any scale, also where the block
+    /// is news.
     #[test]
     fn back_projections_are_the_operators_own() {
         for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {

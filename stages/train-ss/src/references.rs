@@ -12,8 +12,8 @@ const OPAQUE: f32 = 1.0 - 1e-4;
 /// References as they should join a training: of one with an LR photograph of its own the exposure is that photograph's, and it is left out where it
 /// shows something else. What was done is said. `kernel` made the LR photographs.
 ///
-/// Images with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the border of a thing
-/// would look like another exposure, since stored images have none of that.
+/// Images with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the
+/// border of a thing would look like another exposure, since stored images have none of that.
 pub(crate) fn checked(
     mut references: Photographs,
     photographs: &Photographs,

@@ -40,14 +40,15 @@ pub enum Order {
 
 /// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel rays are cast through it.
 ///
-/// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
-/// y + (A - K)·Uy, where A averages, K is the operator that made the LR images y, and U enlarges. `kernel` minimises the
-/// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
+/// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with y +
+/// (A - K)·Uy, where A averages, K is the operator that made the LR images y, and U enlarges. `kernel` minimises the squared
+/// distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
 /// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
-/// sub-pixel ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
+/// sub-pixel ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more,
+/// learns slower.)
 ///
-/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and altogether four times as many blocks as an LR image has
-/// pixels.
+/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and altogether four times as
+/// many blocks as an LR image has pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
@@ -135,8 +136,8 @@ pub struct SupersamplingOptions {
 const PIXEL: u64 = 100;
 const BACKGROUND: u64 = 101;
 
-/// How many times as often something of a reference is drawn as of an LR image. On a small demo scene, six of twelve views at HR, there are 21.66 dB
-/// without them, 21.63 and 22.12 with 1 and 4.
+/// How many times as often something of a reference is drawn as of an LR image. On a small demo scene, six of twelve views at
+/// HR, there are 21.66 dB without them, 21.63 and 22.12 with 1 and 4.
 const REFERENCE_DRAWS: u64 = 4;
 
 /// Draws until one is of a pixel that counts; after so many the last is taken, and has no residual.
@@ -407,7 +408,7 @@ fn block_means(image: &Image, block: [usize; 2]) -> Image {
     Image::new(width, height, image.channels, data)
 }
 
-/// How often the sub-pixel rays along a side double before all are cast: as many stages has the warm-up of the rays.
+/// How often the sub-pixel rays along a side double before all are cast: as many stages has the warm-up.
 pub(crate) fn warmup_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
@@ -738,7 +739,8 @@ mod tests {
         assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
     }
 
-    /// References join LR images as they are: whatever made those, each sub-pixel ray is a reference's pixel, and all are met by some.
+    /// References join LR images as they are: whatever made those, each sub-pixel ray is a reference's pixel, and all are met
+    /// by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);

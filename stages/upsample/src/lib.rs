@@ -1,5 +1,5 @@
-//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone: the baselines of the paper's tables, and
-//! the training photographs at HR size, which `refine` takes the mean with.
+//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone: the baselines of the
+//! paper's tables, and the training photographs at HR size, which `refine` takes the mean with.
 //!
 //! * `bicubic`: Pillow's, on 8 bits, to the last bit.
 //! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much smaller.

@@ -5,8 +5,8 @@ use artifact::counted;
 use crate::transforms::{self, Missing};
 use crate::{Dataset, DatasetError, Format, Split, is_file};
 
-/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. An image that isn't there is an
-/// error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
+/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. An image that isn't
+/// there is an error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("transforms_train.json");
     let mut frames = transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;

@@ -6,8 +6,8 @@
 //! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and its
-//! lens's distortion; [`Frame::photograph`] reads its image, upright as its poses have it. [`Dataset::undistorted`] has images read as
-//! pinhole cameras would have taken them.
+//! lens's distortion; [`Frame::photograph`] reads its image, upright as its poses have it. [`Dataset::undistorted`] has images
+//! read as pinhole cameras would have taken them.
 //!
 //! Units: lengths are those of the poses; pixels count from the stored image's top left corner, whose first pixel has its centre
 //! at (0.5, 0.5). Everything a file says is checked: sizes before anything is allocated, paths before anything is opened.
@@ -180,8 +180,8 @@ impl Dataset {
         self
     }
 
-    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same size, with a
-    /// border cut off where the lens saw no more.
+    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same
+    /// size, with a border cut off where the lens saw no more.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
         let mut undone = 0;
         for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {

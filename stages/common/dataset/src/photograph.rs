@@ -65,9 +65,9 @@ fn is_sideways(turn: Orientation) -> bool {
     matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in shape; and whether the image has to be
-/// turned as its EXIF data ask. Poses are commonly found for images as they are stored, so it is turned only where its shape fits no
-/// other way.
+/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in shape; and whether the image
+/// has to be turned as its EXIF data ask. Poses are commonly found for images as they are stored, so it is turned only where
+/// its shape fits no other way.
 pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let (width, height) = stored.size;
     let fits = |(width, height): (u32, u32)| {

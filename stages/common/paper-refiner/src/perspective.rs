@@ -1,7 +1,8 @@
 use counter_rng::CounterRng;
 use pixels::Image;
 
-/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at most a share of its half width and height.
+/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at most a share of its half width
+/// and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
     /// From places of the warped image to those of the image: (ax + by + c, dx + ey + f) / (gx + hy + 1).

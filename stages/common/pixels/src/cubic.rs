@@ -1,7 +1,7 @@
 use crate::Image;
 
-/// What an image of that size (columns, rows) shows at a position in pixels from its top left corner: cubic interpolation (Catmull and
-/// Rom 1974) of its pixels, whose centres lie at halves; beyond its border it goes on. Nothing is clamped.
+/// What an image of that size (columns, rows) shows at a position in pixels from its top left corner: cubic interpolation
+/// (Catmull and Rom 1974) of its pixels, whose centres lie at halves; beyond its border it goes on. Nothing is clamped.
 pub fn sample_cubic<const N: usize>(
     (width, height): (usize, usize),
     [x, y]: [f64; 2],

@@ -17,8 +17,9 @@ const LEAST_BLOCKS: f64 = 12.0;
 const POSSIBLE: [f32; 2] = [0.1, 10.0];
 
 impl Exposure {
-    /// The exposure of an image against another of its size that has the right one: the line through both by least squares, a channel at a time. Means of
-    /// square blocks of pixels are compared, of what is clipped in neither. None where too little is left, or no line fits.
+    /// The exposure of an image against another of its size that has the right one: the line through both by least squares, a
+    /// channel at a time. Means of square blocks of pixels are compared, of what is clipped in neither. None where too little
+    /// is left, or no line fits.
     ///
     /// # Panics
     /// With fewer than three channels, other sizes, or no pixels in a block.

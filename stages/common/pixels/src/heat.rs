@@ -20,8 +20,8 @@ pub fn heat(palette: Palette, value: f32) -> [u8; 3] {
     [colour.r, colour.g, colour.b]
 }
 
-/// The range of depths that an image of them shows: from the nearest hundredth to the farthest, since a floater or two must not take the
-/// whole scale. `None` where opacity `a` is nowhere one half.
+/// The range of depths that an image of them shows: from the nearest hundredth to the farthest, since a floater or two must not
+/// take the whole scale. `None` where opacity `a` is nowhere one half.
 pub fn depth_range(z: &[f32], a: &[f32]) -> Option<(f32, f32)> {
     let mut seen: Vec<f32> = z.iter().zip(a).filter(|(_, a)| **a >= 0.5).map(|(z, _)| *z).collect();
     seen.sort_by(f32::total_cmp);

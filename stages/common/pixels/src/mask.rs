@@ -2,7 +2,8 @@ use std::path::Path;
 
 use crate::{Image, PixelError, Rgba8, read_png};
 
-/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene, people who walked by for example.
+/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene, people who walked by for
+/// example.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mask {
     /// Columns.
@@ -36,8 +37,8 @@ impl Mask {
         Rgba8::new(self.width, self.height, self.counts.iter().flat_map(pixel).collect())
     }
 
-    /// The mask of the image at another size: a pixel counts where all that lies under it does, and under so many pixels around it, which
-    /// its kernel reads.
+    /// The mask of the image at another size: a pixel counts where all that lies under it does, and under so many pixels around
+    /// it, which its kernel reads.
     #[must_use]
     pub fn resized(&self, (width, height): (usize, usize), around: usize) -> Self {
         // Columns or rows under the pixels around one.

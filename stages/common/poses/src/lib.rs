@@ -5,9 +5,10 @@
 //! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that was for the better.
 //! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
 //!
-//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the image, and the rendered depth how
-//! that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a step takes one rendering
-//! of some thousand pixels, and any field will do that renders colour and depth: nothing is differentiated but photographs.
+//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the image, and the rendered
+//! depth how that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a
+//! step takes one rendering of some thousand pixels, and any field will do that renders colour and depth: nothing is
+//! differentiated but photographs.
 //!
 //! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up, looking along -z).
 //!
@@ -73,8 +74,8 @@ const LEAST: usize = 24;
 const STEEP: f32 = 3.0 / 255.0;
 
 impl Pyramid {
-    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the width of the one before it; there are at most
-    /// `smaller` below the image itself.
+    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the width of the one before it;
+    /// there are at most `smaller` below the image itself.
     ///
     /// # Panics
     /// When the image has other than three channels.

@@ -29,8 +29,8 @@ const SURFACE: f32 = 0.5;
 /// Two distances of one surface differ by at most this share of them.
 const SAME: f64 = 0.02;
 
-/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of colours) between what one shows and what
-/// its neighbours show there, where the field says that they see it, too. None where it says so nowhere.
+/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of colours) between what one shows
+/// and what its neighbours show there, where the field says that they see it, too. None where it says so nowhere.
 ///
 /// The field only says where surfaces are. So this tells good poses from bad ones even by fields that learnt both photograph by photograph:
 /// such a field renders every photograph well, but its surfaces lie where no two of them see the same.

@@ -199,7 +199,8 @@ fn common_motion_is_taken_back() {
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
 }
 
-/// By the true surfaces the photometric error is small from where photographs were taken, and not from beside; exposures that are known are no difference.
+/// By the true surfaces the photometric error is small from where photographs were taken, and not from beside; exposures that
+/// are known are no difference.
 #[test]
 fn photometric_error_is_least_from_where_photographs_were_taken() {
     let cameras: Vec<Camera> = (0..6).map(camera).collect();

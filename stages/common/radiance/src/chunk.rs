@@ -289,8 +289,8 @@ impl Chunk {
         }
     }
 
-    /// Goes back from each ray's colour gradient, and from the distortion and floater losses times their factors: adds to the networks' partial sums
-    /// (`lanes`) and appends to `into`. `transposed` are the weights output by output.
+    /// Goes back from each ray's colour gradient, and from the distortion and floater losses times their factors: adds to the
+    /// networks' partial sums (`lanes`) and appends to `into`. `transposed` are the weights output by output.
     #[allow(clippy::too_many_arguments, reason = "what a pass reads and where it adds; a struct of them would have one use")]
     pub(crate) fn backward(
         &mut self,

@@ -144,8 +144,8 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater loss, where neither likeness to the background nor what comes through
-    // to it is learnt from.
+    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater loss, where neither likeness
+    // to the background nor what comes through to it is learnt from.
     let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {

@@ -42,8 +42,9 @@ impl<'a> LrObservations<'a> {
         Ok(rendered.with_colours(&colours))
     }
 
-    /// The image nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
-    /// photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
+    /// The image nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1].
+    /// Where the photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask
+    /// leaves it out.
     pub fn project(&self, refined: &Image, Photograph { image: photograph, mask }: &Photograph) -> Image {
         let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
         let mut residual = kernel.apply(refined);

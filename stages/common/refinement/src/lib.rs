@@ -1,8 +1,8 @@
 //! Refinement of rendered views: a small network that gives them the detail they systematically lack.
 //!
-//! A field that was trained from LR images renders edges softer than they are, and the same way everywhere in a scene. The network sees a
-//! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR images that
-//! were shrunk once more renders views of LR size, whose truth the LR images are.
+//! A field that was trained from LR images renders edges softer than they are, and the same way everywhere in a scene. The
+//! network sees a rendered view and predicts what to add. It learns that one size down, where the truth is known: a field
+//! trained from LR images that were shrunk once more renders views of LR size, whose truth the LR images are.
 //!
 //! Where true images of some views are known at HR, references, a reference-based network sees what they show of each pixel,
 //! too. The field's depth says where they show it, and whether they see it at all.

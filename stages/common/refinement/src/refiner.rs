@@ -304,8 +304,8 @@ mod tests {
         }
     }
 
-    /// Internal learning from little pushes features below 0 everywhere. What the network adds must still follow what it sees, or it would never
-    /// learn again.
+    /// Internal learning from little pushes features below 0 everywhere. What the network adds must still follow what it sees,
+    /// or it would never learn again.
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();

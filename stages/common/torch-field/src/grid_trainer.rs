@@ -290,7 +290,8 @@ fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// The floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours or the transmittance T.
+/// The floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours or the
+/// transmittance T.
 fn floater_loss(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
     let squared =
