@@ -73,12 +73,15 @@ def renamed(value):
     return [renamed(entry) for entry in value] if isinstance(value, list) else value
 
 
-def files(artifact: pathlib.Path, has_old_names: bool, added: list[str]) -> dict:
+def files(artifact: pathlib.Path, options: argparse.Namespace, has_old_names: bool) -> dict:
     """Contents by path, the manifest left out: it follows from them."""
+    has_renames, added = options.before_renames, options.added
     found = {}
     for file in sorted(p for p in artifact.rglob("*") if p.is_file() and p.name != "artifact.json"):
         parts = file.relative_to(artifact).parts
         name = "/".join(newer(part, KEYS) if has_old_names else part for part in parts)
+        if has_renames and name == "summary.txt":
+            continue  # Words for people, with the names in them.
         if file.suffix == ".json":
             value = json.loads(file.read_text())
             if isinstance(value, dict):
@@ -97,7 +100,7 @@ def compare(name: str, options: argparse.Namespace) -> bool:
         new = artifacts(options.new, pathlib.Path(other), words, False)
         differences, compared = sorted(old.keys() ^ new.keys()), 0
         for label in sorted(old.keys() & new.keys()):
-            before, after = files(old[label], options.before_renames, options.added), files(new[label], False, options.added)
+            before, after = files(old[label], options, options.before_renames), files(new[label], options, False)
             compared += len(after)
             unequal = [path for path in sorted(before.keys() | after.keys()) if before.get(path) != after.get(path)]
             differences += [f"{label}: {path}" for path in unequal]

@@ -78,7 +78,7 @@ pub struct Params {
     /// Which views are for training and which for testing. Default: the data set's own split, else `holdout`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
-    /// Most test views, spread evenly.
+    /// Maximum number of test views, spread evenly.
     #[schemars(range(min = 1), extend("x-group" = "data", "x-default" = "all"))]
     pub test_views: Option<u32>,
     /// Number of training views that are kept at HR, as references. The first view is one; each further one has the camera farthest from those

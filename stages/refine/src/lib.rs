@@ -33,7 +33,7 @@ pub struct Params {
     /// Share of the predicted residual that is added. Default: the best share for views that the refiner's training left out.
     #[schemars(range(min = 0.0, max = 2.0), extend("x-default" = "by refiner"))]
     pub residual_weight: Option<f64>,
-    /// Most HR references that are used: the first ones of input `references`.
+    /// Maximum number of HR references: the first ones of input `references` are used.
     #[schemars(extend("x-default" = "all"))]
     pub max_references: Option<u32>,
     /// Turned and mirrored versions of a view whose residuals are averaged (geometric self-ensemble). Time grows with their number.

@@ -22,7 +22,7 @@ pub struct Params {
     /// How often a photograph is halved at the start. More finds cameras that are farther off.
     #[schemars(range(min = 0, max = 8))]
     pub smaller: u32,
-    /// Most renders for a photograph at each of its sizes.
+    /// Maximum number of renders for a photograph at each of its sizes.
     #[schemars(range(min = 2, max = 100))]
     pub renderings: u32,
 }

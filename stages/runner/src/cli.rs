@@ -13,7 +13,7 @@ use crate::pipeline::Pipeline;
 use crate::plan::{PlanError, Request};
 use crate::remedy::Remedy;
 use crate::session::Session;
-use crate::verbs;
+use crate::verbs::{self, Style};
 
 /// Where the pipeline is looked for.
 const PIPELINE: &str = "pipeline.yaml";
@@ -73,6 +73,9 @@ enum Verb {
     Plan {
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Say why a stage is cached, would run, or waits
     Why {
@@ -80,11 +83,35 @@ enum Verb {
         stage: String,
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Show every stage with its artifact, age and time
     Status {
         #[command(flatten)]
         what: What,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
+    },
+    /// Print the folder of a stage's artifact, or a folder or file inside it
+    Path {
+        /// The stage, e.g. eval, or with a folder or file, e.g. prep/train
+        #[arg(value_name = "STAGE[/FOLDER]")]
+        stage: String,
+        #[command(flatten)]
+        what: What,
+    },
+    /// Tell what differs between two results: parameters, defaults in use, metrics, images
+    Diff {
+        /// A stage with its arguments as one word ("eval -p kernel=box"), the beginning of an artifact's hash, or a recorded run or pin
+        before: String,
+        /// Likewise
+        now: String,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Draw the graph
     Graph {
@@ -135,6 +162,9 @@ enum Verb {
         /// Delete what older versions of nerf-sr made, too: its keys can't be met any more
         #[arg(long)]
         drop_old: bool,
+        /// Print JSON, for programs
+        #[arg(long)]
+        json: bool,
     },
     /// Print the help of a stage's program: what it makes, its inputs and its parameters
     Describe {
@@ -194,9 +224,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
             verbs::run(&session, &what.into(), &options, &out, &remedy)
         }
-        Verb::Plan { what } => verbs::plan(&session, &what.into()),
-        Verb::Why { stage, what } => verbs::why(&session, &stage, &what.into()),
-        Verb::Status { what } => verbs::status(&session, &what.into()),
+        Verb::Plan { what, json } => verbs::plan(&session, &what.into(), json),
+        Verb::Why { stage, what, json } => verbs::why(&session, &stage, &what.into(), json),
+        Verb::Status { what, json } => verbs::status(&session, &what.into(), json),
+        Verb::Path { stage, what } => verbs::path(&session, &stage, &what.into()),
+        Verb::Diff { before, now, json } => verbs::diff(&session, &before, &now, json),
         Verb::Graph { what, format } => {
             let plan = session.plan(&what.into())?;
             let states = session.states(&plan)?;
@@ -211,8 +243,9 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Verify { remove } => verbs::verify(&session.store, remove),
         Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
         Verb::Unpin { name } => verbs::unpin(&session, &name),
-        Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old } => {
-            verbs::gc(&session, &what.into(), dry_run, Choice { keep_days, drop_unfinished, drop_old })
+        Verb::Gc { what, dry_run, keep_days, drop_unfinished, drop_old, json } => {
+            let choice = Choice { keep_days, drop_unfinished, drop_old };
+            verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
         }
         Verb::Completions { .. } | Verb::Describe { .. } => unreachable!("handled before the session"),
     }

@@ -47,10 +47,6 @@ impl Drawing {
     }
 }
 
-pub(crate) fn state_word(state: &State) -> &'static str {
-    Drawing::of(state).word()
-}
-
 /// The nodes in their order, and after them the sinks.
 fn drawn<'a>(plan: &'a Plan, states: &[State]) -> Vec<Drawn<'a>> {
     let nodes = plan.nodes.iter().zip(states).map(|(node, state)| {

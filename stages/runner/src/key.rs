@@ -4,6 +4,7 @@
 use artifact::Record;
 use serde_json::{Map, Value, json};
 
+use crate::changes::{Change, changes};
 use crate::plan::Node;
 
 /// Version of this list: names of parameters changed between 1 and 2.
@@ -38,34 +39,14 @@ pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> M
 
 /// What differs between a key and the nearest earlier one of the same block, in words; `None` when there is no earlier one.
 pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
-    let differences = |record: &Record| -> Vec<String> {
-        let names: std::collections::BTreeSet<&String> = parts.keys().chain(record.key_parts.keys()).collect();
-        names
-            .into_iter()
-            .filter(|name| parts.get(*name) != record.key_parts.get(*name))
-            .map(|name| describe_change(name, record.key_parts.get(name), parts.get(name)))
-            .collect()
-    };
-    let nearest = records
-        .iter()
-        .filter(|r| r.stage == stage)
-        .map(|r| (differences(r), std::cmp::Reverse(r.started_unix)))
-        .min_by_key(|(changes, newest)| (changes.len(), *newest));
-    nearest.map(|(changes, _)| changes)
+    Some(nearest_changes(parts, stage, records)?.iter().map(ToString::to_string).collect())
 }
 
-/// The beginning of a hash, for people.
-pub(crate) fn short(hash: &str) -> &str {
-    hash.get(..10).unwrap_or(hash)
-}
-
-fn describe_change(name: &str, before: Option<&Value>, now: Option<&Value>) -> String {
-    let show = |value: Option<&Value>| match value {
-        None => "absent".to_owned(),
-        Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => short(hash).to_owned(),
-        Some(value) => value.to_string(),
-    };
-    format!("{name}: {} → {}", show(before), show(now))
+/// The same, for programs.
+pub(crate) fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
+    let of_stage = records.iter().filter(|record| record.stage == stage);
+    let compared = of_stage.map(|record| (changes(&record.key_parts, parts), std::cmp::Reverse(record.started_unix)));
+    compared.min_by_key(|(changes, newest)| (changes.len(), *newest)).map(|(changes, _)| changes)
 }
 
 #[cfg(test)]

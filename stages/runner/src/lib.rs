@@ -6,6 +6,7 @@
 //!   file, `arguments` and `axes` at the command line, `expand` makes the nodes.
 //! * `stages`: what each stage says of itself; `describing` asks those that aren't known.
 //! * `key`: the parts of an action's key; one list feeds both the hash and `why`.
+//! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all that they were made of.
 //! * `execute`: runs nodes, some at once, each under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 
@@ -13,6 +14,7 @@
 
 mod arguments;
 mod axes;
+mod changes;
 mod check;
 mod cli;
 mod clock;
@@ -26,6 +28,8 @@ mod gc;
 mod graph;
 mod key;
 mod limits;
+mod lineage;
+mod node_report;
 mod pipeline;
 mod plan;
 mod process;

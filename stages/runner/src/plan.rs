@@ -104,6 +104,17 @@ pub(crate) enum State {
     Waits { on: Vec<usize> },
 }
 
+impl State {
+    /// In a word.
+    pub(crate) fn word(&self) -> &'static str {
+        match self {
+            Self::Cached(_) => "cached",
+            Self::WillRun { .. } => "will run",
+            Self::Waits { .. } => "waits",
+        }
+    }
+}
+
 /// A stage and a sweep's point, as people read it.
 pub(crate) fn label(stage: &str, point: &str) -> String {
     if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }

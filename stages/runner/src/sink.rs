@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, RunFile, RunInput, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
 use serde_json::json;
 
 use crate::execute::{Display, Options, Outcome};
-use crate::plan::{Origin, Plan, Sink};
+use crate::plan::{Plan, Sink};
 use crate::process::{Call, StageFailure};
 use crate::publish;
 
@@ -25,13 +25,6 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
     let nodes = wanted.iter().map(|&index| {
         let (node, record) = (&plan.nodes[index], outcome.records[index].as_ref()?);
         let folder = store.object(&record.output);
-        let inputs = node.inputs.iter().map(|input| {
-            let from = match &input.from {
-                Origin::Node { index, subtree } => RunInput { node: position(*index), subtree: subtree.clone(), folder: None },
-                Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
-            };
-            (input.name.clone(), from)
-        });
         Some(RunNode {
             stage: node.stage.clone(),
             point: node.point.clone(),
@@ -41,7 +34,7 @@ fn record(plan: &Plan, sink: &Sink, outcome: &Outcome, store: &Store) -> Option<
             resolved: node.by_scene(&folder),
             folder,
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
-            inputs: inputs.collect(),
+            inputs: node.run_inputs(position),
             started_unix: record.started_unix,
             seconds: record.seconds,
             threads: record.threads,

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use artifact::{Record, hash_json};
 use serde_json::Value;
 
+use crate::changes::short;
 use crate::execute::seconds;
 use crate::key;
 use crate::plan::{Node, Plan, Sink, State};
@@ -36,7 +37,7 @@ pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State,
         State::WillRun { key_parts } => match key::explain(key_parts, &plan.nodes[index].stage, records) {
             None => "will run: it never ran before".to_owned(),
             Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
-                Some(record) => format!("will run: its artifact {} is gone or incomplete", key::short(&record.output)),
+                Some(record) => format!("will run: its artifact {} is gone or incomplete", short(&record.output)),
                 None => "will run".to_owned(),
             },
             Some(changes) => format!("will run: {}", changes.join("; ")),

@@ -112,15 +112,12 @@ impl Stage for TrainSs {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
             ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
-            (
-                "references",
-                Input::optional(&["scene/references"], "HR images of some views, to be trained on beside the LR ones"),
-            ),
+            ("references", Input::optional(&["scene/references"], "HR images of some views, to train on beside the LR images")),
             (
                 "init",
                 Input::optional(
                     &["field"],
-                    "a field that the same parameters gave of the same scene, to fine-tune; parameter combine says how both are used",
+                    "a field to fine-tune, trained on the same scene with the same parameters; see combine",
                 ),
             ),
         ]

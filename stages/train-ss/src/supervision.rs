@@ -16,25 +16,25 @@ use crate::hr_cache::{HrCache, KernelOperator};
 use crate::moving_cameras::MovingCameras;
 use crate::order::{Focus, detailed, shuffled};
 
-/// What an LR pixel is compared with.
+/// How rays are compared with the LR pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Supervision {
-    /// The mean of its sub-pixel rays, whatever made the LR images: the paper's (eq. 4).
+    /// Their mean is compared, whatever made the LR images (the paper's eq. 4).
     Average,
-    /// The same, with the LR images filtered once so that they look as if averaging had made them.
+    /// As `average`, on LR images that were filtered once so that the mean is the right model.
     Refiltered,
-    /// What the known kernel makes of the field's own HR pixels.
+    /// Rays render HR pixels, and the known degradation kernel makes an LR pixel of them.
     Kernel,
 }
 
-/// In which order pixels are drawn.
+/// Orders in which pixels are drawn.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Order {
-    /// Each time any pixel.
+    /// Each time any pixel, independently.
     Random,
-    /// All of them in random order, and then again in another.
+    /// Each pixel once in random order, then again in another order.
     Epochs,
 }
 

@@ -14,7 +14,7 @@ const NAME_WIDTH: usize = 24;
 pub(crate) fn help_of(description: &Description) -> String {
     let mut text = String::new();
     if !description.inputs.is_empty() {
-        text.push_str("Inputs:\n");
+        text.push_str("Inputs, with the kinds of artifact that they take:\n");
         for (name, input) in &description.inputs {
             let note = if input.optional { ", optional" } else { "" };
             text.push_str(&entry(name, &format!("{} [{}{note}]", input.summary, input.kinds.join(" or "))));
@@ -86,7 +86,7 @@ mod tests {
             rules: Vec::new(),
         };
         let expected = "\
-Inputs:
+Inputs, with the kinds of artifact that they take:
   scene                 images [scene/train or views, optional]
 
 Parameters: in pipeline.yaml under `parameters:`, or as -p NAME=VALUE of nerf-sr.

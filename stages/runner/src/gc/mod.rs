@@ -12,8 +12,10 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use artifact::{Closed, Store, StoreError, unix_time};
+use artifact::{Closed, Record, Store, StoreError, unix_time};
+use serde::Serialize;
 
+use crate::changes::short;
 use crate::plan::label;
 
 pub(crate) use roots::{Choice, Root};
@@ -39,24 +41,36 @@ pub(crate) fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict
 }
 
 impl Verdict {
-    /// A line for each artifact and each unfinished action: why it stays, or that it goes.
-    pub(crate) fn lines(&self) -> Vec<String> {
-        let mut makers: BTreeMap<&str, String> = BTreeMap::new();
+    /// What becomes of each artifact and each unfinished action.
+    pub(crate) fn fates(&self) -> Vec<Fate> {
+        let mut makers: BTreeMap<&str, &Record> = BTreeMap::new();
         for record in self.contents.records.values() {
-            let age = unix_time().saturating_sub(record.started_unix) / 3600;
-            makers.entry(&record.output).or_insert_with(|| format!("{}, {age} h old", label(&record.stage, &record.point)));
+            makers.entry(&record.output).or_insert(record);
         }
-        let fate = |why: Option<&String>| why.map_or("goes".to_owned(), |why| format!("stays: {why}"));
         let objects = self.contents.objects.iter().map(|(identity, bytes)| {
-            let maker = makers.get(identity.as_str()).map_or("no record names it", String::as_str);
-            let size = *bytes as f64 / 1e6;
-            format!("{}  {size:>9.1} MB  {maker}: {}", short(identity), fate(self.kept.objects.get(identity)))
+            let maker = makers.get(identity.as_str());
+            Fate {
+                hash: identity.clone(),
+                bytes: Some(*bytes),
+                stage: maker.map(|record| label(&record.stage, &record.point)),
+                started_unix: maker.map(|record| record.started_unix),
+                stays: self.kept.objects.get(identity).cloned(),
+            }
         });
-        let unfinished = self.contents.unfinished.iter().map(|(key, action)| {
-            let stage = action.as_ref().map_or("an action", |action| &action.stage);
-            format!("{}  unfinished    {stage}: {}", short(key), fate(self.kept.unfinished.get(key)))
+        let unfinished = self.contents.unfinished.iter().map(|(key, action)| Fate {
+            hash: key.clone(),
+            bytes: None,
+            stage: action.as_ref().map(|action| action.stage.clone()),
+            started_unix: action.as_ref().map(|action| action.started_unix),
+            stays: self.kept.unfinished.get(key).cloned(),
         });
         objects.chain(unfinished).collect()
+    }
+
+    /// A line for each artifact and each unfinished action: why it stays, or that it goes.
+    #[cfg(test)]
+    pub(crate) fn lines(&self) -> Vec<String> {
+        self.fates().iter().map(ToString::to_string).collect()
     }
 
     /// Bytes that go, and bytes that stay.
@@ -93,7 +107,33 @@ impl Verdict {
     }
 }
 
-/// The beginning of a hash, as people see it.
-fn short(hash: &str) -> &str {
-    hash.get(..10).unwrap_or(hash)
+/// What becomes of an artifact, or of an unfinished action.
+#[derive(Debug, Serialize)]
+pub(crate) struct Fate {
+    /// The artifact's identity, or the action's key.
+    hash: String,
+    /// The artifact's size; an unfinished action has none.
+    bytes: Option<u64>,
+    /// Stage and point that made it.
+    stage: Option<String>,
+    started_unix: Option<u64>,
+    /// Why it stays; null where it goes.
+    stays: Option<String>,
+}
+
+impl std::fmt::Display for Fate {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let fate = self.stays.as_ref().map_or("goes".to_owned(), |why| format!("stays: {why}"));
+        let hash = short(&self.hash);
+        let Some(bytes) = self.bytes else {
+            let stage = self.stage.as_deref().unwrap_or("an action");
+            return write!(f, "{hash}  unfinished    {stage}: {fate}");
+        };
+        let hours = self.started_unix.map(|unix| unix_time().saturating_sub(unix) / 3600);
+        let maker = match (&self.stage, hours) {
+            (Some(stage), Some(hours)) => format!("{stage}, {hours} h old"),
+            _ => "no record names it".to_owned(),
+        };
+        write!(f, "{hash}  {:>9.1} MB  {maker}: {fate}", bytes as f64 / 1e6)
+    }
 }

@@ -1,23 +1,20 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, hash_json, print_line, report_line, stop_on_signals};
+use artifact::{Failure, hash_json, print_line, print_lines, report_line, stop_on_signals};
+use serde_json::json;
 
 use crate::execute::seconds;
-use crate::gc::{Choice, Root, judge};
+use crate::gc::{Choice, Root, Verdict, judge};
 use crate::plan::{Request, State};
 use crate::session::Session;
 use crate::waiting::until_held;
 
 /// Removes what nothing needs any more.
-pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, choice: Choice) -> anyhow::Result<ExitCode> {
+pub(crate) fn gc(session: &Session, what: &Request, choice: Choice, style: Style) -> anyhow::Result<ExitCode> {
     let store = &session.store;
     let needed = needed(session, what)?;
-    if dry_run {
-        let verdict = judge(store, needed, choice)?;
-        verdict.lines().iter().for_each(|line| print_line!("{line}"));
-        let (goes, stays) = verdict.bytes();
-        print_line!("{:.1} MB would go, {:.1} MB would stay", goes as f64 / 1e6, stays as f64 / 1e6);
-        return Ok(ExitCode::SUCCESS);
+    if style.dry_run {
+        return style.tell(&judge(store, needed, choice)?);
     }
     let stop = stop_on_signals()?;
     let say = |_: Option<&_>, waited: std::time::Duration| {
@@ -31,11 +28,32 @@ pub(crate) fn gc(session: &Session, what: &Request, dry_run: bool, choice: Choic
     let verdict = judge(store, needed, choice)?;
     verdict.carry_out(store, &closed)?;
     drop(closed);
-    verdict.lines().iter().for_each(|line| print_line!("{line}"));
     store.empty_trash()?;
-    let (goes, stays) = verdict.bytes();
-    print_line!("{:.1} MB freed, {:.1} MB stay", goes as f64 / 1e6, stays as f64 / 1e6);
-    Ok(ExitCode::SUCCESS)
+    style.tell(&verdict)
+}
+
+/// What to do beside deciding, and how to tell of it.
+#[derive(Clone, Copy)]
+pub(crate) struct Style {
+    /// Only say what would go.
+    pub(crate) dry_run: bool,
+    /// For programs.
+    pub(crate) json: bool,
+}
+
+impl Style {
+    fn tell(self, verdict: &Verdict) -> anyhow::Result<ExitCode> {
+        let (goes, stays) = verdict.bytes();
+        if self.json {
+            let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays, "items": verdict.fates()});
+            print_lines(&serde_json::to_string_pretty(&told)?);
+            return Ok(ExitCode::SUCCESS);
+        }
+        verdict.fates().iter().for_each(|fate| print_line!("{fate}"));
+        let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };
+        print_line!("{:.1} MB {}, {:.1} MB {}", goes as f64 / 1e6, verbs.0, stays as f64 / 1e6, verbs.1);
+        Ok(ExitCode::SUCCESS)
+    }
 }
 
 /// What the pipeline needs with these arguments.

@@ -1,8 +1,10 @@
 //! What the command line can ask for, a file each.
 
 mod describe;
+mod diff;
 mod gc;
 mod log;
+mod path;
 mod pin;
 mod plan;
 mod run;
@@ -11,8 +13,10 @@ mod verify;
 mod why;
 
 pub(crate) use describe::describe;
-pub(crate) use gc::gc;
+pub(crate) use diff::diff;
+pub(crate) use gc::{Style, gc};
 pub(crate) use log::log;
+pub(crate) use path::path;
 pub(crate) use pin::{pin, unpin};
 pub(crate) use plan::plan;
 pub(crate) use run::run;

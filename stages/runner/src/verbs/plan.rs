@@ -1,15 +1,20 @@
 use std::process::ExitCode;
 
-use artifact::print_line;
+use artifact::{print_line, print_lines};
 
+use crate::node_report::PlanReport;
 use crate::plan::Request;
 use crate::session::Session;
 use crate::words::{by_scene, shown, words};
 
 /// Shows what `run` would do.
-pub(crate) fn plan(session: &Session, what: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
+    if json {
+        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &[]))?);
+        return Ok(ExitCode::SUCCESS);
+    }
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
         by_scene(session, &plan.nodes[i], state).iter().for_each(|line| print_line!("    {line}"));

@@ -1,16 +1,21 @@
 use std::process::ExitCode;
 
-use artifact::print_line;
+use artifact::{print_line, print_lines};
 
+use crate::node_report::PlanReport;
 use crate::plan::Request;
 use crate::session::{Session, of_stage};
 use crate::words::{by_scene, causes, shown, words};
 
 /// Says why a stage is cached, would run, or waits; of a sink, what it shows.
-pub(crate) fn why(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
+pub(crate) fn why(session: &Session, stage: &str, what: &Request, json: bool) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     let records = session.store.records()?;
+    if json {
+        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &records).only(stage))?);
+        return Ok(ExitCode::SUCCESS);
+    }
     let say = |index: usize, indent: &str| {
         print_line!("{indent}{}: {}", plan.nodes[index].label(), words(session, &plan, index, &states[index], &records));
     };

@@ -1,0 +1,120 @@
+//! Two results with all that they were made of, and what differs between them.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use artifact::{Manifest, Record, Store};
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use crate::changes::{Change, changes};
+use crate::plan::label;
+
+/// Metrics of an artifact.
+const METRICS_FILE: &str = "metrics.json";
+
+/// Finished actions with all that they were made of, by stage and point.
+pub(crate) struct Lineage {
+    records: BTreeMap<String, Record>,
+}
+
+/// What differs in one stage.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(crate) struct StageDifference {
+    /// Stage and point.
+    pub(crate) stage: String,
+    /// Parts of the key, defaults that the scene decided, metrics, and files.
+    pub(crate) changes: Vec<Change>,
+}
+
+impl Lineage {
+    /// Of the actions that have these keys. What garbage collection has taken is left out.
+    pub(crate) fn of(store: &Store, keys: impl IntoIterator<Item = String>) -> Self {
+        let (mut open, mut seen): (Vec<String>, BTreeSet<String>) = (keys.into_iter().collect(), BTreeSet::new());
+        let mut records = BTreeMap::new();
+        while let Some(key) = open.pop() {
+            if !seen.insert(key.clone()) {
+                continue;
+            }
+            if let Some(record) = store.record(&key) {
+                open.extend(record.made_of.clone());
+                records.insert(label(&record.stage, &record.point), record);
+            }
+        }
+        Self { records }
+    }
+
+    /// A single result under the name of its stage alone, whatever its point: so two points of a sweep compare.
+    pub(crate) fn without_points(self) -> Self {
+        let bare = self.records.into_values().map(|record| (record.stage.clone(), record));
+        Self { records: bare.collect() }
+    }
+
+    /// What differs from an earlier one, stage by stage. Where what a stage was made of differs, its inputs' hashes aren't told.
+    pub(crate) fn differences(&self, before: &Self, store: &Store) -> Vec<StageDifference> {
+        let names: BTreeSet<&String> = self.records.keys().chain(before.records.keys()).collect();
+        let mut found = Vec::new();
+        for name in names {
+            let [old, new] = [before, self].map(|lineage| lineage.records.get(name));
+            let [parts_before, parts_now] = [(before, old), (self, new)]
+                .map(|(lineage, record)| record.map(|record| lineage.parts(record, store)).unwrap_or_default());
+            let changes = changes(&parts_before, &parts_now);
+            if !changes.is_empty() {
+                found.push(StageDifference { stage: name.clone(), changes });
+            }
+        }
+        found
+    }
+
+    /// All that may differ of a result, by name.
+    fn parts(&self, record: &Record, store: &Store) -> Map<String, Value> {
+        let is_made = |hash: &Value| {
+            let outputs = self.records.values().filter(|other| record.made_of.contains(&other.key()));
+            outputs.into_iter().any(|other| is_of(store, hash, &other.output))
+        };
+        let mut parts: Map<String, Value> =
+            record.key_parts.iter().filter(|(name, value)| !(name.starts_with("input ") && is_made(value))).map(owned).collect();
+        let Ok(manifest) = store.manifest(&record.output) else {
+            parts.insert("artifact".to_owned(), Value::from("gone"));
+            return parts;
+        };
+        for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
+            parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
+        }
+        let folder = store.object(&record.output);
+        for file in manifest.files.iter().filter(|file| file.path.ends_with(".json") && !file.path.contains('/')) {
+            let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
+            let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
+            let resolved = value.get("resolved").and_then(Value::as_object).into_iter().flatten();
+            parts.extend(resolved.map(|(name, value)| (format!("resolved {name}"), value.clone())));
+            if file.path == METRICS_FILE {
+                numbers("mean", &value["mean"], &mut |name, value| {
+                    parts.insert(format!("metric {name}"), value.clone());
+                });
+            }
+        }
+        parts
+    }
+}
+
+fn owned((name, value): (&String, &Value)) -> (String, Value) {
+    (name.clone(), value.clone())
+}
+
+/// Whether an input's hash is of an artifact or of one of its folders.
+fn is_of(store: &Store, hash: &Value, output: &str) -> bool {
+    let of_folder = |manifest: Manifest| {
+        let folders: BTreeSet<String> =
+            manifest.files.iter().filter_map(|file| file.path.split_once('/')).map(|(folder, _)| folder.to_owned()).collect();
+        folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
+    };
+    hash == output || store.manifest(output).is_ok_and(of_folder)
+}
+
+/// Tells of every number inside a value, by its path.
+fn numbers(name: &str, value: &Value, tell: &mut dyn FnMut(&str, &Value)) {
+    match value {
+        Value::Number(_) => tell(name, value),
+        Value::Object(entries) => entries.iter().for_each(|(key, value)| numbers(&format!("{name}.{key}"), value, tell)),
+        _ => {}
+    }
+}

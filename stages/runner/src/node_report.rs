@@ -1,0 +1,144 @@
+//! What is known of a plan's nodes, for programs: the JSON of `plan`, `why` and `status`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use artifact::{Record, RunInput, hash_json};
+use serde::Serialize;
+use serde_json::{Map, Value};
+
+use crate::changes::Change;
+use crate::key;
+use crate::plan::{Node, Origin, Plan, State};
+use crate::session::Session;
+
+/// A plan's nodes, each after those that it needs, and its sinks.
+#[derive(Debug, Serialize)]
+pub(crate) struct PlanReport {
+    pub(crate) nodes: Vec<NodeReport>,
+    pub(crate) sinks: Vec<SinkReport>,
+}
+
+/// A sink.
+#[derive(Debug, Serialize)]
+pub(crate) struct SinkReport {
+    pub(crate) stage: String,
+    /// The nodes that it shows, by number.
+    pub(crate) shows: Vec<usize>,
+}
+
+/// A node: a stage at one point of a sweep.
+#[derive(Debug, Serialize)]
+pub(crate) struct NodeReport {
+    /// By which other nodes name it.
+    pub(crate) number: usize,
+    pub(crate) stage: String,
+    pub(crate) point: String,
+    /// `cached`, `will run` or `waits`.
+    pub(crate) state: &'static str,
+    /// All parameters, by name.
+    pub(crate) parameters: Map<String, Value>,
+    /// Parameters that the scene decides: the values in use, null until they are known.
+    #[serde(skip_serializing_if = "Map::is_empty")]
+    pub(crate) by_scene: Map<String, Value>,
+    /// Inputs by name: the number of another node, or a folder.
+    pub(crate) inputs: BTreeMap<String, RunInput>,
+    /// The action's key, once its inputs are known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) key: Option<String>,
+    /// The finished artifact.
+    #[serde(flatten)]
+    pub(crate) artifact: Option<ArtifactReport>,
+    /// Nodes, by number, that must run before its key is known.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(crate) waits_on: Vec<usize>,
+    /// Whether an earlier run left a checkpoint.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub(crate) has_checkpoint: bool,
+    /// What differs from the nearest earlier run of the stage; absent where it never ran, or wasn't asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) changes: Option<Vec<Change>>,
+}
+
+/// A finished artifact.
+#[derive(Debug, Serialize)]
+pub(crate) struct ArtifactReport {
+    pub(crate) output: String,
+    pub(crate) folder: PathBuf,
+    pub(crate) bytes: u64,
+    pub(crate) started_unix: u64,
+    pub(crate) seconds: f64,
+    pub(crate) threads: usize,
+}
+
+impl PlanReport {
+    /// With records, what differs from earlier runs, too.
+    pub(crate) fn new(session: &Session, plan: &Plan, states: &[State], records: &[Record]) -> Self {
+        let nodes = (0..plan.nodes.len()).map(|number| NodeReport::new(session, plan, (number, &states[number]), records));
+        let sinks = plan.sinks.iter().map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.shows.clone() });
+        Self { nodes: nodes.collect(), sinks: sinks.collect() }
+    }
+
+    /// The nodes of a stage alone, or of the stages that a sink shows.
+    pub(crate) fn only(mut self, stage: &str) -> Self {
+        self.sinks.retain(|sink| sink.stage == stage);
+        let shown: Vec<usize> = self.sinks.iter().flat_map(|sink| sink.shows.clone()).collect();
+        self.nodes.retain(|node| shown.contains(&node.number) || node.stage == stage);
+        self
+    }
+}
+
+impl NodeReport {
+    fn new(session: &Session, plan: &Plan, (number, state): (usize, &State), records: &[Record]) -> Self {
+        let (store, node) = (&session.store, &plan.nodes[number]);
+        let mut report = Self {
+            number,
+            stage: node.stage.clone(),
+            point: node.point.clone(),
+            state: state.word(),
+            parameters: node.parameters.as_object().cloned().unwrap_or_default(),
+            by_scene: Map::new(),
+            inputs: node.run_inputs(Some),
+            key: None,
+            artifact: None,
+            waits_on: Vec::new(),
+            has_checkpoint: false,
+            changes: None,
+        };
+        let mut folder = PathBuf::new();
+        match state {
+            State::Cached(record) => {
+                folder = store.object(&record.output);
+                report.key = Some(record.key());
+                report.artifact = Some(ArtifactReport {
+                    output: record.output.clone(),
+                    folder: folder.clone(),
+                    bytes: store.manifest(&record.output).map_or(0, |manifest| manifest.size()),
+                    started_unix: record.started_unix,
+                    seconds: record.seconds,
+                    threads: record.threads,
+                });
+            }
+            State::WillRun { key_parts } => {
+                let key = hash_json(key_parts);
+                report.has_checkpoint = store.has_checkpoint(&key);
+                report.changes = key::nearest_changes(key_parts, &node.stage, records);
+                report.key = Some(key);
+            }
+            State::Waits { on } => report.waits_on.clone_from(on),
+        }
+        report.by_scene = node.by_scene(&folder);
+        report
+    }
+}
+
+impl Node {
+    /// Its inputs as a record names them; `number` gives another node's place in the record.
+    pub(crate) fn run_inputs(&self, number: impl Fn(usize) -> Option<usize>) -> BTreeMap<String, RunInput> {
+        let source = |from: &Origin| match from {
+            Origin::Node { index, subtree } => RunInput { node: number(*index), subtree: subtree.clone(), folder: None },
+            Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
+        };
+        self.inputs.iter().map(|input| (input.name.clone(), source(&input.from))).collect()
+    }
+}
