@@ -104,7 +104,8 @@ fn help_leads_to_the_reference() {
         for parameter in description.documented().iter().flat_map(|section| &section.parameters) {
             let known = parameter.group.is_empty() || artifact::GROUPS.contains(&parameter.group.as_str());
             assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
-            assert!(parameter.text.ends_with('.') && parameter.default != "none", "{parameter:?}");
+            let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
+            assert!(parameter.text.ends_with('.') && (parameter.default != "none" || is_choice), "{parameter:?}");
         }
     }
 }

@@ -12,12 +12,12 @@ pub struct Params {
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
     /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. It may differ from the scale of the
-    /// views: fewer rays per pixel mean more pixels for the same `rays`. With `supervision: kernel`, the number of HR pixels along
-    /// each side of an LR pixel; it may be fractional, and the number of rays is rounded up.
+    /// views: fewer rays per pixel mean more pixels for the same `rays`. With `supervision: kernel` it is the number of HR pixels
+    /// along each side of an LR pixel and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
-    /// How rays are compared with the LR pixel. Default: `kernel` for `grid` where the degradation kernel is known and `background`
-    /// isn't `alpha`, else `average`.
+    /// How rays are compared with the LR pixel. Default: `kernel` for `grid` where `prep` made the LR images or assumes their
+    /// kernel and `background` isn't `alpha`, else `average`.
     #[schemars(extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub supervision: Option<Supervision>,
     /// Finds one factor for red, green and blue of each photograph, for photographs with several exposures or white balances.
@@ -140,8 +140,8 @@ pub struct GridParams {
     /// Cells along an axis of the coarsest level.
     #[schemars(range(min = 2, max = 512), extend("x-group" = "field"))]
     pub base_resolution: u32,
-    /// Cells along an axis of the finest level. Default: 2.56 for each LR pixel that the unit cube spans, at least
-    /// `base_resolution`.
+    /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the unit cube as the cameras see it,
+    /// at least `base_resolution`.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub max_resolution: Option<u32>,
     /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, no more than a ray has samples;
