@@ -446,6 +446,8 @@ fn what_slurm_is_told() {
     assert!(std::fs::read_to_string(project.path("sbatch.called")).unwrap().contains("--dependency=afterok:42 "));
     let status = run(&["status"]).stdout;
     assert!(status.contains("job 41 running") && status.contains("job 42 pending: Dependency"), "{status}");
+    let json: serde_json::Value = serde_json::from_str(&run(&["status", "--json"]).stdout).unwrap();
+    assert_eq!(json["nodes"][0]["job"]["state"], "RUNNING", "{json}");
     assert!(run(&["cancel", "last"]).stdout.contains("cancelled 1 job of last"));
     assert_eq!(std::fs::read_to_string(project.path("scancel.called")).unwrap(), "42\n");
     // Refusals are one line, and nothing is lost.

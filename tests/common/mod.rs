@@ -124,6 +124,7 @@ impl Project {
     pub fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(bin("nerf-sr"));
         command.args(arguments).current_dir(self.dir.path()).env_remove("NERF_SR_STORE");
+        command.env_remove("NERF_SR_EXECUTOR").env_remove("NERF_SR_SITE");
         command
     }
 

@@ -39,7 +39,7 @@ struct Cli {
     /// Where to compute: cpu or cuda:N
     #[arg(long, global = true, default_value = DEVICE)]
     device: String,
-    /// Who runs the stages. With slurm, a stage that needs GPUs (`resources`) computes on cuda:0
+    /// Who runs the stages: this machine, or a cluster's jobs; there a stage that needs GPUs (`resources`) computes on cuda:0
     #[arg(long, global = true, value_enum, default_value = EXECUTOR, env = "NERF_SR_EXECUTOR")]
     executor: Choose,
 }
@@ -47,9 +47,8 @@ struct Cli {
 /// An executor's name.
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Choose {
-    /// This machine
+    // Without texts of their own: clap would give every verb's help its long form.
     Local,
-    /// A cluster: a job for each stage that isn't cached
     Slurm,
 }
 

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use artifact::{Record, RunInput, hash_json};
 use serde::Serialize;
 use serde_json::{Map, Value};
+use slurm::Job;
 
 use crate::changes::Change;
 use crate::key;
@@ -55,6 +56,9 @@ pub(crate) struct NodeReport {
     /// Whether an earlier run left a checkpoint.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub(crate) has_checkpoint: bool,
+    /// The cluster's job that is to make it, where one is queued or running. `status` alone asks.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) job: Option<Job>,
     /// What differs from the nearest earlier run of the stage; absent where it never ran, or wasn't asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) changes: Option<Vec<Change>>,
@@ -103,6 +107,7 @@ impl NodeReport {
             artifact: None,
             waits_on: Vec::new(),
             has_checkpoint: false,
+            job: None,
             changes: None,
         };
         let mut folder = PathBuf::new();

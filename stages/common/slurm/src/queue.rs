@@ -2,6 +2,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::Path;
 
+use serde::Serialize;
+
 use crate::commands::Slurm;
 use crate::error::SlurmError;
 use crate::submission::{Submission, Task, all};
@@ -10,7 +12,7 @@ use crate::submission::{Submission, Task, all};
 const FORMAT: &str = "%i|%T|%r|%o";
 
 /// A job in the queue.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Job {
     /// Its number.
     pub id: String,
@@ -21,7 +23,9 @@ pub struct Job {
     /// Its submission.
     pub submission: String,
     /// What it does; nothing where the submission can't be read.
+    #[serde(skip)]
     pub task: Task,
+    #[serde(skip)]
     number: usize,
 }
 

@@ -12,11 +12,13 @@ use crate::words::age;
 pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
+    let (jobs, besides) = session.jobs(&plan);
     if json {
-        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &[]))?);
+        let mut report = PlanReport::new(session, &plan, &states, &[]);
+        report.nodes.iter_mut().zip(jobs).for_each(|(node, job)| node.job = job);
+        print_lines(&serde_json::to_string_pretty(&report)?);
         return Ok(ExitCode::SUCCESS);
     }
-    let (jobs, besides) = session.jobs(&plan);
     let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(states) {
         let job = jobs.next().flatten().map(|job| job.words());
