@@ -65,7 +65,7 @@ impl History {
         let missing: BTreeSet<&String> =
             records.values().map(|record| &record.output).filter(|o| !objects.contains(*o)).collect();
         if !records_only && !missing.is_empty() {
-            report_line!("{} of the history not here whole: only the records are written", counted(missing.len(), "artifact"));
+            report_line!("{} of the history not whole here: only the records are written", counted(missing.len(), "artifact"));
         }
         Ok(Self { artifact, records, objects })
     }

@@ -65,10 +65,6 @@ impl Progress {
             None => report_line!("{line}"),
         }
     }
-
-    pub(crate) fn stop(&self) -> &Arc<AtomicBool> {
-        &self.stop
-    }
 }
 
 impl Drop for Progress {

@@ -20,7 +20,7 @@ pub(crate) async fn pull(store: &Store, remote: &Remote, selection: &Selection, 
     let (missing, known) = missing_records(store, remote, selection, &looking, &mut refused).await?;
     let intake = Arc::new(Intake::begin(store, stop)?);
     let objects = look(&intake, remote, missing, &looking, &mut refused).await?;
-    let total = objects.iter().map(|object| object.bytes).sum();
+    let total = objects.iter().fold(0, |sum: u64, object| sum.saturating_add(object.bytes));
     drop(looking);
     let transfer = Transfer::new(remote, Progress::new("pull", total, stop));
     let tasks = objects.into_iter().map(|object| refusable(fetch(Arc::clone(&intake), Arc::clone(&transfer), object)));

@@ -9,10 +9,13 @@ use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload};
+use object_store::{ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig};
 
-/// A server that says nothing for so long is given up; the client asks again a few times.
+/// A server that says nothing for so long is given up.
 const SILENCE: Duration = Duration::from_secs(60);
+/// For so long, and so often, a request is made again that failed for a reason that may pass.
+const RETRYING: Duration = Duration::from_secs(60);
+const RETRIES: usize = 6;
 /// What `format` may hold.
 const FORMAT_LIMIT: u64 = 100;
 
@@ -36,7 +39,7 @@ impl Remote {
     pub(crate) fn open(place: &str, access: Access) -> anyhow::Result<Self> {
         let name = place.trim_end_matches('/').to_owned();
         match place.split_once("://") {
-            Some(("s3", rest)) => Self::open_s3(rest, name),
+            Some(("s3", rest)) => Self::open_s3(rest.trim_end_matches('/'), name),
             Some((scheme, _)) => {
                 let message = format!("{place}: {scheme}:// is not known; a remote is a folder or s3://bucket/prefix");
                 Err(Failure::Usage(message).into())
@@ -73,8 +76,9 @@ impl Remote {
         // A limit on a whole request would stop large files on slow lines.
         let client = ClientOptions::new().with_timeout_disabled().with_read_timeout(SILENCE);
         let plain = endpoint.is_some_and(|endpoint| endpoint.starts_with("http://"));
+        let retry = RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
         let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_client_options(client).with_allow_http(plain);
-        let files = builder.build().with_context(|| name.clone())?;
+        let files = builder.with_retry(retry).build().with_context(|| name.clone())?;
         Ok(Self { files: Arc::new(files), prefix: Path::parse(prefix).with_context(|| name.clone())?, name })
     }
 

@@ -6,7 +6,7 @@ use std::fs;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-use artifact::{Manifest, Record, Store};
+use artifact::{FileEntry, Manifest, Record, Store};
 use common::{assert_clean, assert_equal, assert_tidy, command, said, sample, succeed};
 use serde_json::{Value, json};
 
@@ -178,6 +178,11 @@ const HARM: &[(&str, Harm)] = &[
     ("not a path inside", |s| s.manifest(|m| m.files[0].path = "/tmp/evil".into())),
     ("not the path of", |s| s.manifest(|m| m.files[0].path = "artifact.json".into())),
     ("not sorted", |s| s.manifest(|m| m.files.push(m.files[0].clone()))),
+    ("sizes that no disk has", |s| {
+        s.manifest(|m| {
+            m.files.extend(["x", "y"].map(|path| FileEntry { path: path.into(), size: u64::MAX, blake3: String::new() }))
+        });
+    }),
     ("schema 2", |s| s.manifest(|m| m.schema = 2)),
     ("no plain file (Symlink)", |s| s.entries[FILE].kind = tar::EntryType::Symlink),
     ("no plain file (Link)", |s| s.entries[FILE].kind = tar::EntryType::Link),
@@ -194,7 +199,7 @@ const HARM: &[(&str, Harm)] = &[
         s.entries.splice(0..0, [long.clone(), long]);
     }),
     ("17 bytes where the manifest says 15", |s| s.entries[FILE].bytes.extend(b"  ")),
-    ("14 bytes where the manifest says 15", |s| drop(s.entries[FILE].bytes.pop())),
+    ("14 bytes where the manifest says 15", |s| s.entries[FILE].bytes.truncate(14)),
     ("9000000000 bytes where", |s| s.entries[FILE].size = Some(9_000_000_000)),
     ("has 9000000000 bytes, more than", |s| s.entries[INDEX].size = Some(9_000_000_000)),
     ("has 9000000000 bytes, more than", |s| s.entries[RECORD].size = Some(9_000_000_000)),

@@ -9,8 +9,8 @@ use crate::store::{Record, Store, StoreError, make_durable};
 pub struct Arrival {
     folder: PathBuf,
     identity: String,
-    /// Whether the store has such an object already.
-    is_there: bool,
+    /// Whether what lies in its place isn't whole.
+    replaces: bool,
 }
 
 impl Store {
@@ -23,14 +23,15 @@ impl Store {
         }
         manifest.check_contents(folder)?;
         make_durable(folder, &manifest)?;
-        // What is there already under that name and isn't whole gives way.
-        let is_there = self.verify(identity).is_ok();
-        Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), is_there })
+        let replaces = self.object(identity).symlink_metadata().is_ok() && self.verify(identity).is_err();
+        Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), replaces })
     }
 
     /// Takes in an object that came from another store. A whole one that is there stays.
     pub fn take_in(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
-        self.place(&arrival.folder, &arrival.identity, arrival.is_there)
+        // Somebody else may have put it there meanwhile: then readers shall not miss it for a moment.
+        let is_there = !arrival.replaces && self.is_whole(&arrival.identity);
+        self.place(&arrival.folder, &arrival.identity, is_there)
     }
 
     /// Takes in a record that came from another store, after its object; whether it was new. The record that is there stays,

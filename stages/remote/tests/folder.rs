@@ -5,7 +5,7 @@ mod common;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use artifact::{MANIFEST_FILE, Manifest, Record, Store, write_json};
 use common::{assert_clean, assert_equal, assert_tidy, bytes, command, make, said, sample, succeed};
@@ -236,6 +236,30 @@ fn a_damaged_artifact_is_not_pushed() {
     }
 }
 
+/// A server that takes connections and says nothing holds up nobody who interrupts.
+#[test]
+fn an_interrupt_ends_the_wait_for_a_silent_server() {
+    let dir = tempfile::tempdir().unwrap();
+    let server = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let mut command = command(&dir.path().join("store"), &["pull", "s3://bucket"]);
+    command.env("AWS_ENDPOINT_URL", format!("http://{}", server.local_addr().unwrap()));
+    command.env("AWS_ACCESS_KEY_ID", "x").env("AWS_SECRET_ACCESS_KEY", "x");
+    let child = command.stderr(Stdio::piped()).spawn().unwrap();
+    let _connection = server.accept().unwrap();
+    interrupt(&child);
+    let since = Instant::now();
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(since.elapsed() < Duration::from_secs(20));
+}
+
+fn interrupt(child: &std::process::Child) {
+    assert!(std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+}
+
+/// How often a push or pull is stopped.
+const TURNS: u32 = 12;
+
 /// A store with enough in it that a kill comes in the middle.
 fn much(setup: &Setup) {
     for index in 0..12 {
@@ -244,15 +268,18 @@ fn much(setup: &Setup) {
     }
 }
 
-/// Kills, interrupts, and at last lets end; how often it was stopped.
-fn stop_often(store: &Path, words: &[&str], after: impl Fn()) -> usize {
+/// Kills, interrupts, begins anew what got to its end in the folder it fills, and at last lets end; how often it was stopped.
+fn stop_often(store: &Path, words: &[&str], fills: &Path, after: impl Fn()) -> usize {
+    let since = Instant::now();
+    succeed(&mut command(store, words));
+    let whole = since.elapsed();
+    fs::remove_dir_all(fills).unwrap();
     let mut stopped = 0;
-    for turn in 0..12_u64 {
+    for turn in 0..TURNS {
         let mut child = command(store, words).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        std::thread::sleep(Duration::from_millis(20 + 37 * (turn * 7 % 12)));
+        std::thread::sleep(whole * (1 + turn * 7 % TURNS) / TURNS);
         if turn % 3 == 0 {
-            let pid = child.id().to_string();
-            assert!(std::process::Command::new("kill").args(["-INT", &pid]).status().unwrap().success());
+            interrupt(&child);
         } else {
             child.kill().unwrap();
         }
@@ -260,6 +287,9 @@ fn stop_often(store: &Path, words: &[&str], after: impl Fn()) -> usize {
         assert!(matches!(status.code(), None | Some(0 | 130)), "{status}");
         stopped += usize::from(!status.success());
         after();
+        if status.success() {
+            fs::remove_dir_all(fills).unwrap();
+        }
     }
     succeed(&mut command(store, words));
     after();
@@ -271,20 +301,20 @@ fn kills_leave_nothing_half_seen() {
     let setup = Setup::new();
     much(&setup);
     let remote = setup.remote();
-    let stopped = stop_often(setup.store.root(), &["push", &remote], || {
+    let stopped = stop_often(setup.store.root(), &["push", &remote], &setup.path("remote"), || {
         // Whatever has a record on the remote is whole there.
         let (code, err, seen) = setup.pull("seen", &[]);
         assert!(code == 0 || err.contains("nothing was pushed here") || err.contains("no such folder"), "{code} {err}");
         assert_clean(&seen);
         fs::remove_dir_all(setup.path("seen")).unwrap();
     });
-    assert!(stopped > 0);
-    let stopped = stop_often(&setup.path("other"), &["pull", &remote], || {
+    assert!(stopped > 2, "{stopped}");
+    let stopped = stop_often(&setup.path("other"), &["pull", &remote], &setup.path("other"), || {
         if setup.path("other").exists() {
             assert_clean(&Store::open(&setup.path("other")).unwrap());
         }
     });
-    assert!(stopped > 0);
+    assert!(stopped > 2, "{stopped}");
     assert_equal(&setup.store, &Store::open(&setup.path("other")).unwrap());
 }
 
