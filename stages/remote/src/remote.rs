@@ -25,7 +25,19 @@ pub(crate) struct Remote {
     pub(crate) files: Arc<dyn ObjectStore>,
     prefix: Path,
     name: String,
+    /// What a request that failed may lack.
+    hint: &'static str,
 }
+
+/// Variables by one of which a machine says who it is.
+const IDENTITIES: [&str; 5] = [
+    "AWS_ACCESS_KEY_ID",
+    "AWS_WEB_IDENTITY_TOKEN_FILE",
+    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+    "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+    "AWS_SKIP_SIGNATURE",
+];
+const NO_IDENTITY: &str = " (AWS_ACCESS_KEY_ID is not set, so the machine's own role was asked for)";
 
 /// Whether a remote is to be written.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -60,7 +72,7 @@ impl Remote {
         }
         // A record that survives a power cut must not outlive its artifact.
         let files = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
-        Ok(Self { files: Arc::new(files), prefix: Path::default(), name })
+        Ok(Self { files: Arc::new(files), prefix: Path::default(), name, hint: "" })
     }
 
     /// Credentials, region and endpoint come from the usual `AWS_…` variables.
@@ -79,7 +91,9 @@ impl Remote {
         let retry = RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
         let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_client_options(client).with_allow_http(plain);
         let files = builder.with_retry(retry).build().with_context(|| name.clone())?;
-        Ok(Self { files: Arc::new(files), prefix: Path::parse(prefix).with_context(|| name.clone())?, name })
+        let prefix = Path::parse(prefix).with_context(|| name.clone())?;
+        let hint = if IDENTITIES.iter().any(|name| std::env::var_os(name).is_some()) { "" } else { NO_IDENTITY };
+        Ok(Self { files: Arc::new(files), prefix, name, hint })
     }
 
     /// Where a file of the store is kept. Names with characters that a server or a file system may not take are percent-encoded.
@@ -95,12 +109,17 @@ impl Remote {
         if file.is_empty() { self.name.clone() } else { format!("{}/{file}", self.name) }
     }
 
+    /// A file in words, where a request for it failed.
+    pub(crate) fn failed(&self, file: &str) -> String {
+        format!("{}{}", self.name(file), self.hint)
+    }
+
     /// Opens a file; none where it isn't there.
     pub(crate) async fn get(&self, file: &str) -> anyhow::Result<Option<GetResult>> {
         match self.files.get(&self.path(file)).await {
             Ok(found) => Ok(Some(found)),
             Err(object_store::Error::NotFound { .. }) => Ok(None),
-            Err(error) => Err(error).with_context(|| self.name(file)),
+            Err(error) => Err(error).with_context(|| self.failed(file)),
         }
     }
 
@@ -110,7 +129,7 @@ impl Remote {
         let mut bytes = Vec::new();
         let mut stream = found.into_stream();
         while let Some(piece) = stream.next().await {
-            bytes.extend_from_slice(&piece.with_context(|| self.name(file))?);
+            bytes.extend_from_slice(&piece.with_context(|| self.failed(file))?);
             if bytes.len() as u64 > limit {
                 return Err(Failure::BadInput(format!("{}: more than {limit} bytes", self.name(file))).into());
             }
@@ -120,14 +139,14 @@ impl Remote {
 
     /// Writes a file at once: a reader sees the old or the new one.
     pub(crate) async fn write(&self, file: &str, bytes: Vec<u8>) -> anyhow::Result<()> {
-        self.files.put(&self.path(file), PutPayload::from(bytes)).await.with_context(|| self.name(file))?;
+        self.files.put(&self.path(file), PutPayload::from(bytes)).await.with_context(|| self.failed(file))?;
         Ok(())
     }
 
     /// Every file below a folder with its size.
     pub(crate) async fn list(&self, folder: &str) -> anyhow::Result<BTreeMap<Path, u64>> {
         let entries = self.files.list(Some(&self.path(folder))).map_ok(|meta| (meta.location, meta.size));
-        entries.try_collect().await.with_context(|| self.name(folder))
+        entries.try_collect().await.with_context(|| self.failed(folder))
     }
 
     /// Keys that have a record, sorted.
@@ -143,7 +162,9 @@ impl Remote {
             Some(bytes) => bytes,
             None if access == Access::Write => return self.write("format", format!("{STORE_FORMAT}\n").into_bytes()).await,
             None => {
-                return Err(Failure::BadInput(format!("{}: nothing was pushed here: it has no file `format`", self.name)).into());
+                return Err(
+                    Failure::BadInput(format!("{}: nothing was pushed here: there is no file `format`", self.name)).into()
+                );
             }
         };
         let text = String::from_utf8_lossy(&bytes);

@@ -45,10 +45,10 @@ impl Transfer {
             return self.remote.write(to, bytes).await;
         }
         let part = PART.max(entry.size.div_ceil(PARTS));
-        let upload = self.remote.files.put_multipart(&self.remote.path(to)).await.with_context(|| self.remote.name(to))?;
+        let upload = self.remote.files.put_multipart(&self.remote.path(to)).await.with_context(|| self.remote.failed(to))?;
         let mut upload = WriteMultipart::new_with_chunk_size(upload, part as usize);
         match self.write_parts(&mut upload, file, part, checked, from).await {
-            Ok(()) => upload.finish().await.map(|_| ()).with_context(|| self.remote.name(to)),
+            Ok(()) => upload.finish().await.map(|_| ()).with_context(|| self.remote.failed(to)),
             Err(error) => {
                 // The first error counts, whatever became of the clean-up.
                 upload.abort().await.ok();

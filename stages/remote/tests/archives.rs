@@ -180,7 +180,8 @@ const HARM: &[(&str, Harm)] = &[
     ("not sorted", |s| s.manifest(|m| m.files.push(m.files[0].clone()))),
     ("sizes that no disk has", |s| {
         s.manifest(|m| {
-            m.files.extend(["x", "y"].map(|path| FileEntry { path: path.into(), size: u64::MAX, blake3: String::new() }))
+            let huge = ["x", "y"].map(|path| FileEntry { path: path.into(), size: u64::MAX, blake3: String::new() });
+            m.files.extend(huge);
         });
     }),
     ("schema 2", |s| s.manifest(|m| m.schema = 2)),
