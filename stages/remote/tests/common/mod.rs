@@ -3,7 +3,7 @@
 #![allow(dead_code, reason = "no test uses all of it")]
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use artifact::{Entered, Locked, Record, Store, Unfinished};
@@ -108,4 +108,41 @@ pub(crate) fn assert_equal(one: &Store, other: &Store) {
     assert_clean(other);
     assert_eq!(one.records().unwrap(), other.records().unwrap());
     assert_eq!(one.objects().unwrap(), other.objects().unwrap());
+}
+
+/// A sample store in a folder of its own, and the place of a remote beside it.
+pub(crate) struct Setup {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) store: Store,
+    pub(crate) records: Vec<Record>,
+}
+
+impl Setup {
+    pub(crate) fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let (store, records) = sample(&dir.path().join("store"));
+        Self { dir, store, records }
+    }
+
+    pub(crate) fn pushed() -> Self {
+        let setup = Self::new();
+        succeed(&mut command(setup.store.root(), &["push", &setup.remote()]));
+        setup
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    pub(crate) fn remote(&self) -> String {
+        self.path("remote").display().to_string()
+    }
+
+    /// Pulls into a store; exit code and stderr.
+    pub(crate) fn pull(&self, store: &str, words: &[&str]) -> (i32, String, Store) {
+        let remote = self.remote();
+        let words: Vec<&str> = ["pull", &remote].into_iter().chain(words.iter().copied()).collect();
+        let (code, _, err) = said(&mut command(&self.path(store), &words));
+        (code, err, Store::open(&self.path(store)).unwrap())
+    }
 }
