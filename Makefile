@@ -15,7 +15,7 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build setup test faults lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build remote setup test faults lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -23,15 +23,20 @@ help: ## Show the targets
 setup: ## Put libtorch into .libtorch (once)
 	@scripts/setup-libtorch.sh
 
-build: setup ## Build everything in the release profile
-	@cargo build --release --workspace --quiet
+# The one program with a network in it is built apart: in one build, what it asks of shared crates would have all others built again.
+REMOTE := nerf-sr-remote
+build: setup ## Build everything but nerf-sr-remote in the release profile
+	@cargo build --release --workspace --exclude $(REMOTE) --quiet
+
+remote: ## Build nerf-sr-remote, which shares stores between machines
+	@cargo build --release -p $(REMOTE) --quiet
 
 demo: build ## Set-up, build, demo scene ×2, and the page
 	@$(NERF_SR) run
 
-test: build ## Every test, the skipped and the slowest named; FILTER=WORDS for some of them
+test: build remote ## Every test, the skipped and the slowest named; FILTER=WORDS for some of them
 	@python3 scripts/run-tests.py $(FILTER)
-	cargo test --release --workspace --doc --quiet
+	cargo test --release --workspace --exclude $(REMOTE) --doc --quiet
 
 KILLS ?= 200
 RUNNERS ?= 10

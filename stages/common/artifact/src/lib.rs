@@ -37,6 +37,7 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod amounts;
+mod arrivals;
 mod canonical;
 mod console;
 mod describe;
@@ -66,6 +67,7 @@ mod values;
 mod warnings;
 
 pub use amounts::{amount, counted, sized};
+pub use arrivals::Arrival;
 pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
 pub use describe::{Description, Input, Output};
@@ -87,7 +89,9 @@ pub use run_record::{FailedPoint, RunInput, RunNode, RunRecord};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{Attempt, Checked, KEY_VERSION, KEY_VERSION_PART, Record, Store, StoreError, Unfinished, label};
+pub use store::{
+    Attempt, Checked, FORMAT as STORE_FORMAT, KEY_VERSION, KEY_VERSION_PART, Record, Store, StoreError, Unfinished, label,
+};
 pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.

@@ -124,7 +124,7 @@ pub enum StoreError {
 }
 
 /// Version of a store's layout. It grows when an older runner could harm what a newer one wrote.
-const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 1;
 
 /// An action being carried out: where it writes.
 #[derive(Debug)]
@@ -176,10 +176,13 @@ impl Store {
 
     /// The record of a key, if the action was done and its object is whole (sizes only; see [`Store::verify`]).
     pub fn hit(&self, key: &str) -> Option<Record> {
-        let record = self.record(key)?;
-        let manifest = self.manifest(&record.output).ok().filter(|manifest| manifest.identity() == record.output)?;
-        manifest.check_sizes(&self.object(&record.output)).ok()?;
-        Some(record)
+        self.record(key).filter(|record| self.is_whole(&record.output))
+    }
+
+    /// Whether an object has its own manifest and files of the right sizes; no content is read.
+    pub fn is_whole(&self, identity: &str) -> bool {
+        let manifest = self.manifest(identity).ok().filter(|manifest| manifest.identity() == identity);
+        manifest.is_some_and(|manifest| manifest.check_sizes(&self.object(identity)).is_ok())
     }
 
     /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut short or another's, that is
@@ -319,11 +322,7 @@ impl Store {
         if found.files.is_empty() {
             return Err(StoreError::NoArtifact("it has no files".to_owned()));
         }
-        for file in found.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
-            let path = output.join(file);
-            at(&path, File::open(&path).and_then(|f| f.sync_all()))?;
-        }
-        at(output, sync_folder(output))?;
+        make_durable(output, &found)?;
         let identity = found.identity();
         // What is there already under that name and isn't whole gives way.
         let is_there = self.verify(&identity).is_ok();
@@ -335,25 +334,34 @@ impl Store {
     pub fn publish(&self, _: &Entered, checked: Checked, mut record: Record) -> Result<Record, StoreError> {
         let Checked { attempt, identity, is_there } = checked;
         record.output = identity;
-        let object = self.object(&record.output);
-        if !is_there || !object.exists() {
-            if object.symlink_metadata().is_ok() {
-                self.discard(&object)?;
-            }
-            at(&object, fs::rename(&attempt.output, &object))?;
-            at(&object, sync_folder(&self.root.join("objects")))?;
-        }
-        let key = record.key();
-        let log = self.action(&key, "log");
+        self.place(&attempt.output, &record.output, is_there)?;
+        let log = self.action(&record.key(), "log");
         if attempt.log.exists() {
             at(&log, fs::rename(&attempt.log, &log))?;
         }
-        let path = self.action(&key, "json");
-        let mut text = serde_json::to_string_pretty(&record).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
-        text.push('\n');
-        at(&path, write_atomically(&path, text.as_bytes()))?;
+        self.write_record(&record)?;
         at(&attempt.folder, fs::remove_dir_all(&attempt.folder))?;
         Ok(record)
+    }
+
+    /// Moves a checked folder to an object's place, unless a whole object `is_there`.
+    pub(crate) fn place(&self, folder: &Path, identity: &str, is_there: bool) -> Result<(), StoreError> {
+        let object = self.object(identity);
+        if is_there && object.exists() {
+            return Ok(());
+        }
+        if object.symlink_metadata().is_ok() {
+            self.discard(&object)?;
+        }
+        at(&object, fs::rename(folder, &object))?;
+        at(&object, sync_folder(&self.root.join("objects")))
+    }
+
+    pub(crate) fn write_record(&self, record: &Record) -> Result<(), StoreError> {
+        let path = self.action(&record.key(), "json");
+        let mut text = serde_json::to_string_pretty(record).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
+        text.push('\n');
+        at(&path, write_atomically(&path, text.as_bytes()))
     }
 
     /// Re-hashes one object.
@@ -407,6 +415,15 @@ impl Store {
         }
         Ok(())
     }
+}
+
+/// Makes the files of an artifact durable, its manifest among them.
+pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), StoreError> {
+    for file in manifest.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
+        let path = folder.join(file);
+        at(&path, File::open(&path).and_then(|f| f.sync_all()))?;
+    }
+    at(folder, sync_folder(folder))
 }
 
 /// Refuses a store of a newer form; marks one that isn't marked yet.

@@ -1,0 +1,102 @@
+use std::path::{Path, PathBuf};
+
+use crate::lock::Entered;
+use crate::manifest::{Damage, MANIFEST_FILE, Manifest};
+use crate::store::{Record, Store, StoreError, make_durable};
+
+/// An artifact from another store, found whole in a scratch folder of this one.
+#[derive(Debug)]
+pub struct Arrival {
+    folder: PathBuf,
+    identity: String,
+    /// Whether what lies in its place isn't whole.
+    replaces: bool,
+}
+
+impl Store {
+    /// Looks at what came from another store: every file against the manifest, the manifest against the identity. Makes it
+    /// durable. This takes its time; taking it in ([`Store::take_in`]) doesn't.
+    pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
+        let manifest = Manifest::read(folder)?;
+        if manifest.identity() != identity {
+            return Err(Damage::Content { path: folder.join(MANIFEST_FILE) }.into());
+        }
+        manifest.check_contents(folder)?;
+        make_durable(folder, &manifest)?;
+        let replaces = self.object(identity).symlink_metadata().is_ok() && self.verify(identity).is_err();
+        Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), replaces })
+    }
+
+    /// Takes in an object that came from another store. A whole one that is there stays.
+    pub fn take_in(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
+        // Somebody else may have put it there meanwhile: then readers shall not miss it for a moment.
+        let is_there = !arrival.replaces && self.is_whole(&arrival.identity);
+        self.place(&arrival.folder, &arrival.identity, is_there)
+    }
+
+    /// Takes in a record that came from another store, after its object; whether it was new. The record that is there stays,
+    /// unless its object isn't whole and the new one's is.
+    pub fn take_in_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
+        let known = self.record(&record.key());
+        let stays = known.is_some_and(|known| self.is_whole(&known.output) || !self.is_whole(&record.output) || known == *record);
+        if !stays {
+            self.write_record(record)?;
+        }
+        Ok(!stays)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Locked, write_json};
+    use std::fs;
+
+    fn arriving(store: &Store, content: &str) -> (PathBuf, String) {
+        let folder = store.scratch("run").join("arriving");
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(folder.join("x"), content).unwrap();
+        let manifest = Manifest::of_folder("text", &folder).unwrap();
+        write_json(&folder.join(MANIFEST_FILE), &manifest).unwrap();
+        (folder, manifest.identity())
+    }
+
+    fn record(output: &str, host: &str) -> Record {
+        Record { stage: "s".to_owned(), output: output.to_owned(), host: host.to_owned(), ..Record::default() }
+    }
+
+    /// The first record of a whole artifact stays; damaged objects give way.
+    #[test]
+    fn what_is_whole_stays() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let Locked::Held(entered) = store.try_enter().unwrap() else { panic!("closed") };
+        let take = |host: &str| {
+            let (folder, identity) = arriving(&store, "1234");
+            store.take_in(&entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
+            (store.take_in_record(&entered, &record(&identity, host)).unwrap(), identity)
+        };
+        let (is_new, identity) = take("first");
+        assert!(is_new);
+        assert!(!take("second").0);
+        let key = record("", "").key();
+        assert_eq!(store.hit(&key).unwrap().host, "first");
+        fs::write(store.object(&identity).join("x"), "12").unwrap();
+        take("third");
+        store.verify(&identity).unwrap();
+        assert_eq!(store.hit(&key).unwrap().host, "first");
+    }
+
+    #[test]
+    fn what_is_not_whole_is_not_taken_in() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let (folder, identity) = arriving(&store, "1234");
+        assert!(matches!(store.check_arrival(&folder, &"0".repeat(64)), Err(StoreError::Damage(Damage::Content { .. }))));
+        fs::write(folder.join("x"), "1235").unwrap();
+        assert!(matches!(store.check_arrival(&folder, &identity), Err(StoreError::Damage(Damage::Content { .. }))));
+        fs::remove_file(folder.join("x")).unwrap();
+        assert!(matches!(store.check_arrival(&folder, &identity), Err(StoreError::Damage(Damage::Unreadable { .. }))));
+        assert!(store.objects().unwrap().is_empty());
+    }
+}

@@ -1,0 +1,5 @@
+//! `nerf-sr-remote`: shares a store between machines.
+
+fn main() -> std::process::ExitCode {
+    remote::main()
+}

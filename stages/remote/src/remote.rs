@@ -1,0 +1,181 @@
+use std::collections::BTreeMap;
+use std::path::Path as FilePath;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::Context as _;
+use artifact::{Failure, STORE_FORMAT};
+use futures_util::{StreamExt as _, TryStreamExt as _};
+use object_store::aws::AmazonS3Builder;
+use object_store::local::LocalFileSystem;
+use object_store::path::Path;
+use object_store::{ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig};
+
+/// A server that says nothing for so long is given up.
+const SILENCE: Duration = Duration::from_secs(60);
+/// For so long, and so often, a request is made again that failed for a reason that may pass.
+const RETRYING: Duration = Duration::from_secs(60);
+const RETRIES: usize = 6;
+/// What `format` may hold.
+const FORMAT_LIMIT: u64 = 100;
+
+/// A place that machines share, laid out as a store: a folder, or a prefix in an S3 bucket.
+#[derive(Clone, Debug)]
+pub(crate) struct Remote {
+    pub(crate) files: Arc<dyn ObjectStore>,
+    prefix: Path,
+    name: String,
+    /// What a request that failed may lack.
+    hint: &'static str,
+}
+
+/// Variables by one of which a machine says who it is.
+const IDENTITIES: [&str; 5] = [
+    "AWS_ACCESS_KEY_ID",
+    "AWS_WEB_IDENTITY_TOKEN_FILE",
+    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+    "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+    "AWS_SKIP_SIGNATURE",
+];
+const NO_IDENTITY: &str = " (AWS_ACCESS_KEY_ID is not set, so the machine's own role was asked for)";
+
+/// Whether a remote is to be written.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Access {
+    Read,
+    Write,
+}
+
+impl Remote {
+    /// The remote that a user names. A folder that is to be written is made.
+    pub(crate) fn open(place: &str, access: Access) -> anyhow::Result<Self> {
+        let name = place.trim_end_matches('/').to_owned();
+        match place.split_once("://") {
+            Some(("s3", rest)) => Self::open_s3(rest.trim_end_matches('/'), name),
+            Some((scheme, _)) => {
+                let message = format!("{place}: {scheme}:// is not known; a remote is a folder or s3://bucket/prefix");
+                Err(Failure::Usage(message).into())
+            }
+            None => Self::open_folder(FilePath::new(place), name, access),
+        }
+    }
+
+    fn open_folder(folder: &FilePath, name: String, access: Access) -> anyhow::Result<Self> {
+        if access == Access::Write {
+            if folder.join("locks").exists() {
+                let message = format!("{name}: a store of nerf-sr's own, which only a run may write; name another folder");
+                return Err(Failure::Usage(message).into());
+            }
+            std::fs::create_dir_all(folder).with_context(|| name.clone())?;
+        } else if !folder.is_dir() {
+            return Err(Failure::BadInput(format!("{name}: there is no such folder")).into());
+        }
+        // A record that survives a power cut must not outlive its artifact.
+        let files = LocalFileSystem::new_with_prefix(folder)?.with_fsync(true);
+        Ok(Self { files: Arc::new(files), prefix: Path::default(), name, hint: "" })
+    }
+
+    /// Credentials, region and endpoint come from the usual `AWS_…` variables.
+    fn open_s3(rest: &str, name: String) -> anyhow::Result<Self> {
+        let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
+        if bucket.is_empty() {
+            return Err(Failure::Usage(format!("{name}: names no bucket; a remote is a folder or s3://bucket/prefix")).into());
+        }
+        // With another provider set already, that one is as good.
+        rustls::crypto::ring::default_provider().install_default().ok();
+        let endpoint =
+            ["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"].into_iter().find_map(|v| std::env::var(v).ok());
+        // A limit on a whole request would stop large files on slow lines.
+        let client = ClientOptions::new().with_timeout_disabled().with_read_timeout(SILENCE);
+        let plain = endpoint.is_some_and(|endpoint| endpoint.starts_with("http://"));
+        let retry = RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
+        let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_client_options(client).with_allow_http(plain);
+        let files = builder.with_retry(retry).build().with_context(|| name.clone())?;
+        let prefix = Path::parse(prefix).with_context(|| name.clone())?;
+        let hint = if IDENTITIES.iter().any(|name| std::env::var_os(name).is_some()) { "" } else { NO_IDENTITY };
+        Ok(Self { files: Arc::new(files), prefix, name, hint })
+    }
+
+    /// Where a file of the store is kept. Names with characters that a server or a file system may not take are percent-encoded.
+    pub(crate) fn path(&self, file: &str) -> Path {
+        let is_plain = |c: char| !c.is_control() && !"%#\\?*:<>|\"{}[]^`~".contains(c);
+        let path = if file.chars().all(is_plain) { Path::parse(file).ok() } else { None };
+        let path = path.unwrap_or_else(|| Path::from(file));
+        self.prefix.parts().chain(path.parts()).collect()
+    }
+
+    /// A file of the remote in words.
+    pub(crate) fn name(&self, file: &str) -> String {
+        if file.is_empty() { self.name.clone() } else { format!("{}/{file}", self.name) }
+    }
+
+    /// A file in words, where a request for it failed.
+    pub(crate) fn failed(&self, file: &str) -> String {
+        format!("{}{}", self.name(file), self.hint)
+    }
+
+    /// Opens a file; none where it isn't there.
+    pub(crate) async fn get(&self, file: &str) -> anyhow::Result<Option<GetResult>> {
+        match self.files.get(&self.path(file)).await {
+            Ok(found) => Ok(Some(found)),
+            Err(object_store::Error::NotFound { .. }) => Ok(None),
+            Err(error) => Err(error).with_context(|| self.failed(file)),
+        }
+    }
+
+    /// Reads a file that is small unless somebody means harm.
+    pub(crate) async fn read(&self, file: &str, limit: u64) -> anyhow::Result<Option<Vec<u8>>> {
+        let Some(found) = self.get(file).await? else { return Ok(None) };
+        let mut bytes = Vec::new();
+        let mut stream = found.into_stream();
+        while let Some(piece) = stream.next().await {
+            bytes.extend_from_slice(&piece.with_context(|| self.failed(file))?);
+            if bytes.len() as u64 > limit {
+                return Err(Failure::BadInput(format!("{}: more than {limit} bytes", self.name(file))).into());
+            }
+        }
+        Ok(Some(bytes))
+    }
+
+    /// Writes a file at once: a reader sees the old or the new one.
+    pub(crate) async fn write(&self, file: &str, bytes: Vec<u8>) -> anyhow::Result<()> {
+        self.files.put(&self.path(file), PutPayload::from(bytes)).await.with_context(|| self.failed(file))?;
+        Ok(())
+    }
+
+    /// Every file below a folder with its size.
+    pub(crate) async fn list(&self, folder: &str) -> anyhow::Result<BTreeMap<Path, u64>> {
+        let entries = self.files.list(Some(&self.path(folder))).map_ok(|meta| (meta.location, meta.size));
+        entries.try_collect().await.with_context(|| self.failed(folder))
+    }
+
+    /// Keys that have a record, sorted.
+    pub(crate) async fn keys(&self) -> anyhow::Result<Vec<String>> {
+        let files = self.list("actions").await?;
+        let keys = files.keys().filter_map(|path| Some(path.filename()?.strip_suffix(".json")?.to_owned()));
+        Ok(keys.filter(|key| crate::selection::is_hash(key)).collect())
+    }
+
+    /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for writing.
+    pub(crate) async fn check_format(&self, access: Access) -> anyhow::Result<()> {
+        let bytes = match self.read("format", FORMAT_LIMIT).await? {
+            Some(bytes) => bytes,
+            None if access == Access::Write => return self.write("format", format!("{STORE_FORMAT}\n").into_bytes()).await,
+            None => {
+                return Err(
+                    Failure::BadInput(format!("{}: nothing was pushed here: there is no file `format`", self.name)).into()
+                );
+            }
+        };
+        let text = String::from_utf8_lossy(&bytes);
+        match text.trim().parse::<u32>() {
+            Ok(found) if found <= STORE_FORMAT => Ok(()),
+            _ => Err(Failure::BadInput(format!(
+                "{}: the remote has format {}, this nerf-sr-remote knows format {STORE_FORMAT}; use the newer nerf-sr-remote, or another remote",
+                self.name,
+                text.trim()
+            ))
+            .into()),
+        }
+    }
+}

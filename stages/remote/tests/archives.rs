@@ -1,0 +1,299 @@
+//! Export and import, with the real program and with archives that mean harm.
+
+mod common;
+
+use std::fs;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+use artifact::{FileEntry, Manifest, Record, Store};
+use common::{assert_clean, assert_equal, assert_tidy, command, said, sample, succeed};
+use serde_json::{Value, json};
+
+fn exported(dir: &Path, store: &Store, what: &str, options: &[&str]) -> PathBuf {
+    let file = dir.join("export.tar");
+    let name = file.display().to_string();
+    let words: Vec<&str> = ["export", what, &name].into_iter().chain(options.iter().copied()).collect();
+    succeed(&mut command(store.root(), &words));
+    file
+}
+
+fn import(file: &Path, store: &Path) -> (i32, String, String) {
+    said(&mut command(store, &["import", &file.display().to_string()]))
+}
+
+#[test]
+fn an_artifact_travels_with_its_history() {
+    let dir = tempfile::tempdir().unwrap();
+    let (store, records) = sample(&dir.path().join("store"));
+    let eval = &records[3];
+    let file = exported(dir.path(), &store, &eval.output[..9], &[]);
+    let bytes = fs::read(&file).unwrap();
+    // Equal histories make equal bytes, whatever the file's name and whichever way they were asked for.
+    let (again, _) = sample(&dir.path().join("again"));
+    assert!(bytes == fs::read(exported(dir.path(), &again, &eval.key(), &[])).unwrap());
+    let other = dir.path().join("other");
+    let (code, out, err) = import(&file, &other);
+    assert!(code == 0 && err.is_empty() && out.contains("3 records and 3 artifacts read"), "{out}{err}");
+    let other = Store::open(&other).unwrap();
+    assert_clean(&other);
+    assert_tidy(&other);
+    for record in [&records[0], &records[2], eval] {
+        assert_eq!(other.hit(&record.key()).as_ref(), Some(record));
+    }
+    let (code, out, _) = import(&file, other.root());
+    assert!(code == 0 && out.contains("0 records new"), "{out}");
+    // An artifact that two actions made comes with both.
+    exported(dir.path(), &store, &records[0].output, &[]);
+    assert!(import(&file, other.root()).1.contains("2 records and 1 artifact read"));
+    assert_equal(&store, &other);
+    assert!(store.runs().unwrap().is_empty());
+}
+
+#[test]
+fn a_history_may_be_records_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let (store, records) = sample(&dir.path().join("store"));
+    let file = exported(dir.path(), &store, &records[3].key(), &["--records-only"]);
+    assert!(fs::metadata(&file).unwrap().len() < 20_000);
+    let other = dir.path().join("other");
+    assert!(import(&file, &other).1.contains("3 records and 1 artifact read"));
+    let other = Store::open(&other).unwrap();
+    assert_eq!(other.hit(&records[3].key()).as_ref(), Some(&records[3]));
+    assert_eq!((other.record(&records[2].key()).as_ref(), other.hit(&records[2].key())), (Some(&records[2]), None));
+    // The artifacts may follow.
+    let file = exported(dir.path(), &store, &records[3].key(), &[]);
+    import(&file, other.root());
+    assert_clean(&other);
+}
+
+#[test]
+fn what_is_not_whole_is_not_exported() {
+    let dir = tempfile::tempdir().unwrap();
+    let (store, records) = sample(&dir.path().join("store"));
+    let file = dir.path().join("x.tar").display().to_string();
+    let refused = |what: &str, code: i32, reason: &str| {
+        let (found, _, err) = said(&mut command(store.root(), &["export", what, &file]));
+        assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{found} {err}");
+        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "nothing is left behind");
+    };
+    refused("zz", 2, "no artifact or action \"zz\"");
+    let path = store.object(&records[3].output).join("metrics.json");
+    fs::write(&path, "{\"psnr\": 31.26}").unwrap();
+    refused(&records[3].key(), 3, "metrics.json: the content is not what was written");
+    fs::remove_file(&path).unwrap();
+    refused(&records[3].key(), 3, "the artifact is not whole");
+}
+
+/// An entry of an archive, as bytes say it.
+#[derive(Clone)]
+struct Entry {
+    path: String,
+    kind: tar::EntryType,
+    /// What the header says, where it lies.
+    size: Option<u64>,
+    bytes: Vec<u8>,
+}
+
+fn plain(path: &str, bytes: &[u8]) -> Entry {
+    Entry { path: path.to_owned(), kind: tar::EntryType::Regular, size: None, bytes: bytes.to_vec() }
+}
+
+fn entries_of(file: &Path) -> Vec<Entry> {
+    let mut archive = tar::Archive::new(fs::File::open(file).unwrap());
+    let entries = archive.entries().unwrap().map(|entry| {
+        let mut entry = entry.unwrap();
+        let mut bytes = Vec::new();
+        entry.read_to_end(&mut bytes).unwrap();
+        plain(entry.path().unwrap().to_str().unwrap(), &bytes)
+    });
+    entries.collect()
+}
+
+/// The archive, without any of the checks of a library that means well.
+fn archive(entries: &[Entry]) -> Vec<u8> {
+    let mut out = Vec::new();
+    for entry in entries {
+        let mut header = tar::Header::new_gnu();
+        header.as_old_mut().name[..entry.path.len()].copy_from_slice(entry.path.as_bytes());
+        header.set_size(entry.size.unwrap_or(entry.bytes.len() as u64));
+        header.set_mode(0o644);
+        header.set_entry_type(entry.kind);
+        if entry.kind.is_symlink() || entry.kind.is_hard_link() {
+            header.set_link_name("/etc/passwd").unwrap();
+        }
+        header.set_cksum();
+        out.extend_from_slice(header.as_bytes());
+        out.extend_from_slice(&entry.bytes);
+        out.resize(out.len().next_multiple_of(512), 0);
+    }
+    out.resize(out.len() + 1024, 0);
+    out
+}
+
+/// An archive of one small artifact, in which anything may be changed.
+struct Sample {
+    entries: Vec<Entry>,
+    record: Record,
+    manifest: Manifest,
+}
+
+const INDEX: usize = 0;
+const MANIFEST: usize = 1;
+const FILE: usize = 2;
+const RECORD: usize = 3;
+
+impl Sample {
+    fn index(&mut self, change: impl FnOnce(&mut Value)) {
+        let mut index: Value = serde_json::from_slice(&self.entries[INDEX].bytes).unwrap();
+        change(&mut index);
+        self.entries[INDEX].bytes = serde_json::to_vec(&index).unwrap();
+    }
+
+    /// All agrees, but the manifest is this one.
+    fn manifest(&mut self, change: impl FnOnce(&mut Manifest)) {
+        change(&mut self.manifest);
+        let identity = self.manifest.identity();
+        let record = Record { output: identity.clone(), ..self.record.clone() };
+        self.index(|index| (index["objects"], index["artifact"]) = (json!([identity]), json!(identity)));
+        let path = |file: &str| format!("objects/{identity}/{file}");
+        self.entries[MANIFEST] = plain(&path("artifact.json"), &serde_json::to_vec(&self.manifest).unwrap());
+        self.entries[FILE].path = path(&self.manifest.files[0].path);
+        self.entries[RECORD].bytes = serde_json::to_vec(&record).unwrap();
+    }
+
+    fn record(&mut self, change: impl FnOnce(&mut Record)) {
+        let mut record = self.record.clone();
+        change(&mut record);
+        self.entries[RECORD].bytes = serde_json::to_vec(&record).unwrap();
+    }
+}
+
+type Harm = fn(&mut Sample);
+
+const HARM: &[(&str, Harm)] = &[
+    ("\"../../evil\" where", |s| s.entries[FILE].path = "../../evil".into()),
+    ("\"/tmp/evil\" where", |s| s.entries[FILE].path = "/tmp/evil".into()),
+    ("not a path inside", |s| s.manifest(|m| m.files[0].path = "../../../../evil".into())),
+    ("not a path inside", |s| s.manifest(|m| m.files[0].path = "/tmp/evil".into())),
+    ("not the path of", |s| s.manifest(|m| m.files[0].path = "artifact.json".into())),
+    ("not sorted", |s| s.manifest(|m| m.files.push(m.files[0].clone()))),
+    ("sizes that no disk has", |s| {
+        s.manifest(|m| {
+            let huge = ["x", "y"].map(|path| FileEntry { path: path.into(), size: u64::MAX, blake3: String::new() });
+            m.files.extend(huge);
+        });
+    }),
+    ("schema 2", |s| s.manifest(|m| m.schema = 2)),
+    ("no plain file (Symlink)", |s| s.entries[FILE].kind = tar::EntryType::Symlink),
+    ("no plain file (Link)", |s| s.entries[FILE].kind = tar::EntryType::Link),
+    ("no plain file (Directory)", |s| s.entries[FILE].kind = tar::EntryType::Directory),
+    ("no plain file (Fifo)", |s| s.entries[FILE].kind = tar::EntryType::Fifo),
+    ("no plain file (GNUSparse)", |s| s.entries[FILE].kind = tar::EntryType::GNUSparse),
+    ("no plain file (XHeader)", |s| s.entries[FILE].kind = tar::EntryType::XHeader),
+    ("where \"export.json\"", |s| {
+        let long = vec![b'x'; 1 << 20];
+        s.entries.insert(0, Entry { kind: tar::EntryType::GNULongName, ..plain("long", &long) });
+    }),
+    ("no plain file (GNULongName)", |s| {
+        let long = Entry { kind: tar::EntryType::GNULongName, ..plain("long", b"export.json") };
+        s.entries.splice(0..0, [long.clone(), long]);
+    }),
+    ("17 bytes where the manifest says 15", |s| s.entries[FILE].bytes.extend(b"  ")),
+    ("14 bytes where the manifest says 15", |s| s.entries[FILE].bytes.truncate(14)),
+    ("9000000000 bytes where", |s| s.entries[FILE].size = Some(9_000_000_000)),
+    ("has 9000000000 bytes, more than", |s| s.entries[INDEX].size = Some(9_000_000_000)),
+    ("has 9000000000 bytes, more than", |s| s.entries[RECORD].size = Some(9_000_000_000)),
+    ("it ends within", |s| s.entries[RECORD].size = Some(1_000_000)),
+    ("metrics.json: the content is not what was written", |s| s.entries[FILE].bytes[3] ^= 1),
+    ("its blake3 is not the artifact's name", |s| {
+        let manifest = Manifest { kind: "other".into(), ..s.manifest.clone() };
+        s.entries[MANIFEST].bytes = serde_json::to_vec(&manifest).unwrap();
+    }),
+    ("not a manifest", |s| s.entries[MANIFEST].bytes = b"[]".to_vec()),
+    ("not a record", |s| s.entries[RECORD].bytes = b"{}".to_vec()),
+    ("its key is not its name", |s| s.record(|r| drop(r.key_parts.insert("x".into(), json!(1))))),
+    ("is not a hash", |s| s.record(|r| r.output = "../../../evil".into())),
+    ("is not a hash", |s| s.record(|r| r.made_of = vec!["/tmp/evil".into()])),
+    ("no record says what made", |s| s.record(|r| r.output = "0".repeat(64))),
+    ("no record says what made", |s| s.index(|i| i["artifact"] = json!("0".repeat(64)))),
+    ("no sorted hashes", |s| s.index(|i| i["objects"] = json!(["../../evil"]))),
+    ("no sorted hashes", |s| s.index(|i| i["actions"] = json!([i["actions"][0], i["actions"][0]]))),
+    ("export format 2", |s| s.index(|i| i["export"] = json!(2))),
+    ("store format 2", |s| s.index(|i| i["store"] = json!(2))),
+    ("export format null", |s| s.index(|i| *i = json!([]))),
+    ("unknown field `more`", |s| s.index(|i| i["more"] = json!(1))),
+    ("where the end should be", |s| s.entries.push(plain("more", b""))),
+    ("it ends before \"actions/", |s| s.entries.truncate(RECORD)),
+    ("where \"export.json\" should follow", |s| drop(s.entries.remove(INDEX))),
+    ("where \"objects/", |s| s.entries.swap(MANIFEST, FILE)),
+];
+
+fn small_export(dir: &Path) -> (Vec<Entry>, Record, Manifest) {
+    let store = Store::open(&dir.join("store")).unwrap();
+    let record = common::make(&store, "eval", &[], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
+    let entries = entries_of(&exported(dir, &store, &record.output, &[]));
+    let manifest = store.manifest(&record.output).unwrap();
+    (entries, record, manifest)
+}
+
+/// Imports bytes that must be refused in one line, and leave nothing behind.
+fn refused(dir: &Path, bytes: &[u8], reason: &str) {
+    let (file, folder) = (dir.join("hostile.tar"), dir.join("inner/other"));
+    fs::write(&file, bytes).unwrap();
+    let (code, _, err) = import(&file, &folder);
+    assert!(code == 3 && err.contains(reason) && err.lines().count() == 1, "{reason}: {code} {err}");
+    let other = Store::open(&folder).unwrap();
+    assert!(other.objects().unwrap().is_empty() && other.action_files().unwrap().is_empty(), "{reason}");
+    assert_tidy(&other);
+    fs::remove_dir_all(dir.join("inner")).unwrap();
+    let left: Vec<_> = fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left.len(), 3, "{reason}: {left:?}");
+    assert!(!Path::new("/tmp/evil").exists());
+}
+
+#[test]
+fn hostile_archives_are_refused_in_one_line() {
+    let dir = tempfile::tempdir().unwrap();
+    let (entries, record, manifest) = small_export(dir.path());
+    let sample = || Sample { entries: entries.clone(), record: record.clone(), manifest: manifest.clone() };
+    let whole = archive(&sample().entries);
+    fs::write(dir.path().join("hostile.tar"), &whole).unwrap();
+    assert_eq!(import(&dir.path().join("hostile.tar"), &dir.path().join("fine")).0, 0, "the builder's archives are read");
+    fs::remove_dir_all(dir.path().join("fine")).unwrap();
+    for (reason, harm) in HARM {
+        let mut sample = sample();
+        harm(&mut sample);
+        refused(dir.path(), &archive(&sample.entries), reason);
+    }
+}
+
+/// Wherever an archive is cut, and whichever byte of the small one is flipped, nothing wrong comes in.
+#[test]
+fn cut_and_flipped_archives() {
+    let dir = tempfile::tempdir().unwrap();
+    let (entries, record, _) = small_export(dir.path());
+    let whole = archive(&entries);
+    let end = whole.len() - 1024;
+    for length in [0, 1, 511, 512, 700, 1024, 1536, 2048, 2600, end - 600, end - 512] {
+        refused(dir.path(), &whole[..length], "");
+    }
+    refused(dir.path(), b"neither tar nor anything else\n", "no tar file");
+    refused(dir.path(), &vec![b'x'; 2048], "no tar file");
+    for place in (0..end).step_by(41) {
+        let mut bytes = whole.clone();
+        bytes[place] ^= 1;
+        let file = dir.path().join("flipped.tar");
+        fs::write(&file, bytes).unwrap();
+        let (code, _, err) = import(&file, &dir.path().join("flipped"));
+        let store = Store::open(&dir.path().join("flipped")).unwrap();
+        // A flipped bit may lie in padding, or in words of a record that no hash covers.
+        assert!(
+            code == 0 || (code == 3 && err.lines().count() == 1 && store.objects().unwrap().is_empty()),
+            "{place}: {code} {err}"
+        );
+        store.objects().unwrap().iter().for_each(|object| assert_eq!(*object, record.output));
+        assert_clean(&store);
+        fs::remove_dir_all(store.root()).unwrap();
+    }
+}

@@ -1,0 +1,148 @@
+//! A store with a few finished actions, and the program.
+
+#![allow(dead_code, reason = "no test uses all of it")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use artifact::{Entered, Locked, Record, Store, Unfinished};
+use serde_json::json;
+
+pub(crate) fn entered(store: &Store) -> Entered {
+    match store.try_enter().unwrap() {
+        Locked::Held(entered) => entered,
+        Locked::By(_) => panic!("closed"),
+    }
+}
+
+/// An action as a runner carries it out.
+pub(crate) fn make(store: &Store, stage: &str, made_of: &[&Record], files: &[(&str, Vec<u8>)]) -> Record {
+    let key_parts = json!({ "stage": stage }).as_object().unwrap().clone();
+    let made_of: Vec<String> = made_of.iter().map(|record| record.key()).collect();
+    let stage = stage.to_owned();
+    let action = Unfinished { stage, key_parts, made_of, started_unix: 7, ..Default::default() };
+    let attempt = store.begin(&entered(store), &action, &json!({})).unwrap();
+    for (path, bytes) in files {
+        let file = attempt.output.join(path);
+        fs::create_dir_all(file.parent().unwrap()).unwrap();
+        fs::write(file, bytes).unwrap();
+    }
+    let checked = store.check(attempt, "text").unwrap();
+    let Unfinished { stage, key_parts, made_of, started_unix, .. } = action;
+    let record = Record { stage, key_parts, made_of, started_unix, host: "here".into(), ..Record::default() };
+    store.publish(&entered(store), checked, record).unwrap()
+}
+
+/// Bytes that no compression and no hole in a file makes smaller.
+pub(crate) fn bytes(count: usize, seed: u64) -> Vec<u8> {
+    let mut state = seed;
+    let mut next = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 56) as u8
+    };
+    (0..count).map(|_| next()).collect()
+}
+
+/// prep and again make one artifact, train is made of prep and has a file in several parts, eval is made of both.
+pub(crate) fn sample(folder: &Path) -> (Store, Vec<Record>) {
+    let store = Store::open(folder).unwrap();
+    let images = [
+        ("train/Bäume 写真.png", bytes(3000, 1)),
+        ("train/50% ~ [a]#12", bytes(2000, 2)),
+        ("train/r_0#1", bytes(10, 3)),
+        ("empty", Vec::new()),
+        ("views.json", b"{\"views\": []}".to_vec()),
+    ];
+    let prep = make(&store, "prep", &[], &images);
+    let again = make(&store, "again", &[], &images);
+    assert_eq!(prep.output, again.output);
+    let long = format!("{}/{}.bin", "folder".repeat(15), "name".repeat(20));
+    let train = make(&store, "train", &[&prep], &[("field.bin", bytes((13 << 20) + 5, 4)), (&long, bytes(100, 5))]);
+    let eval = make(&store, "eval", &[&prep, &train], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
+    (store, vec![prep, again, train, eval])
+}
+
+/// A command line of the program on a store; nothing of the environment's AWS settings is in it.
+pub(crate) fn command(store: &Path, words: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nerf-sr-remote"));
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("AWS_")) {
+        command.env_remove(name);
+    }
+    command.args(words).arg("--store").arg(store).stdin(Stdio::null());
+    command
+}
+
+/// Exit code, stdout, and stderr.
+pub(crate) fn said(command: &mut Command) -> (i32, String, String) {
+    let output = command.output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code().unwrap_or(-1), text(output.stdout), text(output.stderr))
+}
+
+/// Stdout of a command that succeeds.
+pub(crate) fn succeed(command: &mut Command) -> String {
+    let (code, out, err) = said(command);
+    assert_eq!(code, 0, "{out}{err}");
+    out
+}
+
+/// Every record is of a whole artifact, and nothing is left over.
+pub(crate) fn assert_clean(store: &Store) {
+    for record in store.records().unwrap() {
+        assert_eq!(store.hit(&record.key()).as_ref(), Some(&record));
+    }
+    for object in store.objects().unwrap() {
+        store.verify(&object).unwrap();
+    }
+}
+
+/// No scratch folder is left, and nothing unfinished.
+pub(crate) fn assert_tidy(store: &Store) {
+    assert_eq!(fs::read_dir(store.root().join("sinks")).unwrap().count(), 0);
+    assert!(store.partials().unwrap().is_empty());
+}
+
+/// Two stores have equal records and objects, clean ones.
+pub(crate) fn assert_equal(one: &Store, other: &Store) {
+    assert_clean(other);
+    assert_eq!(one.records().unwrap(), other.records().unwrap());
+    assert_eq!(one.objects().unwrap(), other.objects().unwrap());
+}
+
+/// A sample store in a folder of its own, and the place of a remote beside it.
+pub(crate) struct Setup {
+    pub(crate) dir: tempfile::TempDir,
+    pub(crate) store: Store,
+    pub(crate) records: Vec<Record>,
+}
+
+impl Setup {
+    pub(crate) fn new() -> Self {
+        let dir = tempfile::tempdir().unwrap();
+        let (store, records) = sample(&dir.path().join("store"));
+        Self { dir, store, records }
+    }
+
+    pub(crate) fn pushed() -> Self {
+        let setup = Self::new();
+        succeed(&mut command(setup.store.root(), &["push", &setup.remote()]));
+        setup
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.dir.path().join(name)
+    }
+
+    pub(crate) fn remote(&self) -> String {
+        self.path("remote").display().to_string()
+    }
+
+    /// Pulls into a store; exit code and stderr.
+    pub(crate) fn pull(&self, store: &str, words: &[&str]) -> (i32, String, Store) {
+        let remote = self.remote();
+        let words: Vec<&str> = ["pull", &remote].into_iter().chain(words.iter().copied()).collect();
+        let (code, _, err) = said(&mut command(&self.path(store), &words));
+        (code, err, Store::open(&self.path(store)).unwrap())
+    }
+}

@@ -1,0 +1,217 @@
+//! Push and pull through a folder, with the real program.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+
+use artifact::{MANIFEST_FILE, Manifest, Record, Store, write_json};
+use common::{Setup, assert_clean, assert_equal, assert_tidy, command, make, said, succeed};
+
+#[test]
+fn what_is_pushed_is_pulled() {
+    let setup = Setup::new();
+    let remote = setup.remote();
+    let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
+    assert!(out.contains("4 actions pushed (13.6 MB), 0 there already"), "{out}");
+    let out = succeed(&mut command(setup.store.root(), &["push", &remote]));
+    assert!(out.contains("0 actions pushed (0 bytes), 4 there already"), "{out}");
+    assert!(setup.store.runs().unwrap().is_empty(), "a push keeps nothing longer");
+    let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
+    assert!(out.contains("4 actions pulled (13.6 MB), 0 here already"), "{out}");
+    let other = Store::open(&setup.path("other")).unwrap();
+    assert_equal(&setup.store, &other);
+    assert_tidy(&other);
+    let run = other.runs().unwrap().remove(0);
+    assert!(run.ended_unix.is_some() && run.keys.len() == 4, "collection must leave what was pulled");
+    let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
+    assert!(out.contains("0 actions pulled (0 bytes), 4 here already"), "{out}");
+    // The layout is a store's.
+    let train = &setup.records[2];
+    for file in ["format", &format!("actions/{}.json", train.key()), &format!("objects/{}/field.bin", train.output)] {
+        assert!(setup.path("remote").join(file).is_file(), "{file}");
+    }
+}
+
+#[test]
+fn some_are_selected() {
+    let setup = Setup::pushed();
+    let keys: Vec<String> = setup.records.iter().map(Record::key).collect();
+    let (prep, eval) = (&setup.records[0].output[..8], &keys[3][..8]);
+    for (name, words, expected) in [
+        ("a", &["--key", eval][..], &[3][..]),
+        ("b", &["--key", eval, "--history"], &[0, 2, 3]),
+        ("c", &["--artifact", prep], &[0, 1]),
+        ("d", &["--artifact", prep, "--key", eval], &[0, 1, 3]),
+    ] {
+        let (code, err, store) = setup.pull(name, words);
+        assert_eq!((code, err.as_str()), (0, ""));
+        let mut expected: Vec<&String> = expected.iter().map(|&index| &keys[index]).collect();
+        expected.sort();
+        assert_eq!(
+            store.records().unwrap().iter().map(Record::key).collect::<Vec<_>>(),
+            expected.into_iter().cloned().collect::<Vec<_>>()
+        );
+        assert_clean(&store);
+    }
+    let remote = setup.path("some").display().to_string();
+    succeed(&mut command(setup.store.root(), &["push", &remote, "--artifact", prep]));
+    assert_eq!(fs::read_dir(setup.path("some/actions")).unwrap().count(), 2);
+    let (code, err, _) = setup.pull("e", &["--key", "zz"]);
+    assert!(code == 2 && err.contains("no action \"zz\""), "{err}");
+}
+
+/// What is here stays, unless it is damaged: that is what pulling is for.
+#[test]
+fn what_is_here_is_not_overwritten() {
+    let setup = Setup::pushed();
+    let other = Store::open(&setup.path("other")).unwrap();
+    let own = make(&other, "eval", &[], &[("metrics.json", b"mine".to_vec())]);
+    let (code, _, _) = setup.pull("other", &[]);
+    assert_eq!((code, other.hit(&own.key())), (0, Some(own)));
+    let train = &setup.records[2];
+    fs::write(other.object(&train.output).join("field.bin"), "cut short").unwrap();
+    assert_eq!(setup.pull("other", &[]).0, 0);
+    assert_clean(&other);
+}
+
+type Harm = fn(&Setup);
+
+fn on_remote(setup: &Setup, record: usize, file: &str) -> PathBuf {
+    setup.path("remote/objects").join(&setup.records[record].output).join(file)
+}
+
+fn record_file(setup: &Setup, record: usize) -> PathBuf {
+    setup.path("remote/actions").join(format!("{}.json", setup.records[record].key()))
+}
+
+fn edit(path: &Path, change: impl FnOnce(&mut Vec<u8>)) {
+    let mut bytes = fs::read(path).unwrap();
+    change(&mut bytes);
+    fs::write(path, bytes).unwrap();
+}
+
+/// A record whose artifact's manifest names a file outside.
+fn lead_outside(setup: &Setup, path: &str) {
+    let mut manifest = Manifest::read(&setup.store.object(&setup.records[3].output)).unwrap();
+    path.clone_into(&mut manifest.files[0].path);
+    let record = Record { output: manifest.identity(), ..setup.records[3].clone() };
+    let folder = setup.path("remote/objects").join(&record.output);
+    fs::create_dir_all(&folder).unwrap();
+    write_json(&folder.join(MANIFEST_FILE), &manifest).unwrap();
+    write_json(&record_file(setup, 3), &record).unwrap();
+}
+
+/// Harm to eval on the remote: it is refused by name, nothing of it comes in, and the rest does.
+#[test]
+fn harm_is_refused_by_name() {
+    let cases: &[(&str, &str, Harm)] = &[
+        ("metrics.json", "blake3 differs", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1)),
+        ("metrics.json", "more than the 15 bytes", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '))),
+        ("metrics.json", "14 bytes where the manifest says 15", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14))),
+        ("metrics.json", "it is not there", |s| fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap()),
+        (MANIFEST_FILE, "it is not there", |s| fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap()),
+        (MANIFEST_FILE, "not a manifest", |s| edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20))),
+        (MANIFEST_FILE, "its blake3 is not the artifact's name", |s| {
+            fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE)).map(|_| ()).unwrap();
+        }),
+        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "../../../../evil")),
+        (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "/tmp/evil")),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, MANIFEST_FILE)),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, "./metrics.json")),
+        (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
+        (".json", "its key is not its name", |s| fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap()),
+        (".json", "\"../../evil\" is not a hash", |s| {
+            write_json(&record_file(s, 3), &Record { output: "../../evil".into(), ..s.records[3].clone() }).unwrap();
+        }),
+        (".json", "is not a hash", |s| {
+            write_json(&record_file(s, 3), &Record { made_of: vec!["/etc".into()], ..s.records[3].clone() }).unwrap();
+        }),
+    ];
+    // One push serves all cases.
+    let pushed = Setup::pushed();
+    for (name, reason, harm) in cases {
+        let dir = tempfile::tempdir().unwrap();
+        copy(&pushed.path("remote"), &dir.path().join("remote"));
+        let setup = Setup { dir, store: pushed.store.clone(), records: pushed.records.clone() };
+        harm(&setup);
+        let (code, err, store) = setup.pull("other", &[]);
+        let lines: Vec<&str> = err.lines().collect();
+        assert!(code == 3 && lines.len() == 2 && lines[0].contains(name) && lines[0].contains(reason), "{reason}: {code} {err}");
+        assert!(lines[1].contains("1 file refused"), "{err}");
+        assert_eq!((store.records().unwrap().len(), store.objects().unwrap().len()), (3, 2), "{reason}");
+        assert_clean(&store);
+        assert_tidy(&store);
+        assert!(!setup.path("evil").exists() && !Path::new("/tmp/evil").exists());
+    }
+}
+
+fn copy(from: &Path, to: &Path) {
+    for (relative, file) in artifact::list_files(from).unwrap() {
+        let target = to.join(relative);
+        fs::create_dir_all(target.parent().unwrap()).unwrap();
+        fs::copy(file, target).unwrap();
+    }
+}
+
+#[test]
+fn other_formats_and_places_are_refused_in_one_line() {
+    let setup = Setup::pushed();
+    let refused = |words: &[&str], store: &Path, code: i32, reason: &str| {
+        let (found, _, err) = said(&mut command(store, words));
+        assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{words:?}: {found} {err}");
+    };
+    let (remote, store) = (setup.remote(), setup.store.root());
+    for text in ["2\n", "new", ""] {
+        fs::write(setup.path("remote/format"), text).unwrap();
+        refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
+        refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
+    }
+    fs::remove_file(setup.path("remote/format")).unwrap();
+    refused(&["pull", &remote], &setup.path("other"), 3, "nothing was pushed here");
+    let inside = store.display().to_string();
+    refused(&["push", &inside], store, 2, "a store of nerf-sr's own");
+    refused(&["pull", "gs://bucket"], &setup.path("other"), 2, "gs:// is not known");
+    refused(&["pull", "s3://"], &setup.path("other"), 2, "names no bucket");
+    refused(&["pull", "/nowhere"], &setup.path("other"), 3, "no such folder");
+    refused(&["push", &remote], &setup.path("none"), 3, "no store of nerf-sr");
+    assert!(!setup.path("none").exists());
+    fs::write(store.join("format"), "2\n").unwrap();
+    for words in [&["push", &remote][..], &["export", "abc", "/tmp/x.tar"]] {
+        refused(words, store, 1, "use the newer nerf-sr,");
+    }
+    refused(&["pull", &remote], store, 1, "use the newer nerf-sr,");
+}
+
+/// A flipped byte in the store that is pushed never arrives.
+#[test]
+fn a_damaged_artifact_is_not_pushed() {
+    for (record, file) in [(3, "metrics.json"), (2, "field.bin")] {
+        let setup = Setup::new();
+        edit(&setup.store.object(&setup.records[record].output).join(file), |bytes| bytes[7] ^= 1);
+        let (code, _, err) = said(&mut command(setup.store.root(), &["push", &setup.remote()]));
+        assert!(code == 3 && err.contains(file) && err.contains("blake3 differs"), "{err}");
+        assert!(!on_remote(&setup, record, file).exists() && !record_file(&setup, record).exists());
+        let (code, err, store) = setup.pull("other", &[]);
+        assert_eq!((code, err.as_str()), (0, ""));
+        assert_clean(&store);
+    }
+}
+
+#[test]
+fn several_at_once_pull_into_one_store_and_push_to_one_remote() {
+    let setup = Setup::new();
+    let remote = setup.remote();
+    for (store, words) in [(setup.store.root().to_path_buf(), ["push", &remote]), (setup.path("other"), ["pull", &remote])] {
+        let start = |_| command(&store, &words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let children: Vec<_> = (0..4).map(start).collect();
+        for child in children {
+            let output = child.wait_with_output().unwrap();
+            assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+        }
+    }
+    let other = Store::open(&setup.path("other")).unwrap();
+    assert_equal(&setup.store, &other);
+    assert_tidy(&other);
+}
