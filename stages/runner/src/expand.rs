@@ -54,13 +54,15 @@ impl<'a> Expansion<'a> {
         Ok(Plan { nodes: self.nodes, sinks, ..Plan::default() })
     }
 
-    /// A block's inputs less those that the command line replaces.
+    /// A block's inputs less those that the command line or an experiment replaces at every point.
     fn block_inputs(&self, stage: &str) -> impl Iterator<Item = (&'a str, Source<'a>)> {
-        let settings = self.axes.iter().flat_map(Axis::settings);
-        let replaced: Vec<&str> =
-            settings.filter(|set| set.stage == stage && set.kind == Kind::Input).map(|set| set.name.as_str()).collect();
         let inputs = self.pipeline.stages[stage].inputs.iter().map(|(name, source)| (name.as_str(), Source::of(source)));
-        inputs.filter(move |(name, _)| !replaced.contains(name))
+        let is_set = |axis: &Axis, name: &str| {
+            let sets = |set: &Setting| set.stage == stage && set.kind == Kind::Input && set.name == name;
+            axis.values.iter().all(|value| value.settings.iter().any(sets))
+        };
+        let replaced: Vec<bool> = inputs.clone().map(|(name, _)| self.axes.iter().any(|axis| is_set(axis, name))).collect();
+        inputs.zip(replaced).filter(|(_, is_replaced)| !is_replaced).map(|(input, _)| input)
     }
 
     /// Whether a setting reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.

@@ -301,5 +301,9 @@ pub(crate) fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path
 mod tests;
 
 #[cfg(test)]
+#[path = "experiment_tests.rs"]
+mod experiment_tests;
+
+#[cfg(test)]
 #[path = "variant_tests.rs"]
 mod variant_tests;

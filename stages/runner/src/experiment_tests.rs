@@ -1,0 +1,192 @@
+//! Experiments to nodes, with stages that would describe themselves so.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use super::*;
+
+const EXPERIMENT: &str = "default: [table]
+stages:
+  prep:
+    inputs: {dataset: ./own}
+  train:
+    inputs: {scene: prep}
+  score:
+    inputs: {field: train}
+  table:
+    inputs: {run: score}
+experiment:
+  folders: [first, second]
+  inputs: {score.weights: weights}
+  scenes: [demo, lego]
+  protocols: [100x2]
+  presets:
+    100x2: {lr_width: 100, prep.scale: 2, rays: 1000}
+    other: {rays: 500}
+  variants:
+    - {name: as it is}
+    - {name: no warm-up, parameters: {warmup: 0}}
+    - {name: 'one ray, shown', parameters: {score.samples: 1}}
+";
+
+fn descriptions() -> BTreeMap<String, Description> {
+    let integer = |default: u64| json!({"type": "integer", "default": default});
+    let described = [
+        (
+            "prep",
+            "scene",
+            json!({"dataset": {"kinds": ["data"], "summary": ""}}),
+            json!({"lr_width": integer(10), "scale": integer(1)}),
+        ),
+        (
+            "train",
+            "field",
+            json!({"scene": {"kinds": ["scene"], "summary": ""}}),
+            json!({"rays": integer(1), "warmup": integer(3)}),
+        ),
+        (
+            "score",
+            "metrics",
+            json!({"field": {"kinds": ["field"], "summary": ""}, "weights": {"kinds": ["w"], "optional": true, "summary": ""}}),
+            json!({"samples": integer(2)}),
+        ),
+        ("table", "table", json!({"run": {"kinds": ["run"], "summary": ""}}), json!({})),
+    ];
+    let whole = |(name, kind, inputs, parameters): (&str, &str, Value, Value)| {
+        let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs, "output": {"kind": kind},
+            "parameters": {"properties": parameters}, "sink": name == "table", "partial": name == "table"});
+        (name.to_owned(), serde_json::from_value(text).unwrap())
+    };
+    described.map(whole).into()
+}
+
+/// The plan of an experiment, whose data sets lie in a folder of their own.
+fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
+    let mut request = Request { choice: Choice { data: Some(data.to_path_buf()), ..Choice::default() }, ..Request::default() };
+    change(&mut request);
+    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+}
+
+fn data() -> tempfile::TempDir {
+    let data = tempfile::tempdir().unwrap();
+    for folder in ["second/lego", "second/chair", "first/chair", "weights"] {
+        std::fs::create_dir_all(data.path().join(folder)).unwrap();
+    }
+    data
+}
+
+fn labels(plan: &Plan) -> Vec<String> {
+    plan.nodes.iter().map(Node::label).collect()
+}
+
+/// Variants form no product, and what they have in common is one node.
+#[test]
+fn scenes_protocols_and_variants_are_axes() {
+    let data = data();
+    let plan = plan_of(EXPERIMENT, data.path(), |_| ()).unwrap();
+    let expected = [
+        "prep [scene=demo]",
+        "prep [scene=lego]",
+        "train [scene=demo, variant=as it is]",
+        "train [scene=demo, variant=no warm-up]",
+        "train [scene=lego, variant=as it is]",
+        "train [scene=lego, variant=no warm-up]",
+        "score [scene=demo, variant=as it is]",
+        "score [scene=demo, variant=no warm-up]",
+        "score [scene=demo, variant=one ray, shown]",
+        "score [scene=lego, variant=as it is]",
+        "score [scene=lego, variant=no warm-up]",
+        "score [scene=lego, variant=one ray, shown]",
+    ];
+    assert_eq!(labels(&plan), expected);
+    let last = plan.nodes.last().unwrap();
+    let values = [("protocol", "100x2"), ("scene", "lego"), ("variant", "one ray, shown")];
+    assert_eq!(last.values, values.map(|(name, value)| (name.to_owned(), value.to_owned())).into());
+    assert_eq!((&last.parameters["samples"], &plan.nodes[3].parameters["warmup"]), (&json!(1), &json!(0)));
+    assert_eq!((&plan.nodes[0].parameters["lr_width"], &plan.nodes[2].parameters["rays"]), (&json!(100), &json!(1000)));
+    let folder = |node: usize, input: &str| {
+        let input = plan.nodes[node].inputs.iter().find(|one| one.name == input).unwrap();
+        match &input.from {
+            Origin::Folder(folder) => folder.clone(),
+            Origin::Node { .. } => panic!("{input:?}"),
+        }
+    };
+    assert!(folder(1, "dataset").ends_with("second/lego") && folder(0, "dataset").ends_with("own"));
+    assert!(folder(6, "weights").ends_with("weights"));
+    assert_eq!(plan.sinks[0].shows.len(), 6);
+}
+
+#[test]
+fn the_command_line_chooses_and_wins() {
+    let data = data();
+    let scores = |change: &dyn Fn(&mut Request)| -> Vec<String> {
+        let plan = plan_of(EXPERIMENT, data.path(), change).unwrap();
+        labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect()
+    };
+    let named = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
+    assert_eq!(scores(&|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))), ["score"]);
+    assert_eq!(
+        scores(&|r| (r.choice.scenes, r.choice.variants) = (named(&["demo"]), named(&["no warm-up", "as it is"]))),
+        ["score [variant=as it is]", "score [variant=no warm-up]"]
+    );
+    let plan = plan_of(EXPERIMENT, data.path(), |r| {
+        r.choice.scenes = named(&["chair"]);
+        r.choice.protocols = named(&["50x3"]);
+        r.choice.first = Some(2);
+        r.parameters = named(&["warmup=7", "lr_width=20,30"]);
+    });
+    let plan = plan.unwrap();
+    // Both variants come to one node, for what they set is set otherwise.
+    assert_eq!(labels(&plan)[2..4], ["train [variant=as it is, lr_width=20]", "train [variant=as it is, lr_width=30]"]);
+    assert_eq!((&plan.nodes[0].parameters["lr_width"], &plan.nodes[0].parameters["scale"]), (&json!(20), &json!(3)));
+    assert_eq!((&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]), (&json!(7), &json!(500)));
+}
+
+#[test]
+fn a_sweep_of_the_file_gives_way() {
+    let data = data();
+    let text = EXPERIMENT.replace("  variants:\n", "  sweeps: {train.rays: [5, 6]}\n  variants:\n");
+    let choose = |r: &mut Request| (r.choice.scenes, r.choice.first) = (vec!["demo".to_owned()], Some(1));
+    let plan = plan_of(&text, data.path(), choose).unwrap();
+    assert_eq!(labels(&plan)[1..3], ["train [rays=5]", "train [rays=6]"]);
+    let plan = plan_of(&text, data.path(), |r| {
+        choose(r);
+        r.parameters = vec!["rays=9".to_owned()];
+    });
+    assert_eq!(labels(&plan.unwrap())[1..2], ["train"]);
+}
+
+#[test]
+fn what_there_is_not_is_refused() {
+    let data = data();
+    for (text, change, words) in [
+        (
+            EXPERIMENT.to_owned(),
+            &(|c: &mut Choice| c.scenes = vec!["ship".to_owned()]) as &dyn Fn(&mut Choice),
+            "no scene ship in ",
+        ),
+        (
+            EXPERIMENT.to_owned(),
+            &|c| c.protocols = vec!["100y2".to_owned()],
+            "no protocol \"100y2\", and not of the form WIDTHxSCALE; did you mean 100x2?",
+        ),
+        (EXPERIMENT.to_owned(), &|c| c.protocols = vec!["other".to_owned()], "no protocol \"other\""),
+        (
+            EXPERIMENT.to_owned(),
+            &|c| c.variants = vec!["no warmup".to_owned()],
+            "no variant \"no warmup\"; did you mean no warm-up?",
+        ),
+        (EXPERIMENT.replace("warmup: 0", "warmap: 0"), &|_| (), "-p warmap: no stage has such a parameter; did you mean warmup?"),
+        (EXPERIMENT.replace("score.samples: 1", "scor.samples: 1"), &|_| (), "no stage \"scor\""),
+        (
+            EXPERIMENT.split("experiment:").next().unwrap().to_owned(),
+            &|c| c.scenes = vec!["demo".to_owned()],
+            "--scene, --protocol and --variant are for experiments",
+        ),
+    ] {
+        let plan = plan_of(&text, data.path(), |request| change(&mut request.choice));
+        let problem = plan.map(|plan| labels(&plan)).unwrap_err().to_string();
+        assert!(problem.contains(words), "{problem}");
+    }
+}
