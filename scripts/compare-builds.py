@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 
-# Targets and arguments, by today's names. Budgets are small: bytes are compared, not pictures.
+# Targets and arguments, by today's names. Budgets are small: bytes are compared, not images.
 SMALL = "-p lr_width=100 -p prep.test_views=2 -p train-ss.rays=400000 -p train-ss.precrop_steps=20"
 EXPERIMENTS = {
     "demo": "-p demo-scene.size=64 -p demo-scene.train=12 -p demo-scene.test=2 -p train-ss.rays=300000",

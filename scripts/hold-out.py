@@ -6,7 +6,7 @@ Choices (defaults, regularisers, schedules) are made on these, so that test view
     scripts/hold-out.py ../shared/data/nerf_synthetic/lego out/held-out/lego
     nerf-sr run -i dataset=out/held-out/lego
 
-Every EVERY-th training frame, from the middle of the first EVERY on, becomes a test view. Pictures are linked, not copied.
+Every EVERY-th training frame, from the middle of the first EVERY on, becomes a test view. Images are linked, not copied.
 """
 
 import argparse

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""PSNR of true LR views, ideally up-sampled: the HR test views with all removed that lies above the LR pictures' Nyquist frequency.
+"""PSNR of true LR views, ideally up-sampled: the HR test views with all removed that lies above the LR images' Nyquist frequency.
 
 What a method without any prior or second view could reach at best; a yardstick for the tables. Needs numpy and Pillow
 (`.venv/bin/python` after `make goldens`). HR views are made as `prep` makes them: Lanczos in 8 bits, then white behind.

@@ -94,7 +94,7 @@ def ssim():
 
 
 def lpips():
-    """LPIPS by PyTorch's layers, with weights that are drawn: every network, one pair of pictures."""
+    """LPIPS by PyTorch's layers, with weights that are drawn: every network, one pair of images."""
     import torch
     from torch.nn import functional
 

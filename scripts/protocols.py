@@ -1,6 +1,6 @@
 """What a protocol (LR width x scale) is run with. Not a program."""
 
-# Rays of a training, and fields that share them: more where LR pictures leave more open. All else is the stages' defaults.
+# Rays of a training, and fields that share them: more where LR images leave more open. All else is the stages' defaults.
 BUDGET = {"100x2": (32_000_000, 1), "100x4": (64_000_000, 4), "200x2": (80_000_000, 1), "200x4": (70_000_000, 1)}
 # Photographs in NDC: every ray ends on something and meets more samples than before white.
 PHOTOGRAPHS = {"252x2": (15_000_000, 1), "252x4": (17_500_000, 1)}

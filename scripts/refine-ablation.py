@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """What each part of refinement brings: `make refine-ablation`.
 
-A refiner is trained for each row, and scored as its training ends, by views of the downscaled field that it left out: at LR size, where LR pictures are the
-truth, so that choices made by this table look at no HR picture and at no test view. References are other views of that field.
+A refiner is trained for each row, and scored as its training ends, by views of the downscaled field that it left out: at LR size, where LR images are the
+truth, so that choices made by this table look at no HR image and at no test view. References are other views of that field.
 
 Rows of the paper's network follow, whose parts ours doesn't have: perceptual loss, several reference patches, patches that overlap. They are scored at HR on
 the test views, by a network of a quarter of the published width and by few steps: what a part brings there, not what the published training reaches.

@@ -1,19 +1,19 @@
 #!/usr/bin/env python3
 """The paper's tables with every method in them: `make table`.
 
-Rows are methods, columns protocols (LR width x scale), figures means over scenes. A cell's methods share what they can (the LR pictures, plain
+Rows are methods, columns protocols (LR width x scale), figures means over scenes. A cell's methods share what they can (the LR images, plain
 NeRF's field), and what is in the store isn't run again. OUT is the Markdown file; beside it come .csv, .json and .html, the page, with
-links to a page of pictures for each scene and protocol.
+links to a page of images for each scene and protocol.
 
 Methods:
     nerf          plain NeRF (a ray a pixel), rendered at HR, with as many rays as ours
     nerf-epochs   the same with as many epochs: a pixel is seen as often, by one ray instead of four
     bicubic, imdn, liif, swinir
                   plain NeRF rendered at LR, enlarged by a 2-D method (upsample)
-    ss            ours: supersampling, the mean of sub-rays as in the paper
+    ss            ours: supersampling, the mean of sub-pixel rays as in the paper
     kernel        ours: supersampling through the known kernel
-    refine        ours: kernel, refined by a network that learnt from the same LR pictures
-    hr            trained on HR pictures: what could be reached
+    refine        ours: kernel, refined by a network that learnt from the same LR images
+    hr            trained on HR images: what could be reached
     mlp-nerf, mlp the paper's own field for --mlp-rays rays, plain and supersampled
 """
 
@@ -28,14 +28,14 @@ import cells
 import protocols
 
 NETWORKS = {"imdn": "imdn_x{scale}.safetensors", "liif": "liif.safetensors", "swinir": "swinir_x{scale}.safetensors"}
-# What a row is called, and what it has seen: this scene's LR pictures alone, other pictures, or HR pictures of this scene.
+# What a row is called, and what it has seen: this scene's LR images alone, other images, or HR images of this scene.
 TITLES = {
     "nerf": ("NeRF, equal rays", "LR"),
     "nerf-epochs": ("NeRF, equal epochs", "LR"),
     "bicubic": ("NeRF-Bi", "LR"),
-    "imdn": ("NeRF-IMDN", "other pictures"),
-    "liif": ("NeRF-Liif", "other pictures"),
-    "swinir": ("NeRF-Swin", "other pictures"),
+    "imdn": ("NeRF-IMDN", "other images"),
+    "liif": ("NeRF-Liif", "other images"),
+    "swinir": ("NeRF-Swin", "other images"),
     "ss": ("ours, SS", "LR"),
     "kernel": ("ours, SS by the kernel", "LR, kernel"),
     "refine": ("ours, refined", "LR, kernel"),
@@ -66,7 +66,7 @@ parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
 parser.add_argument("--protocols", nargs="+", default=["100x2", "100x4", "200x2", "200x4"], help="LR width x scale")
 parser.add_argument("--methods", nargs="+", default=[m for m in TITLES if not m.startswith("mlp")], choices=TITLES, metavar="METHOD")
 parser.add_argument("--weights", type=pathlib.Path, help="folder with networks' safetensors (default: DATA/weights)")
-parser.add_argument("--kernel", default="lanczos", help="what makes the LR pictures; average: the paper's experiment of section 5.3")
+parser.add_argument("--kernel", default="lanczos", help="what makes the LR images; average: the paper's experiment of section 5.3")
 parser.add_argument("--split", choices=["given", "paper", "holdout"], help="which views are for testing (default: as the data say)")
 parser.add_argument("--rays", type=int, help="rays of each training (default: the protocol's)")
 parser.add_argument("--mlp-rays", type=int, default=1_000_000, help="rays of the paper's own field; 20 epochs are published")
@@ -262,7 +262,7 @@ disk = sum(file.stat().st_size for folder in used for file in pathlib.Path(folde
 notes = [
     "PSNR in dB / SSIM / LPIPS. In bold: the best PSNR of the rows that have seen the same.",
     *(f"{name}: {conventions[name]}." for name in ("psnr", "ssim", "lpips", "background") if name in conventions),
-    f"LR pictures by {options.kernel}. Views to test: {options.split or 'as the data say'}.",
+    f"LR images by {options.kernel}. Views to test: {options.split or 'as the data say'}.",
     "The paper's figures are means over all eight scenes of its data sets, its LPIPS network and SSIM window unknown: compare gains rather than "
     "values; its scenes' own values, where known, stand with the scenes. It gives its method four times (×2) and 16 times (×4) plain NeRF's steps: "
     f"that is the comparison at equal epochs, where ours casts {sub_rays} times as many rays.",

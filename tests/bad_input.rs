@@ -62,7 +62,7 @@ fn datasets_that_cannot_be_used() {
         },
         &[],
         3,
-        &["frame r_1", "train/r_1.png", "not a whole picture"],
+        &["frame r_1", "train/r_1.png", "not a whole image"],
     );
     let first_number = |d: &Path| {
         let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();

@@ -42,9 +42,9 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
     assert_eq!(stage("train-ss", &on.replace('{', r#"{"combine": "average_weights", "#), &inputs, &averaged, &[]).code, 0);
     let weights = |folder: &std::path::Path, member: u32| std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok();
-    let [begun, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
-    assert!(weights(&beside, 0) == begun && weights(&averaged, 1).is_none());
-    assert!(begun != trained && begun != mean && trained != mean);
+    let [initial, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
+    assert!(weights(&beside, 0) == initial && weights(&averaged, 1).is_none());
+    assert!(initial != trained && initial != mean && trained != mean);
 
     // `render-depth` doesn't know which field it has.
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));

@@ -1,5 +1,5 @@
-//! Odd data sets: names, text, poses and pictures as they happen to people. What can be used is used, what can't be is refused by a line
-//! that names it, and what is likely wrong is warned of.
+//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used, what can't be is refused by
+//! a line that names it, and what is likely wrong is warned of.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -52,7 +52,7 @@ fn names_from_files_are_printed_without_control_characters() {
     let missing = project.run(&["run"]);
     missing.fails(3, &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "is not there; remove the frame"]);
     assert!(is_plain(&missing.stderr) && is_plain(&missing.stdout), "{}", missing.stderr);
-    // A picture may have such a name; its view hasn't.
+    // An image may have such a name; its view hasn't.
     std::fs::rename(folder.join("train/r_1.png"), folder.join(format!("train/{name}.png"))).unwrap();
     let scene = project.path("scene");
     let made = stage("prep", "{}", &[("dataset", &folder)], &scene, &["--threads", "1"]);
@@ -187,22 +187,22 @@ fn training_views_alone_are_a_data_set() {
 }
 
 #[test]
-fn what_stands_where_a_picture_should_be_is_named() {
+fn what_stands_where_an_image_should_be_is_named() {
     type Put = fn(&Path);
     let cases: [(Put, &str); 4] = [
-        (|at| std::fs::create_dir(at).unwrap(), "r_1.png is a folder, not a picture"),
+        (|at| std::fs::create_dir(at).unwrap(), "r_1.png is a folder, not an image"),
         (
             |at| assert!(std::process::Command::new("mkfifo").arg(at).status().unwrap().success()),
-            "is a named pipe (FIFO), not a picture",
+            "is a named pipe (FIFO), not an image",
         ),
-        (|at| symlink("/dev/zero", at).unwrap(), "r_1.png is a device, not a picture"),
+        (|at| symlink("/dev/zero", at).unwrap(), "r_1.png is a device, not an image"),
         (|at| symlink("r_1.png", at).unwrap(), "r_1.png is a symbolic link that leads nowhere"),
     ];
     for (put, words) in cases {
         let (project, folder) = project(16, 4);
-        let picture = folder.join("train/r_1.png");
-        std::fs::remove_file(&picture).unwrap();
-        put(&picture);
+        let image = folder.join("train/r_1.png");
+        std::fs::remove_file(&image).unwrap();
+        put(&image);
         let refused = stage("prep", "{}", &[("dataset", &folder)], &project.path("scene"), &[]);
         refused.fails(3, &["transforms_train.json: frame 1 (./train/r_1)", words]);
     }
@@ -211,7 +211,7 @@ fn what_stands_where_a_picture_should_be_is_named() {
 #[test]
 fn the_largest_size_is_said() {
     let (project, folder) = project(16, 4);
-    // An EXR's header isn't summed up: a picture of one pixel that says it has 20000 × 20000.
+    // An EXR's header isn't summed up: an image of one pixel that says it has 20000 × 20000.
     let path = folder.join("train/huge.exr");
     let channels = ["R", "G", "B"].map(|name| pixels::Channel { name, sample_type: pixels::SampleType::Half });
     pixels::write_exr(&path, (1, 1), &channels, "", |_, _, samples| {
@@ -248,7 +248,7 @@ stages:
     inputs: {run: eval}
 ";
 
-/// LR was made from that very picture.
+/// LR was made from that very image.
 #[test]
 fn a_reference_has_the_exposure_of_its_own_lr_photograph() {
     for kernel in ["lanczos", "average"] {

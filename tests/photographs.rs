@@ -1,4 +1,5 @@
-//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR pictures.
+//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR
+//! images.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -13,7 +14,7 @@ use serde_json::{Value, json};
 const WIDTH: u32 = 32;
 const ANGLE: f64 = 0.691_111_2;
 
-/// Names, poses (right, up, back and centre as columns) and opaque pictures of a demo scene's training views, in `folder/images`.
+/// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's training views, in `folder/images`.
 fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let data = project.path("data");
     if !data.exists() {
@@ -29,8 +30,8 @@ fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let mut views: Vec<_> = frames
         .map(|frame| {
             let name = Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned();
-            let picture = pixels::read_premultiplied(&data.join(format!("train/{name}.png"))).unwrap().over(1.0);
-            pixels::write_png(&images.join(format!("{name}.png")), &picture.to_rgba8()).unwrap();
+            let image = pixels::read_premultiplied(&data.join(format!("train/{name}.png"))).unwrap().over(1.0);
+            pixels::write_png(&images.join(format!("{name}.png")), &image.to_rgba8()).unwrap();
             let number = |row: usize, column: usize| frame["transform_matrix"][row][column].as_f64().unwrap();
             let column = |c: usize| DVec3::new(number(0, c), number(1, c), number(2, c));
             (name, DMat3::from_cols(column(0), column(1), column(2)), column(3))
@@ -114,7 +115,7 @@ fn views(folder: &Path) -> Vec<Value> {
 }
 
 #[test]
-fn every_form_gives_the_same_cameras_and_pictures() {
+fn every_form_gives_the_same_cameras_and_images() {
     let project = Project::tiny();
     let folders = [as_transforms(&project), as_colmap(&project), as_llff(&project)];
     let mut scenes = Vec::new();
@@ -138,8 +139,8 @@ fn every_form_gives_the_same_cameras_and_pictures() {
             }
         }
     }
-    let picture = |scene: &Path| std::fs::read(scene.join("train/images/r_3.png")).unwrap();
-    assert!(scenes.iter().all(|s| picture(s) == picture(&scenes[0])));
+    let image = |scene: &Path| std::fs::read(scene.join("train/images/r_3.png")).unwrap();
+    assert!(scenes.iter().all(|s| image(s) == image(&scenes[0])));
 }
 
 /// What COLMAP's own library writes is read, too.
@@ -207,11 +208,11 @@ fn exposures_are_found() {
     let frames = transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
     for (taken, (_, frame)) in frames.enumerate() {
         let path = folder.join(frame["file_path"].as_str().unwrap());
-        let mut picture = pixels::read_png(&path).unwrap();
-        for pixel in picture.data.chunks_exact_mut(4) {
+        let mut image = pixels::read_png(&path).unwrap();
+        for pixel in image.data.chunks_exact_mut(4) {
             (0..3).for_each(|c| pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8);
         }
-        pixels::write_png(&path, &picture).unwrap();
+        pixels::write_png(&path, &image).unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
@@ -235,7 +236,7 @@ fn exposures_are_found() {
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
 }
 
-/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets fog.
+/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets floaters.
 #[test]
 fn lenses_are_followed_or_undone() {
     let project = Project::tiny();
@@ -334,13 +335,13 @@ fn what_masks_leave_out_is_not_learnt() {
         // The held-out ones are free of it but for a corner.
         let (columns, rows) = if i % 8 == 0 { (0..4, 0..4) } else { (8 + i % 5..20 + i % 5, 6..26) };
         let name = Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned();
-        let mut picture = pixels::read_png(&folder.join("images").join(&name)).unwrap();
+        let mut image = pixels::read_png(&folder.join("images").join(&name)).unwrap();
         let mut mask = pixels::Rgba8::new(32, 32, vec![255; 4 * 32 * 32]);
         for pixel in rows.flat_map(|y| columns.clone().map(move |x| 4 * (32 * y + x))) {
-            picture.data[pixel..pixel + 3].copy_from_slice(&[255, 0, 200]);
+            image.data[pixel..pixel + 3].copy_from_slice(&[255, 0, 200]);
             mask.data[pixel..pixel + 3].fill(0);
         }
-        pixels::write_png(&folder.join("images").join(&name), &picture).unwrap();
+        pixels::write_png(&folder.join("images").join(&name), &image).unwrap();
         pixels::write_png(&folder.join("masks").join(&name), &mask).unwrap();
         frame["mask_path"] = json!(format!("masks/{name}"));
     }

@@ -293,13 +293,13 @@ fn tables_are_made_of_cells() {
     assert_eq!((missing.code, missing.stderr.trim()), (1, "no scene nowhere in data: set DATA=DIR to a folder that has it"));
 }
 
-/// A field renders at any size, and pictures need not be square.
+/// A field renders at any size, and images need not be square.
 #[test]
 fn any_size_and_shape() {
     let project = Project::tiny();
     project.ok(&["run", "render-depth", "-p", "render-depth.size=1"]);
     project.ok(&["run", "render-depth", "-p", "render-depth.size=100"]);
-    // Cut the data set's pictures to 48×30: the same focal length, the same centre.
+    // Cut the data set's images to 48×30: the same focal length, the same centre.
     let dataset = project.artifact("demo-scene", &[]);
     for split in ["train", "test"] {
         let text = std::fs::read_to_string(dataset.join(format!("transforms_{split}.json"))).unwrap();

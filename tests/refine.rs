@@ -96,11 +96,11 @@ fn a_block_follows_the_one_it_extends() {
     }
 }
 
-/// In the paper's split all views are trained on, so each one's LR picture is known; where views are withheld, none is.
+/// In the paper's split all views are trained on, so each one's LR image is known; where views are withheld, none is.
 #[test]
-fn views_agree_with_their_own_photographs() {
+fn views_are_consistent_with_their_own_photographs() {
     let project = project();
-    let at_low_resolution = |more: &[&str]| -> Vec<f64> {
+    let at_lr = |more: &[&str]| -> Vec<f64> {
         project.ok(&[&["run", "refined"], more].concat());
         let rows: serde_json::Value =
             serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
@@ -113,12 +113,12 @@ fn views_agree_with_their_own_photographs() {
     let is_trained_so = |more: &[&str]| -> bool {
         project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"].as_bool().unwrap()
     };
-    let given = at_low_resolution(&[]);
+    let given = at_lr(&[]);
     assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
-    let papers = at_low_resolution(&["-p", "split=paper"]);
+    let papers = at_lr(&["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
     assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
-    // The network has learnt on views that agree, too; what hasn't is said to be another task.
+    // The network has learnt on consistent views, too; what hasn't is said to be another task.
     assert!(is_trained_so(&["-p", "split=paper"]) && !is_trained_so(&[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
@@ -128,10 +128,11 @@ fn views_agree_with_their_own_photographs() {
         .args([("views", &views), ("refiner", &refiner)].map(|(input, folder)| format!("--input={input}={}", folder.display())));
     let alone = Finished::of(command.output().unwrap());
     assert_eq!(alone.code, 0, "{}", alone.stderr);
-    assert!(alone.stderr.contains("trained on views that agree with LR photographs of their own"), "{}", alone.stderr);
+    assert!(alone.stderr.contains("trained on views consistent with LR photographs of their own"), "{}", alone.stderr);
 }
 
-/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and agrees with the photograph.
+/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and is consistent with the
+/// photograph.
 #[test]
 fn views_are_means_with_their_enlarged_photographs() {
     let project = project();
@@ -170,12 +171,12 @@ fn views_are_means_with_their_enlarged_photographs() {
         let file = folder.join(format!("images/{name}.exr"));
         pixels::read_premultiplied(&file).unwrap().over(1.0).channel(1)
     };
-    let (plain, mean, large) = (green(&plain), green(&mean), green(&enlarged));
-    for (i, ((plain, mean), large)) in plain.iter().zip(&mean).zip(&large).enumerate() {
-        let expected = if i % 48 < 24 { 0.5 * (plain + large) } else { *plain };
-        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {large}");
+    let (plain, mean, enlarged) = (green(&plain), green(&mean), green(&enlarged));
+    for (i, ((plain, mean), enlarged)) in plain.iter().zip(&mean).zip(&enlarged).enumerate() {
+        let expected = if i % 48 < 24 { 0.5 * (plain + enlarged) } else { *plain };
+        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {enlarged}");
     }
-    assert!(plain.iter().zip(&large).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
+    assert!(plain.iter().zip(&enlarged).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
     // Of another size.
     refine("no", Some(&photographs)).0.fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
 }
@@ -203,7 +204,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     let (alone, output) = refine("alone", &refiner, &[]);
     assert!(alone.code == 0 && alone.stderr.contains("there are none"), "{}", alone.stderr);
     assert_ne!(green(&output), green(&referenced));
-    // Pictures without their rendered views can't be placed.
+    // Images without their rendered views can't be placed.
     let both = [("references", references.as_path()), ("reference-views", views.as_path())];
     refine("no", &refiner, &both).0.fails(3, &["input reference-views: no view r_0 with that pose"]);
     // A network that can't use them says so.
@@ -278,11 +279,11 @@ fn bad_references_do_no_harm() {
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
         changed(&project, name, of, "exr", &|path| change_depth(path, change))
     };
-    let pictures = |name: &str, change: fn([f32; 3]) -> [f32; 3]| {
+    let images = |name: &str, change: fn([f32; 3]) -> [f32; 3]| {
         changed(&project, name, &references, "png", &|path| {
-            let picture = pixels::read_premultiplied(path).unwrap().over(1.0);
-            let data = picture.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
-            pixels::write_png(path, &pixels::Picture::new(picture.width, picture.height, 3, data).to_rgba8()).unwrap();
+            let image = pixels::read_premultiplied(path).unwrap().over(1.0);
+            let data = image.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
+            pixels::write_png(path, &pixels::Image::new(image.width, image.height, 3, data).to_rgba8()).unwrap();
         })
     };
     let psnr = |found: &Path| {
@@ -314,9 +315,9 @@ fn bad_references_do_no_harm() {
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
     let said = refined("hidden", &views, &references, &depths("e", &reference_views, |_, z| 0.01 * z));
     assert!(said.contains("sees nothing of these views"), "{said}");
-    let said = refined("dark", &views, &pictures("f", |p| p.map(|v| 0.6 * v)), &reference_views);
+    let said = refined("dark", &views, &images("f", |p| p.map(|v| 0.6 * v)), &reference_views);
     assert!(said.contains("has another exposure"), "{said}");
-    let said = refined("other", &views, &pictures("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
+    let said = refined("other", &views, &images("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
 }
 
@@ -378,7 +379,7 @@ fn tables_have_rendered_and_refined_rows() {
 /// HR references that join the training: what they show is learnt.
 #[test]
 fn references_join_a_training() {
-    // A field of its own that learns from both, beside the shipped one, which goes on from the field of LR pictures.
+    // A field of its own that learns from both, beside the shipped one, which goes on from the field of LR images.
     let joined = "
   joined-field:
     extends: train-ss
@@ -397,10 +398,10 @@ fn references_join_a_training() {
         let metrics = project.json(stage, "metrics.json", &arguments);
         metrics["mean"]["psnr"].as_f64().unwrap()
     };
-    println!("{:.2} dB from LR pictures, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
+    println!("{:.2} dB from LR images, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
-    // Half as many rays do, where the training goes on from what LR pictures gave and both fields, or their weights' mean, are kept. Few rays, or one
-    // reference alone, lose nothing of that.
+    // Half as many rays do, where the training goes on from what LR images gave and both fields, or their weights' mean, are
+    // kept. Few rays, or one reference alone, lose nothing of that.
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
         let on = |rays: &str, references: &str| {
@@ -569,9 +570,9 @@ fn wrong_views_are_refused_in_a_line() {
         stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
     };
     train(r#"{"patch_size": 15}"#, &views, &truth).fails(2, &["parameter patch_size: 15 is odd"]);
-    train("{}", &views, &truth.with_file_name("downscaled")).fails(3, &["24×24 pixels where its picture has 12×12"]);
+    train("{}", &views, &truth.with_file_name("downscaled")).fails(3, &["24×24 pixels where its image has 12×12"]);
     train("{}", &views, &truth.with_file_name("truth"))
-        .fails(3, &["none of them has a picture, by name and pose, in input truth"]);
+        .fails(3, &["none of them has an image, by name and pose, in input truth"]);
 }
 
 /// The published network goes through the same stages; what it can't do is said.

@@ -6,18 +6,18 @@ mod common;
 use std::path::Path;
 
 use common::{Project, manifest, stage};
-use pixels::{Filter, Picture, read_exr, read_premultiplied, resize_pillow};
+use pixels::{Filter, Image, read_exr, read_premultiplied, resize_pillow};
 
 /// A project whose LR views are enlarged.
 fn project() -> Project {
     let project = Project::tiny();
     let blocks = "
-  views-low:
+  views-lr:
     extends: render-depth
     inputs: {field: train-ss, cameras: prep/cameras}
     parameters: {size: 24}
   upsample:
-    inputs: {views: views-low, cameras: prep/cameras}
+    inputs: {views: views-lr, cameras: prep/cameras}
   eval-upsampled:
     extends: eval
     inputs: {views: upsample, truth: prep/truth}
@@ -36,14 +36,14 @@ fn views_are_enlarged_and_scored() {
     let project = project();
     project.ok(&["run", "eval-upsampled"]);
     let folder = |stage: &str| project.artifact(stage, &["eval-upsampled"]);
-    let (low, large) = (folder("views-low"), folder("upsample"));
-    for file in std::fs::read_dir(low.join("images")).unwrap() {
+    let (lr, hr) = (folder("views-lr"), folder("upsample"));
+    for file in std::fs::read_dir(lr.join("images")).unwrap() {
         let name = file.unwrap().file_name();
-        let before = read_premultiplied(&low.join("images").join(&name)).unwrap().over(1.0);
-        let after = read_exr(&large.join("images").join(&name)).unwrap();
+        let before = read_premultiplied(&lr.join("images").join(&name)).unwrap().over(1.0);
+        let after = read_exr(&hr.join("images").join(&name)).unwrap();
         assert_eq!((after.width, after.height, after.channel("Z")), (48, 48, None));
         // Pillow's own bicubic filter on 8 bits, but for half precision.
-        let expected = Picture::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
+        let expected = Image::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
         let worst = (0..4).flat_map(|c| {
             let found = after.channel(["R", "G", "B", "A"][c]).unwrap();
             expected.channel(c).into_iter().zip(found).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>()
@@ -59,7 +59,7 @@ fn views_are_enlarged_and_scored() {
     assert!(run.contains("method=swinir") && run.contains("method=liif"), "{run}");
     // At any thread count the same bytes.
     let outputs = project.output_of("upsample", &["eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir"]);
-    let (views, cameras) = (low, folder("prep").join("cameras"));
+    let (views, cameras) = (lr, folder("prep").join("cameras"));
     for threads in ["1", "3"] {
         let output = project.path(&format!("threads-{threads}"));
         let inputs = [("views", views.as_path()), ("cameras", &cameras), ("weights", &weights)];
@@ -95,7 +95,7 @@ fn the_table_has_every_method_side_by_side() {
     let table = std::fs::read_to_string(project.path("out/table.md")).unwrap();
     for words in [
         "By other metrics: ssim_valid",
-        "| NeRF-Swin | other pictures | weights not given: swinir_x2.safetensors |",
+        "| NeRF-Swin | other images | weights not given: swinir_x2.safetensors |",
         "equal epochs",
         "conventions",
         "GiB",

@@ -249,7 +249,7 @@ pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output:
     command
 }
 
-/// LR pictures of a small demo scene at half the size.
+/// LR images of a small demo scene at half the size.
 pub fn demo_train(project: &Project, views: u32) -> PathBuf {
     let (data, scene) = (project.path("data"), project.path("scene"));
     let params = format!(r#"{{"size": 48, "train": {views}, "test": 1, "samples_per_axis": 1}}"#);

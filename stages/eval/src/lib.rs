@@ -5,7 +5,7 @@
 //! * `lpips`: by SqueezeNet, AlexNet and VGG-16, each where its weights are given and the build has libtorch.
 //! * [`depth_error`]: where the truth has depth.
 //! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
-//! * [`LowScores`]: the same of the render shrunk to LR, by the kernel that made the LR pictures or is taken to have made them. Where
+//! * [`LrScores`]: the same of the render shrunk to LR, by the kernel that made the LR images or is taken to have made them. Where
 //!   photographs are all there is, no HR truth exists, and this alone can be known.
 //!
 //! Means over views are means of per-view values. Open backgrounds are scored on white. Where a view has a mask, what doesn't count is taken
@@ -24,8 +24,8 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use perceptual::{MISSING, Perceptual};
 use pixels::{
-    DEGRADATION_FILE, Degradation, Filter, Mask, Palette, Picture, Resampling, Rgba8, heat, psnr_of, read_exr,
-    read_premultiplied, write_png,
+    DEGRADATION_FILE, Degradation, Filter, Image, Mask, Palette, Resampling, Rgba8, heat, psnr_of, read_exr, read_premultiplied,
+    write_png,
 };
 use rayon::prelude::*;
 use scene::{Background, View, Views};
@@ -82,7 +82,7 @@ pub struct MetricConventions {
     pub depth: String,
     /// How a view's neighbour was brought over.
     pub warp: String,
-    /// How the view's LR picture was compared with.
+    /// How the view's LR image was compared with.
     pub low_resolution: String,
     /// What the error maps show.
     pub error_maps: String,
@@ -95,7 +95,7 @@ pub struct Scores {
     /// Peak signal-to-noise ratio in dB, where there is HR truth; higher is better.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// Structural similarity, where there is HR truth; higher is better. Pictures are reflected at their borders, as PyTorch pads.
+    /// Structural similarity, where there is HR truth; higher is better. Images are reflected at their borders, as PyTorch pads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
     /// The same over pixels whose window is whole, as scikit-image has it.
@@ -113,18 +113,18 @@ pub struct Scores {
     /// Depth errors, where there is true depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthError>,
-    /// The neighbour's true picture brought over by depth, where there is HR truth and rendered depth.
+    /// The neighbour's true image brought over by depth, where there is HR truth and rendered depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warp: Option<WarpScore>,
-    /// The shrunk render against the view's LR picture, where there is one.
+    /// The shrunk render against the view's LR image, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub low_resolution: Option<LowScores>,
+    pub low_resolution: Option<LrScores>,
 }
 
-/// A render shrunk to LR against the view's LR picture.
+/// A render shrunk to LR against the view's LR image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct LowScores {
+pub struct LrScores {
     /// Peak signal-to-noise ratio in dB.
     pub psnr: f64,
     /// Structural similarity.
@@ -141,7 +141,7 @@ pub struct ViewScores {
     pub scores: Scores,
     /// Its error map.
     pub error_map: String,
-    /// Its neighbour's picture, brought over by depth.
+    /// Its neighbour's image, brought over by depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warp: Option<String>,
 }
@@ -201,7 +201,7 @@ struct ScoringJob<'a> {
     context: &'a Context,
     params: &'a Params,
     perceptual: &'a Perceptual,
-    /// What made the LR pictures, as far as is known.
+    /// What made the LR images, as far as is known.
     filter: Filter,
     views: (&'a GivenInput, &'a Views),
     truth: (&'a GivenInput, &'a Views),
@@ -215,7 +215,7 @@ impl ScoringJob<'_> {
         let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
         let image = view.image.as_ref().with_context(|| format!("view {name}: it has no image")).bad_input("views")?;
         let found = read_view(views_in, view, image, views.background)?;
-        let read_true = |file: &Option<String>| -> anyhow::Result<Option<Picture>> {
+        let read_true = |file: &Option<String>| -> anyhow::Result<Option<Image>> {
             file.as_ref().map(|f| read_view(truth_in, true_view, f, truth.background)).transpose()
         };
         let (mut expected, mut lr) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
@@ -227,10 +227,9 @@ impl ScoringJob<'_> {
             );
             return Err(Failure::BadInput(message).into());
         }
-        let size = |p: &Picture| (p.width, p.height);
+        let size = |p: &Image| (p.width, p.height);
         if let Some(expected) = expected.as_ref().filter(|e| size(e) != wanted) {
-            let message =
-                format!("view {name}: its picture has {}×{} pixels, its camera others", expected.width, expected.height);
+            let message = format!("view {name}: its image has {}×{} pixels, its camera others", expected.width, expected.height);
             return Err(Failure::BadInput(message).into());
         }
         let shrunk = lr.as_ref().map(|lr| {
@@ -240,8 +239,8 @@ impl ScoringJob<'_> {
             shrunk
         });
         // What doesn't count can't differ; PSNR is that of the rest: so many dB more or less.
-        let of_mask = |picture: &Picture| -> anyhow::Result<Option<Mask>> {
-            true_view.read_mask(truth_in, size(picture)).bad_input(format!("view {name}"))
+        let of_mask = |image: &Image| -> anyhow::Result<Option<Mask>> {
+            true_view.read_mask(truth_in, size(image)).bad_input(format!("view {name}"))
         };
         let mask = expected.as_ref().or(lr.as_ref()).map(of_mask).transpose()?.flatten();
         let mut counted = [0.0; 2];
@@ -262,7 +261,7 @@ impl ScoringJob<'_> {
         let (shown, against) = match (&expected, &shrunk, &lr) {
             (Some(expected), ..) => (&found, expected),
             (None, Some(shrunk), Some(lr)) => (shrunk, lr),
-            _ => return Err(Failure::BadInput(format!("truth: view {name} has no picture at all")).into()),
+            _ => return Err(Failure::BadInput(format!("truth: view {name} has no image at all")).into()),
         };
         let error_map = format!("errors/{name}.png");
         write_png(&self.context.output_path(&error_map)?, &draw_error(shown, against, self.params.error_range as f32))?;
@@ -282,14 +281,14 @@ impl ScoringJob<'_> {
             low_resolution: shrunk
                 .iter()
                 .zip(&lr)
-                .map(|(shrunk, lr)| LowScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
+                .map(|(shrunk, lr)| LrScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
     }
 
-    /// The true picture of a view's nearest neighbour, seen from the view by the rendered depths: its score and its file.
-    fn warp(&self, view: &View, expected: &Picture) -> anyhow::Result<Option<(WarpScore, String)>> {
+    /// The true image of a view's nearest neighbour, seen from the view by the rendered depths: its score and its file.
+    fn warp(&self, view: &View, expected: &Image) -> anyhow::Result<Option<(WarpScore, String)>> {
         let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
         let Some(other) = warp::neighbour(&view.camera, &views.views) else { return Ok(None) };
         let other_truth = truth.views.iter().find(|v| v.camera.name == other.camera.name);
@@ -297,11 +296,11 @@ impl ScoringJob<'_> {
         let (Some(own), Some(theirs)) = (warp::read_surface(views_in, view)?, warp::read_surface(views_in, other)?) else {
             return Ok(None);
         };
-        let picture = read_view(truth_in, other_view, file, truth.background)?;
-        if (picture.width, picture.height) != (theirs.width, theirs.height) {
+        let image = read_view(truth_in, other_view, file, truth.background)?;
+        if (image.width, image.height) != (theirs.width, theirs.height) {
             return Ok(None);
         }
-        let Some((score, warped)) = warp::warp((&view.camera, &own, expected), (&other.camera, &theirs, &picture)) else {
+        let Some((score, warped)) = warp::warp((&view.camera, &own, expected), (&other.camera, &theirs, &image)) else {
             return Ok(None);
         };
         let file = format!("warps/{}.png", view.camera.name);
@@ -311,23 +310,23 @@ impl ScoringJob<'_> {
 }
 
 /// Peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all samples. Predictions are clamped to [0, 1] by
-/// [`read_view`]; equal pictures, which have no PSNR, count as 100 dB.
-pub fn psnr(found: &Picture, expected: &Picture) -> f64 {
+/// [`read_view`]; equal images, which have no PSNR, count as 100 dB.
+pub fn psnr(found: &Image, expected: &Image) -> f64 {
     let sum: f64 = found.data.iter().zip(&expected.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
     psnr_of(sum / found.data.len() as f64)
 }
 
-/// A picture of a view over its background, clamped to [0, 1].
-fn read_view(input: &GivenInput, view: &View, file: &str, background: Background) -> anyhow::Result<Picture> {
+/// An image of a view over its background, clamped to [0, 1].
+fn read_view(input: &GivenInput, view: &View, file: &str, background: Background) -> anyhow::Result<Image> {
     let place = format!("view {}", view.camera.name);
     let path = input.path(file);
-    let mut picture = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
-    picture.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
-    Ok(picture)
+    let mut image = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
+    image.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
+    Ok(image)
 }
 
 /// Mean absolute error of the three channels as a colour.
-fn draw_error(found: &Picture, expected: &Picture, range: f32) -> Rgba8 {
+fn draw_error(found: &Image, expected: &Image, range: f32) -> Rgba8 {
     let pixel = |(a, b): (&[f32], &[f32])| {
         let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
         let [r, g, b] = heat(Palette::Error, error / range);
@@ -371,7 +370,7 @@ fn mean_of(views: &[ViewScores]) -> Scores {
             .map(|(psnr, seen)| WarpScore { psnr, seen }),
         low_resolution: mean(&|s| s.low_resolution.map(|l| l.psnr))
             .zip(mean(&|s| s.low_resolution.map(|l| l.ssim)))
-            .map(|(psnr, ssim)| LowScores { psnr, ssim }),
+            .map(|(psnr, ssim)| LrScores { psnr, ssim }),
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use nets::{Conv, Weights, WeightsError};
-use pixels::Picture;
+use pixels::Image;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::LpipsNetwork;
@@ -148,19 +148,19 @@ impl Lpips {
         Ok(Self { layers: reader.layers, heads, least })
     }
 
-    /// Distance of two RGB pictures in [0, 1].
-    pub fn distance(&self, a: &Picture, b: &Picture) -> anyhow::Result<f64> {
+    /// Distance of two RGB images in [0, 1].
+    pub fn distance(&self, a: &Image, b: &Image) -> anyhow::Result<f64> {
         let least = self.least;
         anyhow::ensure!(
             a.width >= least && a.height >= least,
-            "LPIPS needs pictures of at least {least}×{least} pixels, not {}×{}",
+            "LPIPS needs images of at least {least}×{least} pixels, not {}×{}",
             a.width,
             a.height
         );
         no_grad(|| self.sum_over_stages(a, b)).context("LPIPS")
     }
 
-    fn sum_over_stages(&self, a: &Picture, b: &Picture) -> Result<f64, TchError> {
+    fn sum_over_stages(&self, a: &Image, b: &Image) -> Result<f64, TchError> {
         let (mut a, mut b, mut sum) = (input(a)?, input(b)?, 0.0);
         let mut heads = self.heads.iter();
         for layer in &self.layers {
@@ -178,9 +178,9 @@ impl Lpips {
 }
 
 /// To [-1, 1], then by the method's own shift and scale; shape 1×3×H×W.
-fn input(picture: &Picture) -> Result<Tensor, TchError> {
+fn input(image: &Image) -> Result<Tensor, TchError> {
     let constant = |v: [f32; 3]| Tensor::f_from_slice(&v)?.f_reshape([1, 3, 1, 1]);
-    let x = nets::tensor_of(picture)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?;
+    let x = nets::tensor_of(image)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?;
     x.f_sub(&constant([-0.030, -0.088, -0.188])?)?.f_div(&constant([0.458, 0.448, 0.450])?)
 }
 

@@ -1,5 +1,5 @@
 use artifact::{Failure, GivenInput};
-use pixels::Picture;
+use pixels::Image;
 
 #[cfg(feature = "torch")]
 use crate::Lpips;
@@ -92,7 +92,7 @@ impl Perceptual {
     }
 
     /// Distances by each network, in the order of [`LpipsNetwork::ALL`].
-    pub(crate) fn distances(&self, found: &Picture, expected: &Picture) -> anyhow::Result<[Option<f64>; 3]> {
+    pub(crate) fn distances(&self, found: &Image, expected: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         let mut distances = [None; 3];
         for reader in &self.readers {
             let lpips = reader.take()?;
@@ -114,7 +114,7 @@ impl Perceptual {
         Ok(Self { given: Vec::new() })
     }
 
-    pub(crate) fn distances(&self, _: &Picture, _: &Picture) -> anyhow::Result<[Option<f64>; 3]> {
+    pub(crate) fn distances(&self, _: &Image, _: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         Ok([None; 3])
     }
 }

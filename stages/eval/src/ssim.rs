@@ -1,9 +1,9 @@
-use pixels::Picture;
+use pixels::Image;
 
 /// Mean structural similarity, by what the window does at the border.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ssim {
-    /// The picture is mirrored without repeating its edge, as PyTorch pads: every pixel counts.
+    /// The image is mirrored without repeating its edge, as PyTorch pads: every pixel counts.
     pub reflected: f64,
     /// Only pixels whose window lies inside count: scikit-image's scalar. Where there is none, all count.
     pub valid: f64,
@@ -12,10 +12,10 @@ pub struct Ssim {
 const RADIUS: usize = 5;
 
 /// Mean structural similarity (Wang et al. 2004): Gaussian window of 11×11 with σ 1.5, data range 1, in f64; mean over the
-/// channels. A picture narrower than the window is reflected as often as it takes.
-pub fn ssim(a: &Picture, b: &Picture) -> Ssim {
+/// channels. An image narrower than the window is reflected as often as it takes.
+pub fn ssim(a: &Image, b: &Image) -> Ssim {
     let channel = |c: usize| {
-        let plane = |p: &Picture| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
+        let plane = |p: &Image| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
         of_planes(&plane(a), &plane(b), a.width, a.height)
     };
     let channels: Vec<Ssim> = (0..a.channels).map(channel).collect();

@@ -1,10 +1,10 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{ExrImage, Picture, Rgba8, psnr_of, read_exr, to_u8};
+use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A view's true picture against its neighbour's, brought over by the rendered depths: depth is right where colours agree.
+/// A view's true image against its neighbour's, brought over by the rendered depths: depth is right where colours agree.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WarpScore {
@@ -29,9 +29,9 @@ pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Op
     Ok((whole && image.channel("Z").is_some() && image.channel("A").is_some()).then_some(image))
 }
 
-/// Brings the neighbour's picture over to a view and compares. The picture shows what was brought over; what the neighbour doesn't see is
-/// red. Pictures have the sizes of the views. `None` where it sees nothing.
-pub(crate) fn warp(view: (&Camera, &ExrImage, &Picture), other: (&Camera, &ExrImage, &Picture)) -> Option<(WarpScore, Rgba8)> {
+/// Brings the neighbour's image over to a view and compares. The image shows what was brought over; what the neighbour doesn't
+/// see is red. Images have the sizes of the views. `None` where it sees nothing.
+pub(crate) fn warp(view: (&Camera, &ExrImage, &Image), other: (&Camera, &ExrImage, &Image)) -> Option<(WarpScore, Rgba8)> {
     const UNSEEN: [u8; 4] = [120, 20, 30, 255];
     let from = surface(view.0, view.1)?;
     let places = from.seen_from(&surface(other.0, other.1)?);
@@ -82,19 +82,19 @@ mod tests {
         ExrImage { width: 40, height: 4, channels }
     }
 
-    /// A step of a tenth to the side before a wall at distance 2 moves its picture by two pixels.
+    /// A step of a tenth to the side before a wall at distance 2 moves its image by two pixels.
     #[test]
     fn right_depth_agrees_and_wrong_depth_does_not() {
         let wall = |shift: usize| {
             let level = |i: usize| ((i % 40 + shift) as f32 * 0.7).sin() * 0.4 + 0.5;
-            Picture::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
+            Image::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
         };
         let (a, b) = (camera("a", 0.0), camera("b", 0.1));
         let score = |depth: f32| warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap();
-        let (right, picture) = score(2.0);
+        let (right, shown) = score(2.0);
         assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
-        // What lies left of the neighbour's picture isn't seen.
-        assert_eq!(picture.data[..3], [120, 20, 30]);
+        // What lies left of the neighbour's shown isn't seen.
+        assert_eq!(shown.data[..3], [120, 20, 30]);
         let (wrong, _) = score(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
     }

@@ -6,14 +6,14 @@
 mod pattern;
 
 use eval::ssim;
-use pixels::Picture;
+use pixels::Image;
 
-/// f64 in the goldens, f32 in a picture: the blend is rounded here, which costs about 1e-8.
-fn pictures(width: usize, height: usize, seed: u32) -> (Picture, Picture) {
+/// f64 in the goldens, f32 in an image: the blend is rounded here, which costs about 1e-8.
+fn images(width: usize, height: usize, seed: u32) -> (Image, Image) {
     let bytes = |seed| -> Vec<f64> { pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect() };
     let (a, other) = (bytes(seed), bytes(seed + 100));
     let b = a.iter().zip(&other).map(|(a, o)| (0.7 * a + 0.3 * o) as f32).collect();
-    (Picture::new(width, height, 3, a.iter().map(|&v| v as f32).collect()), Picture::new(width, height, 3, b))
+    (Image::new(width, height, 3, a.iter().map(|&v| v as f32).collect()), Image::new(width, height, 3, b))
 }
 
 #[test]
@@ -21,7 +21,7 @@ fn ssim_equals_scikit_image_and_pytorch() {
     let list: serde_json::Value = serde_json::from_str(include_str!("goldens/ssim.json")).unwrap();
     for case in list["cases"].as_array().unwrap() {
         let number = |key: &str| case[key].as_u64().unwrap() as usize;
-        let (a, b) = pictures(number("width"), number("height"), number("seed") as u32);
+        let (a, b) = images(number("width"), number("height"), number("seed") as u32);
         let both = ssim(&a, &b);
         for (ours, key) in [(both.valid, "valid"), (both.reflected, "reflect")] {
             let theirs = case[key].as_f64().unwrap();
@@ -32,9 +32,9 @@ fn ssim_equals_scikit_image_and_pytorch() {
 }
 
 #[test]
-fn one_pixel_and_narrow_pictures_have_an_ssim() {
+fn one_pixel_and_narrow_images_have_an_ssim() {
     for (width, height) in [(1, 1), (2, 7), (4, 30)] {
-        let (a, b) = pictures(width, height, 5);
+        let (a, b) = images(width, height, 5);
         let both = ssim(&a, &b);
         assert!(both.valid.is_finite() && both.reflected.is_finite());
     }
@@ -82,10 +82,10 @@ fn lpips_is_that_of_pytorch_with_every_network() {
             nets::write(&folder.path().join(file), &tensors.collect::<Vec<_>>()).unwrap();
         }
         let lpips = eval::Lpips::read(folder.path(), network).unwrap();
-        let (a, b) = pictures(45, 37, 9);
+        let (a, b) = images(45, 37, 9);
         let (found, expected) = (lpips.distance(&a, &b).unwrap(), case["distance"].as_f64().unwrap());
         assert!((found / expected - 1.0).abs() < 1e-4, "{name}: {found} where PyTorch has {expected}");
-        let (a, b) = pictures(15, 15, 9);
+        let (a, b) = images(15, 15, 9);
         assert!(lpips.distance(&a, &b).unwrap_err().to_string().contains("at least"));
     }
 }

@@ -1,4 +1,4 @@
-use pixels::{Filter, Kernel, Picture, Resampling, Rgba8, average_pool, resize_pillow};
+use pixels::{Filter, Image, Kernel, Resampling, Rgba8, average_pool, resize_pillow};
 
 use crate::sizes::Sizes;
 
@@ -24,23 +24,23 @@ pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     }
 }
 
-/// An LR picture as its kernel gives it.
+/// An LR image as its kernel gives it.
 #[derive(Clone, Debug, PartialEq)]
-pub enum LowResolution {
+pub enum LrImage {
     /// Rounded to 8 bits, alpha straight.
     Bytes(Rgba8),
     /// Not rounded, alpha premultiplied.
-    Floats(Picture),
+    Floats(Image),
 }
 
-impl LowResolution {
+impl LrImage {
     /// The same shrunk once more, by the same kernel.
     pub(crate) fn shrunk(&self, (width, height): (usize, usize), kernel: Kernel) -> Self {
         match self {
             Self::Bytes(image) => Self::Bytes(resize_pillow(image, width, height, kernel.filter())),
-            Self::Floats(picture) => {
-                let shrink = Resampling::new(kernel.filter(), (picture.width, picture.height), (width, height));
-                Self::Floats(shrink.apply(picture))
+            Self::Floats(image) => {
+                let shrink = Resampling::new(kernel.filter(), (image.width, image.height), (width, height));
+                Self::Floats(shrink.apply(image))
             }
         }
     }
@@ -49,7 +49,7 @@ impl LowResolution {
     pub(crate) fn size(&self) -> (usize, usize) {
         match self {
             Self::Bytes(image) => (image.width, image.height),
-            Self::Floats(picture) => (picture.width, picture.height),
+            Self::Floats(image) => (image.width, image.height),
         }
     }
 
@@ -57,31 +57,31 @@ impl LowResolution {
     pub(crate) fn alpha(&self) -> Vec<f32> {
         match self {
             Self::Bytes(image) => image.data.iter().skip(3).step_by(4).map(|&a| f32::from(a) / 255.0).collect(),
-            Self::Floats(picture) => picture.channel(3),
+            Self::Floats(image) => image.channel(3),
         }
     }
 }
 
-/// The HR picture by Lanczos from the photograph, and the LR picture from that 8-bit HR one: two steps, as the paper's code does.
+/// The HR image by Lanczos from the photograph, and the LR image from that 8-bit HR one: two steps, as the paper's code does.
 ///
 /// # Panics
 /// With [`Kernel::Average`] when the sizes aren't whole multiples.
-pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LowResolution) {
+pub fn degrade(image: &Rgba8, sizes: &Sizes, kernel: Kernel) -> (Rgba8, LrImage) {
     let size = |(w, h): (u32, u32)| (w as usize, h as usize);
     let (hr_size, lr_size) = (size(sizes.hr), size(sizes.lr));
     let hr = resize_pillow(image, hr_size.0, hr_size.1, Filter::Lanczos);
     let lr = match kernel {
         Kernel::Lanczos | Kernel::Bicubic | Kernel::Box => {
-            LowResolution::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
+            LrImage::Bytes(resize_pillow(&hr, lr_size.0, lr_size.1, kernel.filter()))
         }
         Kernel::Average => {
             let pooled = average_pool(&hr, hr_size.0 / lr_size.0, hr_size.1 / lr_size.1);
-            let mut picture = pooled.expect("an average is refused for sizes that don't divide");
+            let mut floats = pooled.expect("an average is refused for sizes that don't divide");
             // The mean of straight colours times the mean alpha: what the paper's code composites.
-            for p in picture.data.chunks_exact_mut(4) {
+            for p in floats.data.chunks_exact_mut(4) {
                 (0..3).for_each(|c| p[c] *= p[3]);
             }
-            LowResolution::Floats(picture)
+            LrImage::Floats(floats)
         }
     };
     (hr, lr)

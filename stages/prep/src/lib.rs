@@ -1,7 +1,7 @@
 //! `prep`: posed images → scene. Makes HR ground truth and, from it, the LR images that training may see.
 //!
 //! * `sizes`: LR and HR size from `lr_width`, `hr_width`, `scale`.
-//! * `degrade`: HR and LR pictures of one photograph, through Pillow's exact kernels.
+//! * `degrade`: HR and LR images of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see; `hull`: tighter, from alpha, where that is allowed.
 //! * `pose_warnings`: poses that can't be right, or hardly.
 //!
@@ -9,7 +9,7 @@
 //!
 //! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `downscaled/` (the
 //! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `train-cameras/` and `cameras/` (the training
-//! and the test cameras at HR size, no pictures), `truth/` (HR test images, depth), `references/` (HR training images).
+//! and the test cameras at HR size, no images), `truth/` (HR test images, depth), `references/` (HR training images).
 
 mod bounds;
 mod degrade;
@@ -31,7 +31,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
-pub use degrade::{LowResolution, degrade};
+pub use degrade::{LrImage, degrade};
 pub use hull::{GRID, carve};
 pub use sizes::{SizeError, Sizes, enlarged, sizes};
 
@@ -278,13 +278,13 @@ fn pose_warnings(set: &Dataset, split: &Split) -> anyhow::Result<Vec<String>> {
     Ok(pose_warnings::warnings(&training, &test).into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 
-/// What lies behind a scene: nothing, where the space holds all that is seen and one of the pictures is opaque.
+/// What lies behind a scene: nothing, where the space holds all that is seen and one of the images is opaque.
 fn background_of(space: &Space, frame: &Frame) -> anyhow::Result<Background> {
     if *space == Space::Box {
         return Ok(Background::White);
     }
-    let picture = frame.photograph().bad_input(frame_name(frame))?;
-    let is_opaque = picture.data.chunks_exact(4).all(|p| p[3] == 255);
+    let image = frame.photograph().bad_input(frame_name(frame))?;
+    let is_opaque = image.data.chunks_exact(4).all(|p| p[3] == 255);
     Ok(if is_opaque { Background::Opaque } else { Background::White })
 }
 
@@ -365,8 +365,8 @@ fn mask_name(frame: &Frame) -> Option<String> {
 }
 
 /// What is made of a frame to train on.
-struct TrainingPicture {
-    picture: LowResolution,
+struct TrainingImage {
+    image: LrImage,
     mask: Option<Mask>,
 }
 
@@ -420,39 +420,39 @@ impl Job<'_> {
 
         let count = if self.making.has_truth { self.params.hr_references as usize } else { 0 };
         let references = references::choose(train_cameras.iter().map(Camera::centre), count);
-        let train_pictures = train
+        let train_images = train
             .par_iter()
             .enumerate()
-            .map(|(i, frame)| -> anyhow::Result<TrainingPicture> {
+            .map(|(i, frame)| -> anyhow::Result<TrainingImage> {
                 self.context.check_interrupt()?;
-                let (hr, lr) = self.pictures(frame)?;
-                self.write_low("train/images", &frame.name, &lr)?;
+                let (hr, lr) = self.images(frame)?;
+                self.write_lr("train/images", &frame.name, &lr)?;
                 let mask = frame.mask().bad_input(frame_name(frame))?;
-                let low_mask = mask.as_ref().map(|mask| self.low_mask(mask, &lr));
-                low_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
+                let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
+                lr_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
                 if let Some(hr) = hr.filter(|_| references.contains(&i)) {
-                    self.write_high("references", &frame.name, &hr)?;
+                    self.write_hr("references", &frame.name, &hr)?;
                     mask.iter()
                         .try_for_each(|m| self.write_mask("references", &frame.name, &m.resized((hr.width, hr.height), 0)))?;
                 }
                 progress.add(1);
-                Ok(TrainingPicture { picture: lr, mask: low_mask })
+                Ok(TrainingImage { image: lr, mask: lr_mask })
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
-        let low_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
+        let lr_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
         let mut views = Views::new(background, bounds, Vec::new());
         views.views = train_cameras
             .iter()
             .zip(train)
             .map(|(c, frame)| View {
-                image: Some(low_name(&c.name)),
+                image: Some(lr_name(&c.name)),
                 mask: mask_name(frame),
                 ..View::camera_only(self.resized(c, |s| s.lr))
             })
             .collect();
         if self.params.hull == HullSource::Alpha {
             let cameras: Vec<Camera> = views.views.iter().map(|v| v.camera.clone()).collect();
-            let alphas: Vec<Vec<f32>> = train_pictures.iter().map(|p| p.picture.alpha()).collect();
+            let alphas: Vec<Vec<f32>> = train_images.iter().map(|p| p.image.alpha()).collect();
             let footprint = degrade::footprint(self.making.kernel);
             bounds = hull::tightened(&bounds, &cameras, &alphas, footprint).bad_input("hull: alpha")?;
             if self.params.near.is_none() && self.params.far.is_none() {
@@ -467,22 +467,22 @@ impl Job<'_> {
             views.hull = Some("hull.safetensors".to_owned());
         }
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
-        self.write_downscaled(&views, &train_pictures)?;
-        drop(train_pictures);
+        self.write_downscaled(&views, &train_images)?;
+        drop(train_images);
         let degradation = Degradation { kernel: self.making.kernel, hr: self.sizes.hr.into() };
         for subtree in ["train", "truth"] {
             self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &degradation)?;
         }
 
-        let high = |c: &Camera| self.resized(c, |s| s.hr);
-        let enlarged = train_cameras.iter().map(|c| View::camera_only(high(c))).collect();
+        let at_hr = |c: &Camera| self.resized(c, |s| s.hr);
+        let enlarged = train_cameras.iter().map(|c| View::camera_only(at_hr(c))).collect();
         self.context.write_json(&format!("train-cameras/{VIEWS_FILE}"), &Views::new(background, bounds, enlarged))?;
         let reference_views = references
             .iter()
             .map(|&i| View {
                 image: Some(format!("images/{}.png", train[i].name)),
                 mask: mask_name(train[i]),
-                ..View::camera_only(high(&train_cameras[i]))
+                ..View::camera_only(at_hr(&train_cameras[i]))
             })
             .collect();
         if !references.is_empty() {
@@ -493,15 +493,15 @@ impl Job<'_> {
         test.par_iter()
             .map(|frame| {
                 self.context.check_interrupt()?;
-                let (hr, lr) = self.pictures(frame)?;
+                let (hr, lr) = self.images(frame)?;
                 if let Some(hr) = &hr {
-                    self.write_high("truth", &frame.name, hr)?;
+                    self.write_hr("truth", &frame.name, hr)?;
                 }
-                self.write_low("truth/low", &frame.name, &lr)?;
+                self.write_lr("truth/low", &frame.name, &lr)?;
                 if let Some(mask) = frame.mask().bad_input(frame_name(frame))? {
                     let mask = match &hr {
                         Some(hr) => mask.resized((hr.width, hr.height), 0),
-                        None => self.low_mask(&mask, &lr),
+                        None => self.lr_mask(&mask, &lr),
                     };
                     self.write_mask("truth", &frame.name, &mask)?;
                 }
@@ -516,7 +516,7 @@ impl Job<'_> {
             .iter()
             .zip(test)
             .map(|(c, frame)| View {
-                camera: high(c),
+                camera: at_hr(c),
                 image: self.making.has_truth.then(|| format!("images/{}.png", c.name)),
                 mask: mask_name(frame),
                 depth: frame.depth.as_ref().filter(|_| self.making.has_truth).map(|_| format!("depth/{}.exr", c.name)),
@@ -529,24 +529,24 @@ impl Job<'_> {
         self.summarise(set, notes, train, test, bounds, background)
     }
 
-    /// The same task one size down, where its solution is known: LR pictures shrunk as HR ones were to make them.
-    fn write_downscaled(&self, train: &Views, pictures: &[TrainingPicture]) -> anyhow::Result<()> {
+    /// The same task one size down, where its solution is known: LR images shrunk as HR ones were to make them.
+    fn write_downscaled(&self, train: &Views, images: &[TrainingImage]) -> anyhow::Result<()> {
         let Sizes { lr, hr } = self.sizes;
         let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
         let kernel = self.making.kernel;
-        let make = |(view, TrainingPicture { picture, mask }): (&View, &TrainingPicture)| -> anyhow::Result<View> {
+        let make = |(view, TrainingImage { image, mask }): (&View, &TrainingImage)| -> anyhow::Result<View> {
             self.context.check_interrupt()?;
             let k = &view.camera.intrinsics;
             let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
-            let small = picture.shrunk((width as usize, height as usize), kernel);
-            self.write_low("downscaled/images", &view.camera.name, &small)?;
-            let mask = mask.as_ref().map(|mask| self.low_mask(mask, &small));
+            let downscaled = image.shrunk((width as usize, height as usize), kernel);
+            self.write_lr("downscaled/images", &view.camera.name, &downscaled)?;
+            let mask = mask.as_ref().map(|mask| self.lr_mask(mask, &downscaled));
             mask.iter().try_for_each(|mask| self.write_mask("downscaled", &view.camera.name, mask))?;
             Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
         };
-        let views = train.views.par_iter().zip(pictures).map(make).collect::<anyhow::Result<Vec<_>>>()?;
+        let views = train.views.par_iter().zip(images).map(make).collect::<anyhow::Result<Vec<_>>>()?;
         self.context.write_json(&format!("downscaled/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
-        // LR pictures that weren't rounded are shrunk by the box: the same, and for any size.
+        // LR images that weren't rounded are shrunk by the box: the same, and for any size.
         let kernel = if kernel == Kernel::Average { Kernel::Box } else { kernel };
         self.context.write_json(&format!("downscaled/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
     }
@@ -565,11 +565,11 @@ impl Job<'_> {
         camera.resized(width, height)
     }
 
-    /// The HR picture, where there is one, and the LR picture.
-    fn pictures(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LowResolution)> {
+    /// The HR image, where there is one, and the LR image.
+    fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
         let image = frame.photograph().bad_input(frame_name(frame))?;
         if !self.making.has_truth {
-            return Ok((None, LowResolution::Bytes(image)));
+            return Ok((None, LrImage::Bytes(image)));
         }
         let (hr, lr) = degrade(&image, &self.sizes_of(&frame.intrinsics()), self.making.kernel);
         Ok((Some(hr), lr))
@@ -595,7 +595,7 @@ impl Job<'_> {
         }
     }
 
-    fn write_high(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
+    fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
         write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image).map_err(Into::into)
     }
 
@@ -603,26 +603,26 @@ impl Job<'_> {
         write_png(&self.context.output_path(&format!("{subtree}/masks/{name}.png"))?, &mask.to_rgba8()).map_err(Into::into)
     }
 
-    /// The mask of an LR picture: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
-    fn low_mask(&self, mask: &Mask, picture: &LowResolution) -> Mask {
-        let size = picture.size();
+    /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
+    fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
+        let size = image.size();
         let around = if size == (mask.width, mask.height) { 0 } else { degrade::mask_reach(self.making.kernel) };
         mask.resized(size, around)
     }
 
-    fn write_low(&self, folder: &str, name: &str, image: &LowResolution) -> anyhow::Result<()> {
+    fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
         let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.making.kernel)))?;
         match image {
-            LowResolution::Bytes(image) => write_png(&path, image)?,
-            LowResolution::Floats(picture) => {
+            LrImage::Bytes(image) => write_png(&path, image)?,
+            LrImage::Floats(image) => {
                 let channels = ["R", "G", "B", "A"].map(|name| Channel { name, sample_type: SampleType::Float });
                 write_exr(
                     &path,
-                    (picture.width, picture.height),
+                    (image.width, image.height),
                     &channels,
                     "display-encoded sRGB, premultiplied",
                     |first, rows, samples| {
-                        samples.copy_from_slice(&picture.data[first * picture.width * 4..(first + rows) * picture.width * 4]);
+                        samples.copy_from_slice(&image.data[first * image.width * 4..(first + rows) * image.width * 4]);
                         Ok::<(), pixels::PixelError>(())
                     },
                 )?;

@@ -7,7 +7,8 @@ use scene::Camera;
 const FAR_OFF: f64 = 20.0;
 /// Fewer cameras say too little of where the others stand.
 const FEWEST: usize = 4;
-/// A principal point farther from the middle of the picture, as a share of its length, is far from it. Real lenses have a hundredth.
+/// A principal point farther from the middle of the image, as a share of its length, is far from it. Real lenses have a
+/// hundredth.
 const OFF_CENTRE: f64 = 0.2;
 /// Centres nearer to each other than this share of their distance from the origin are one place: they were the same before they were rounded.
 const ONE_PLACE: f64 = 1e-7;
@@ -81,7 +82,7 @@ fn median(of: impl Iterator<Item = f64>) -> f64 {
     sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// Principal points far from the middles of pictures: commonly numbers for pictures of another size.
+/// Principal points far from the middles of images: commonly numbers for images of another size.
 fn off_centre(all: &[Named]) -> Option<String> {
     let is_off = |named: &&Named| {
         let k = &named.camera.intrinsics;

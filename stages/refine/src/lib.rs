@@ -1,14 +1,15 @@
 //! `refine`: gives rendered views the detail they systematically lack, by a network that `train-refine` trained.
 //!
-//! A network that was trained with references takes them from the inputs `references` (true pictures at HR) and `reference-views` (the
-//! same views as rendered, for what the field sees where).
+//! A network that was trained with references takes them from the inputs `references` (true images at HR) and `reference-views`
+//! (the same views as rendered, for what the field sees where).
 //!
 //! The paper's own network (`train-refine`'s `net: paper`) redraws patches from references' patches instead of adding to the view.
 //!
-//! What a network that learnt from other pictures makes of a view's own photograph (input `enlarged`) errs in another way: the mean of both is taken.
+//! What a network that learnt from other images makes of a view's own photograph (input `enlarged`) errs in another way: the
+//! mean of both is taken.
 //!
 //! A view whose own LR photograph is known (input `photographs`; in the paper's split all are trained on and scored) is then moved as little
-//! as it takes to agree with that; before, too, where the network learnt on views that do.
+//! as it takes to be consistent with that; before, too, where the network learnt on views that are.
 //!
 //! Colours change; opacity, depth and cameras stay what the field made them.
 
@@ -16,7 +17,7 @@ use std::path::Path;
 
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage, counted};
 use paper_refiner::{OVERLAP, PaperRefiner};
-use pixels::{Channel, ExrImage, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
+use pixels::{Channel, ExrImage, Image, PixelError, VIEW_CHANNELS, VIEW_NOTE, read_exr, write_exr, write_png};
 use refinement::{
     Guidance, KnownView, LrObservations, Network, REFINER_FILE, Refiner, RefinerFile, Rendered, Use, WEIGHTS_FILE,
     with_references,
@@ -61,11 +62,11 @@ impl Stage for Refine {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("refiner", Input::required(&["refiner"], "a trained refiner")),
-            ("references", Input::optional(&["scene/references", "scene/truth"], "true pictures of some other views, at HR")),
+            ("references", Input::optional(&["scene/references", "scene/truth"], "true images of some other views, at HR")),
             ("reference-views", Input::optional(&["views"], "those views as rendered")),
             (
                 "photographs",
-                Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made to agree with its own"),
+                Input::optional(&["scene/train"], "LR photographs; a view of the same camera is made consistent with its own"),
             ),
             (
                 "enlarged",
@@ -92,7 +93,7 @@ impl Stage for Refine {
         let mut references = references(context, network.takes_references(), views.background)?;
         references.truncate(params.max_references.map_or(usize::MAX, |most| most as usize));
         let photographs = context.optional_input("photographs").map(LrObservations::read).transpose()?;
-        // Those that the network learnt by agreed, too.
+        // Those that the network learnt by were consistent, too.
         if let Some(own) = photographs.as_ref().filter(|_| file.agreeing) {
             let consistent =
                 |KnownView { rendered, truth }| anyhow::Ok(KnownView { rendered: own.make_consistent(rendered)?, truth });
@@ -129,7 +130,7 @@ impl Stage for Refine {
             progress.add(1);
         }
         if job.takes_consistent && consistent < views.views.len() {
-            context.say("the network was trained on views that agree with LR photographs of their own, which some of these haven't: train one without");
+            context.say("the network was trained on views consistent with LR photographs of their own, which some of these haven't: train one without");
         }
         context.write_json(VIEWS_FILE, &views)?;
         let by = job.say_of(&uses);
@@ -149,7 +150,7 @@ impl Stage for Refine {
 /// The references that a reference-based network asks for; what another is given is said and left out.
 fn references(context: &Context, wanted: bool, background: Background) -> anyhow::Result<Vec<KnownView>> {
     let given = context.optional_input("references").zip(context.optional_input("reference-views"));
-    let Some((pictures, rendered)) = given else {
+    let Some((images, rendered)) = given else {
         if wanted {
             context
                 .say("the network knows how to use references, but there are none: give inputs references and reference-views");
@@ -161,21 +162,21 @@ fn references(context: &Context, wanted: bool, background: Background) -> anyhow
             .say("the network was trained without references: those given are left out; set train-refine's parameter references_per_view");
         return Ok(Vec::new());
     }
-    let (pictures_list, rendered_list) = (Views::read(pictures)?, Views::read(rendered)?);
+    let (images_list, rendered_list) = (Views::read(images)?, Views::read(rendered)?);
     let shown = background.shown();
-    let reference = |picture: &View| -> anyhow::Result<Option<KnownView>> {
-        let name = &picture.camera.name;
-        let Some(truth) = picture.read_photograph(pictures).bad_input(format!("reference {name}"))? else { return Ok(None) };
-        let view = rendered_list.taken_by(&picture.camera).ok_or_else(|| {
+    let reference = |image: &View| -> anyhow::Result<Option<KnownView>> {
+        let name = &image.camera.name;
+        let Some(truth) = image.read_photograph(images).bad_input(format!("reference {name}"))? else { return Ok(None) };
+        let view = rendered_list.taken_by(&image.camera).ok_or_else(|| {
             Failure::BadInput(format!("input reference-views: no view {name} with that pose; render it for input references"))
         })?;
         let known = KnownView::new(read(rendered, view, shown)?.0, truth.over(shown)).bad_input("input reference-views")?;
         Ok(Some(same_exposure(context, known)))
     };
-    pictures_list.views.iter().filter_map(|picture| reference(picture).transpose()).collect()
+    images_list.views.iter().filter_map(|image| reference(image).transpose()).collect()
 }
 
-/// A reference as it would look with the exposure of the pictures that the field learnt from.
+/// A reference as it would look with the exposure of the images that the field learnt from.
 fn same_exposure(context: &Context, reference: KnownView) -> KnownView {
     let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_none()) else { return reference };
     let [r, g, b] = exposure.gain;
@@ -187,7 +188,7 @@ fn same_exposure(context: &Context, reference: KnownView) -> KnownView {
 /// A rendered view, and its file's channels.
 fn read(input: &GivenInput, view: &View, background: f32) -> anyhow::Result<(Rendered, ExrImage)> {
     let name = &view.camera.name;
-    let file = view.image.as_ref().ok_or_else(|| Failure::BadInput(format!("view {name}: it has no picture")))?;
+    let file = view.image.as_ref().ok_or_else(|| Failure::BadInput(format!("view {name}: it has no image")))?;
     let image = read_exr(&input.path(file)).bad_input(format!("view {name}"))?;
     Ok((Rendered::new(view.camera.clone(), &image, background).bad_input("rendered views")?, image))
 }
@@ -203,24 +204,23 @@ impl<'a> Enlarged<'a> {
         Ok(Self { input, views: Views::read(input)? })
     }
 
-    /// The mean of a picture and what was made of the same camera's photograph, where its mask leaves it; the picture where there is none.
-    fn mean(&self, mut picture: Picture, camera: &Camera) -> anyhow::Result<Picture> {
-        let Some(view) = self.views.taken_by(camera) else { return Ok(picture) };
+    /// The mean of an image and what was made of the same camera's photograph, where its mask leaves it; the image where there
+    /// is none.
+    fn mean(&self, mut image: Image, camera: &Camera) -> anyhow::Result<Image> {
+        let Some(view) = self.views.taken_by(camera) else { return Ok(image) };
         let place = || format!("input enlarged: view {}", camera.name);
-        let Some(photograph) = view.read_photograph(self.input).bad_input(place())? else { return Ok(picture) };
-        let Photograph { picture: mut other, mask } = photograph.over(self.views.background.shown());
-        if (other.width, other.height) != (picture.width, picture.height) {
-            let sizes = format!(
-                "{}×{} pixels where the view to refine has {}×{}",
-                other.width, other.height, picture.width, picture.height
-            );
+        let Some(photograph) = view.read_photograph(self.input).bad_input(place())? else { return Ok(image) };
+        let Photograph { image: mut other, mask } = photograph.over(self.views.background.shown());
+        if (other.width, other.height) != (image.width, image.height) {
+            let sizes =
+                format!("{}×{} pixels where the view to refine has {}×{}", other.width, other.height, image.width, image.height);
             return Err(Failure::BadInput(format!("{}: {sizes}", place())).into());
         }
         if let Some(mask) = mask {
-            mask.fill(&mut other, &picture);
+            mask.fill(&mut other, &image);
         }
-        picture.data.iter_mut().zip(&other.data).for_each(|(v, other)| *v = 0.5 * (*v + other));
-        Ok(picture)
+        image.data.iter_mut().zip(&other.data).for_each(|(v, other)| *v = 0.5 * (*v + other));
+        Ok(image)
     }
 }
 
@@ -252,10 +252,10 @@ impl AnyRefiner {
     }
 }
 
-/// Something must be wrong with a reference that is trusted with less than this share of what those of the rehearsal were.
+/// Something must be wrong with a reference whose confidence is less than this share of that in those of the downscaled field.
 const LITTLE: f64 = 0.75;
 
-/// Unless it is trusted so many times as much as with all depths nearer or farther by that share.
+/// Unless the confidence in it is so many times as high as with all depths nearer or farther by that share.
 const SENSITIVE: f64 = 1.1;
 const ELSEWHERE: f32 = 0.1;
 
@@ -315,16 +315,16 @@ impl RefineJob<'_> {
         Ok((rendered.with_colours(&colours), image, own))
     }
 
-    /// A picture of a view that is consistent with its own LR observation, where there is one.
-    fn make_consistent(&self, picture: Picture, own: Option<&Photograph>) -> Picture {
+    /// An image of a view that is consistent with its own LR observation, where there is one.
+    fn make_consistent(&self, image: Image, own: Option<&Photograph>) -> Image {
         match self.photographs.as_ref().zip(own) {
-            Some((photographs, own)) => photographs.project(&picture, own),
-            None => picture,
+            Some((photographs, own)) => photographs.project(&image, own),
+            None => image,
         }
     }
 
     /// What the network makes of a view: colours in 0..1. What each reference was of use for is added to `uses`.
-    fn redraw(&self, rendered: &Rendered, uses: &mut [Use]) -> anyhow::Result<Picture> {
+    fn redraw(&self, rendered: &Rendered, uses: &mut [Use]) -> anyhow::Result<Image> {
         let references: Vec<&KnownView> = self.references.iter().collect();
         match &self.network {
             AnyRefiner::Compact(network) => {
@@ -345,9 +345,9 @@ impl RefineJob<'_> {
         }
     }
 
-    /// Leaves references out that look otherwise than what is rendered: those that are trusted with less than a share of what they see, unless they would
-    /// be trusted with clearly less still were all depths others. Then depths are right, and it is for another reason that little agrees: seen from
-    /// far aside, surfaces look otherwise.
+    /// Leaves references out that look otherwise than what is rendered: those in which confidence is less than a share of what
+    /// they see, unless it would be clearly less still were all depths others. Then depths are right, and confidence is low for
+    /// another reason: seen from far aside, surfaces look otherwise.
     fn leave_out(&mut self, views: &Views, guidance: Guidance, least: f64) -> anyhow::Result<()> {
         let confidence = self.confidence(&self.references, views, guidance, 1.0)?;
         let references = std::mem::take(&mut self.references);
@@ -365,7 +365,7 @@ impl RefineJob<'_> {
             }
             let name = &reference.rendered.camera.name;
             self.context.say(format!(
-                "reference {name} looks otherwise than what is rendered ({:.0} % agree) and is left out: wrong depth, a wrong pose, or \
+                "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and is left out: wrong depth, a wrong pose, or \
                  something that moved?",
                 100.0 * share
             ));
@@ -373,7 +373,8 @@ impl RefineJob<'_> {
         Ok(())
     }
 
-    /// Share of what it sees of some views, spread over all, that each reference is trusted with, were depths so many times what they are.
+    /// Confidence in each reference, as a share of what it sees of some views spread over all, were depths so many times what
+    /// they are.
     fn confidence(&self, references: &[KnownView], views: &Views, guidance: Guidance, depths: f32) -> anyhow::Result<Vec<f64>> {
         let every = views.views.len().div_ceil(JUDGES).max(1);
         let mut uses = vec![Use::default(); references.len()];
@@ -410,7 +411,7 @@ impl RefineJob<'_> {
     }
 
     /// A view's file with other colours.
-    fn write(&self, path: &Path, image: &ExrImage, refined: &Picture, opacity: &[f32]) -> anyhow::Result<()> {
+    fn write(&self, path: &Path, image: &ExrImage, refined: &Image, opacity: &[f32]) -> anyhow::Result<()> {
         // All but the colours stay.
         let kept: Vec<(Channel, Option<&[f32]>)> = VIEW_CHANNELS
             .into_iter()

@@ -8,7 +8,7 @@
 use std::error::Error;
 
 use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings};
-use pixels::{Picture, PixelError};
+use pixels::{Image, PixelError};
 use poses::{CameraMove, Moved, Options, Pyramid, refine};
 use radiance::RayField;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
@@ -67,8 +67,8 @@ impl Stage for Register {
             let photograph = read(view, input).bad_input(place())?;
             let registered = match photograph {
                 Some(photograph) => {
-                    let picture = photograph.over(shown).known();
-                    Registered::by(&members, &view.camera, &picture, params, shown)
+                    let image = photograph.over(shown).known();
+                    Registered::by(&members, &view.camera, &image, params, shown)
                         .map_err(|e| anyhow::anyhow!("{}: {e}", place()))?
                 }
                 None => Registered::unknown(&view.camera),
@@ -107,11 +107,11 @@ impl Registered {
     fn by(
         field: &dyn RayField,
         camera: &Camera,
-        picture: &Picture,
+        image: &Image,
         params: &Params,
         background: f32,
     ) -> Result<Self, Box<dyn Error + Send + Sync>> {
-        let pyramid = Pyramid::new(picture, params.smaller);
+        let pyramid = Pyramid::new(image, params.smaller);
         let moved = |camera: &Camera, level: u32, renderings: u32| {
             let options = Options { renderings, background, ..Options::default() };
             refine(field, camera, &pyramid, level, &options)
@@ -123,14 +123,14 @@ impl Registered {
         }
         let last = moved(&to, 0, params.renderings)?;
         let best = if last.after < given.before { last } else { given.clone() };
-        let from = camera.resized(picture.width as u32, picture.height as u32);
+        let from = camera.resized(image.width as u32, image.height as u32);
         Ok(Self { from, to: best.camera, depth: best.depth, errors: Some([given.before, best.after]) })
     }
 }
 
 /// The LR photograph of a view, or the only one there is.
 fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
-    Ok(match view.read_low_resolution(input)? {
+    Ok(match view.read_lr(input)? {
         Some(photograph) => Some(photograph),
         None => view.read_photograph(input)?,
     })

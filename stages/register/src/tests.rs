@@ -4,7 +4,8 @@ use scene::Intrinsics;
 
 use super::*;
 
-/// A painted wall. Pictures of fewer pixels than `whole` show it shifted; those of more say nothing of depth, so that nothing moves by them.
+/// A painted wall. Images of fewer pixels than `whole` show it shifted; those of more say nothing of depth, so that nothing
+/// moves by them.
 struct Wall {
     whole: usize,
     shift: f64,
@@ -31,14 +32,14 @@ fn camera(x: f64) -> Camera {
     Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]] }
 }
 
-fn photograph() -> Picture {
+fn photograph() -> Image {
     let k = camera(0.0).intrinsics;
     let rays = (0..k.width * k.height).map(|i| {
         let ray = camera(0.0).ray(f64::from(i % k.width) + 0.5, f64::from(i / k.width) + 0.5);
         Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
     });
     let pixels = Wall { whole: 0, shift: 0.0 }.render(&rays.collect::<Vec<_>>()).unwrap();
-    Picture::new(48, 48, 3, pixels.iter().flat_map(|pixel| pixel.colour).collect())
+    Image::new(48, 48, 3, pixels.iter().flat_map(|pixel| pixel.colour).collect())
 }
 
 fn registered(field: &Wall, from: f64) -> Registered {
@@ -60,7 +61,7 @@ fn a_camera_that_is_off_is_found_and_one_far_off_is_warned_of() {
     assert!(warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) in the mean, which is far")), "{warning:?}");
 }
 
-/// Smaller pictures say that the wall lies elsewhere; in the whole one it is met best from where it was given.
+/// Smaller images say that the wall lies elsewhere; in the whole one it is met best from where it was given.
 #[test]
 fn the_given_pose_stays_where_none_is_better() {
     let misled = registered(&Wall { whole: 2000, shift: 0.5 }, 0.0);

@@ -1,7 +1,7 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
-//! A field may have several members, trained apart or one on from another; what they render is averaged: each errs in its own way where the pictures
-//! leave it open.
+//! A field may have several members, trained apart or one on from another; what they render is averaged: each errs in its own
+//! way where the images leave it open.
 //!
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
@@ -187,7 +187,7 @@ impl RenderJob<'_> {
     }
 }
 
-/// The middle one of the sub-rays' distances, and its z-depth per distance: a mean would invent a surface between two.
+/// The middle one of the sub-pixel rays' distances, and its z-depth per distance: a mean would invent a surface between two.
 fn middle(distances: &mut [(f32, f32)]) -> (f32, f32) {
     distances.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
     distances[(distances.len() - 1) / 2]

@@ -7,10 +7,10 @@ use pixels::{Rgba8, read_png};
 use scene::Views;
 
 use crate::Params;
+use crate::images::{colour, uri_of};
 use crate::page::{Point, label};
-use crate::pictures::{colour, uri_of};
 
-/// A square of a picture.
+/// A square of an image.
 #[derive(Clone, Copy)]
 struct Crop {
     x: usize,
@@ -18,7 +18,7 @@ struct Crop {
     side: usize,
 }
 
-/// Squares along a picture's shorter side, where nobody says which to show.
+/// Squares along an image's shorter side, where nobody says which to show.
 const SQUARES: usize = 4;
 
 /// What all methods make of one view: a crop of each beside its error map, as the figures of papers have it.
@@ -61,19 +61,19 @@ fn row(
         let scores = point.metrics["views"].as_array().into_iter().flatten().find(|scores| scores["name"] == name.as_str());
         let found = views.views.iter().find(|v| v.camera.name == *name).and_then(|v| v.image.as_ref());
         let (Some(found), Some(scores)) = (found, scores) else { continue };
-        let picture = colour(&folder, found, views.background)?;
+        let image = colour(&folder, found, views.background)?;
         let error = scores["error_map"].as_str().map(|file| read_png(&point.node.folder.join(file))).transpose()?;
         let psnr = scores["scores"]["psnr"].as_f64().map(|psnr| format!(", {psnr:.2} dB")).unwrap_or_default();
-        methods.push((label(all, point), psnr, picture, error));
+        methods.push((label(all, point), psnr, image, error));
     }
     let Crop { x, y, side } = crop;
-    let figure = |picture: &Rgba8, caption: &str| {
-        let same_size = (picture.width, picture.height) == (truth.width, truth.height);
-        html! { @if same_size { figure { img class="px" src=(uri_of(&cut(picture, crop))) alt=(caption); figcaption { (caption) } } } }
+    let figure = |image: &Rgba8, caption: &str| {
+        let same_size = (image.width, image.height) == (truth.width, truth.height);
+        html! { @if same_size { figure { img class="px" src=(uri_of(&cut(image, crop))) alt=(caption); figcaption { (caption) } } } }
     };
     Ok(Some(html! {
         p { "View " (name) ", the " (side) "×" (side) " pixels from " (x) ", " (y) " on; the figures are the whole view's." }
-        div class="row compare" { (figure(&truth, "ground truth")) @for (name, psnr, picture, _) in &methods { (figure(picture, &format!("{name}{psnr}"))) } }
+        div class="row compare" { (figure(&truth, "ground truth")) @for (name, psnr, image, _) in &methods { (figure(image, &format!("{name}{psnr}"))) } }
         div class="row compare" {
             figure { figcaption { "error" } }
             @for (name, _, _, error) in &methods { @if let Some(error) = error { (figure(error, name)) } }
@@ -81,11 +81,11 @@ fn row(
     }))
 }
 
-/// The square of a picture in which neighbours differ most.
-fn busiest(picture: &Rgba8) -> Crop {
-    let side = (picture.width.min(picture.height) / SQUARES).max(1);
+/// The square of an image in which neighbours differ most.
+fn busiest(image: &Rgba8) -> Crop {
+    let side = (image.width.min(image.height) / SQUARES).max(1);
     let detail = |crop: &Crop| -> u64 {
-        let at = |x: usize, y: usize, c: usize| i64::from(picture.data[4 * (y * picture.width + x) + c]);
+        let at = |x: usize, y: usize, c: usize| i64::from(image.data[4 * (y * image.width + x) + c]);
         let places = (crop.y..crop.y + side - 1).flat_map(|y| (crop.x..crop.x + side - 1).map(move |x| (x, y)));
         let differs =
             |(x, y)| (0..3).map(|c| at(x, y, c).abs_diff(at(x + 1, y, c)) + at(x, y, c).abs_diff(at(x, y + 1, c))).sum::<u64>();
@@ -93,19 +93,19 @@ fn busiest(picture: &Rgba8) -> Crop {
     };
     // Half a square apart; of equals the first.
     let starts = |size: usize| (0..=size - side).step_by((side / 2).max(1));
-    let crops = starts(picture.height).flat_map(|y| starts(picture.width).map(move |x| Crop { x, y, side }));
+    let crops = starts(image.height).flat_map(|y| starts(image.width).map(move |x| Crop { x, y, side }));
     let first = Crop { x: 0, y: 0, side };
     crops.map(|crop| (detail(&crop), crop)).fold((0, first), |best, next| if next.0 > best.0 { next } else { best }).1
 }
 
-/// A square as it was asked for, moved and made smaller where it would leave the picture.
-fn within(picture: &Rgba8, x: u32, y: u32, side: u32) -> Crop {
-    let side = (side as usize).clamp(1, picture.width.min(picture.height).max(1));
-    Crop { x: (x as usize).min(picture.width - side), y: (y as usize).min(picture.height - side), side }
+/// A square as it was asked for, moved and made smaller where it would leave the image.
+fn within(image: &Rgba8, x: u32, y: u32, side: u32) -> Crop {
+    let side = (side as usize).clamp(1, image.width.min(image.height).max(1));
+    Crop { x: (x as usize).min(image.width - side), y: (y as usize).min(image.height - side), side }
 }
 
-fn cut(picture: &Rgba8, Crop { x, y, side }: Crop) -> Rgba8 {
-    let row = |row: usize| &picture.data[4 * (row * picture.width + x)..4 * (row * picture.width + x + side)];
+fn cut(image: &Rgba8, Crop { x, y, side }: Crop) -> Rgba8 {
+    let row = |row: usize| &image.data[4 * (row * image.width + x)..4 * (row * image.width + x + side)];
     Rgba8::new(side, side, (y..y + side).flat_map(row).copied().collect())
 }
 
@@ -113,7 +113,7 @@ fn cut(picture: &Rgba8, Crop { x, y, side }: Crop) -> Rgba8 {
 mod tests {
     use super::*;
 
-    fn picture(width: usize, height: usize, busy: impl Fn(usize, usize) -> bool) -> Rgba8 {
+    fn image(width: usize, height: usize, busy: impl Fn(usize, usize) -> bool) -> Rgba8 {
         let pixel = |i: usize| {
             let (x, y) = (i % width, i / width);
             [if busy(x, y) && (x + y) % 2 == 0 { 255 } else { 0 }; 4]
@@ -123,20 +123,20 @@ mod tests {
 
     #[test]
     fn the_square_with_most_detail_is_shown() {
-        let shown = busiest(&picture(40, 24, |x, y| x >= 30 && (9..15).contains(&y)));
+        let shown = busiest(&image(40, 24, |x, y| x >= 30 && (9..15).contains(&y)));
         assert_eq!((shown.side, shown.y), (6, 9));
         assert!(shown.x >= 30, "{}", shown.x);
-        // Pictures without any, and the smallest.
+        // Images without any, and the smallest.
         for (width, height) in [(1, 1), (2, 1), (3, 9)] {
-            let flat = picture(width, height, |_, _| false);
+            let flat = image(width, height, |_, _| false);
             let crop = busiest(&flat);
             assert_eq!(cut(&flat, crop).width, crop.side);
         }
     }
 
     #[test]
-    fn a_square_stays_in_the_picture() {
-        let whole = picture(10, 6, |_, _| true);
+    fn a_square_stays_in_the_image() {
+        let whole = image(10, 6, |_, _| true);
         for (x, y, side) in [(0, 0, 6), (9, 5, 4), (99, 99, 99), (2, 3, 0)] {
             let crop = within(&whole, x, y, side);
             assert!(crop.x + crop.side <= 10 && crop.y + crop.side <= 6 && crop.side > 0);

@@ -4,12 +4,12 @@
 //!
 //! * `compare`: where several blocks score, what each made of a crop of one view, beside its error map.
 //! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes and times.
-//! * `pictures`: views and depth as embedded PNG data.
+//! * `images`: views and depth as embedded PNG data.
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 
 mod compare;
+mod images;
 mod page;
-mod pictures;
 mod results;
 
 use artifact::{Context, Failure, Input, Output, RunRecord, Stage};

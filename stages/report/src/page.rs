@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use crate::Params;
 use crate::compare::compare;
-use crate::pictures::{colour, depth, depths_of, shown_in_gallery};
+use crate::images::{colour, depth, depths_of, shown_in_gallery};
 use crate::results::{metrics, scored, warnings_by_node};
 
 const STYLE: &str = "
@@ -179,13 +179,13 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let figure = |class: &str, uri: Option<String>, caption: String| {
             html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }
         };
-        let picture = |folder: &Path, file: &Option<String>, background| -> anyhow::Result<Option<(String, usize)>> {
+        let embedded = |folder: &Path, file: &Option<String>, background| -> anyhow::Result<Option<(String, usize)>> {
             let image = file.as_ref().map(|f| colour(folder, f, background)).transpose()?;
             Ok(image.map(|i| (shown_in_gallery(&i), i.width)))
         };
-        let low = picture(&truth, &true_view.low_resolution, truths.background)?;
-        let found = picture(&rendered, &view.image, views.background)?;
-        let expected = picture(&truth, &true_view.image, truths.background)?;
+        let lr = embedded(&truth, &true_view.low_resolution, truths.background)?;
+        let found = embedded(&rendered, &view.image, views.background)?;
+        let expected = embedded(&truth, &true_view.image, truths.background)?;
         let map = |key: &str| -> anyhow::Result<Option<String>> {
             let file = scores[key].as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
             Ok(file.map(|map| shown_in_gallery(&map)))
@@ -205,7 +205,7 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         rows.push(html! {
             h3 { "View " (name) " " small { "PSNR " (number("/psnr", 2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr", 2)) " dB" } }
             div class="row" {
-                (figure("lr", low.clone().map(|l| l.0), caption("LR", &low)))
+                (figure("lr", lr.clone().map(|l| l.0), caption("LR", &lr)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
                 (figure("px", error, if expected.is_some() { "error" } else { "error at LR" }.to_owned()))

@@ -1,4 +1,4 @@
-//! Pictures of a plan: text, Graphviz, SVG.
+//! Drawings of a plan: text, Graphviz, SVG.
 
 use crate::plan::{Origin, Plan, State};
 

@@ -33,7 +33,7 @@ fn descriptions() -> BTreeMap<String, Description> {
         {"name": "make", "output": {"kind": "data"}, "parameters": {"properties": {
             "size": {"type": "integer", "format": "uint32", "minimum": 1, "default": 4}, "seed": seed}}},
         {"name": "prep", "output": {"kind": "scene", "subtrees": {"train": "scene/train"}},
-         "inputs": {"data": {"kinds": ["data"], "summary": "pictures"}},
+         "inputs": {"data": {"kinds": ["data"], "summary": "images"}},
          "parameters": {"properties": {
             "scale": {"type": ["number", "null"], "default": null},
             "kernel": {"anyOf": [{"enum": ["box", "average"]}, {"type": "null"}], "default": null},

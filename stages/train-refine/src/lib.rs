@@ -1,13 +1,13 @@
 //! `train-refine`: trains the network that refines rendered views, from views whose truth is known.
 //!
-//! In the pipeline those are of a rehearsal: a field trained from LR pictures that were shrunk once more, rendered at LR size, beside
-//! the LR pictures themselves. So it sees LR pictures alone, and the scene it is for.
+//! This is internal learning; in the pipeline the views are of the downscaled field: a field trained from LR images that were
+//! shrunk once more, rendered at LR size, beside the LR images themselves. So it sees LR images alone, and the scene it is for.
 //!
-//! For views that will be refined by references, it sees references in training, too: other views of the rehearsal, of which every one has
-//! its true picture.
+//! For views that will be refined by references, it sees references in training, too: other views of the downscaled field, of
+//! which every one has its true image.
 //!
-//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's split, they agree with those before the
-//! network sees them; so do the views that it learns from.
+//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's split, they are made
+//! consistent with those before the network sees them; so do the views that it learns from.
 //!
 //! Every eighth view is left out of training; what the network brings there is measured and kept with it.
 //!
@@ -228,7 +228,8 @@ impl Stage for TrainRefine {
     }
 }
 
-/// LR photographs of the rehearsal's views, where those of the views to be refined will be known, too: the task is to be the same.
+/// LR photographs of the downscaled field's views, where those of the views to be refined will be known, too: the task is to be
+/// the same.
 fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_>>> {
     let Some((photographs, cameras)) = context.optional_input("photographs").zip(context.optional_input("cameras")) else {
         return Ok(None);
@@ -237,7 +238,9 @@ fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_
     if !own.are_of_all(&Views::read(cameras)?) {
         return Ok(None);
     }
-    context.say("all views to be refined have LR photographs of their own: the network learns on views that agree with theirs");
+    context.say(
+        "all views to be refined have LR photographs of their own: the network learns on views that are consistent with theirs",
+    );
     Ok(Some(own))
 }
 
@@ -318,7 +321,7 @@ fn examples(
     let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;
     if all.is_empty() {
         return Err(
-            Failure::BadInput("input views: none of them has a picture, by name and pose, in input truth".to_owned()).into()
+            Failure::BadInput("input views: none of them has an image, by name and pose, in input truth".to_owned()).into()
         );
     }
     if all.len() == 1 {

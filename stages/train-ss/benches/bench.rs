@@ -158,7 +158,7 @@ fn rays(count: usize) -> Vec<Ray> {
     (0..side * side).map(at).collect()
 }
 
-/// One core through a field of faint fog: every sample gets a colour.
+/// One core through a field of faint density: every sample gets a colour.
 fn passes(rows: &mut Rows) {
     let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
     let default = Architecture::default();

@@ -13,8 +13,8 @@ pub(crate) struct Exposures {
 const KEEP: f64 = 0.998;
 /// Photographs are as bright as rendered, says so many white pixels.
 const PRIOR: f64 = 1.0;
-/// Share of the training before which the field knows too little to say anything of exposures. Much later it has made up haze before the
-/// cameras that explains them: with 0.1, 0.3 factors are found half, not at all.
+/// Share of the training before which the field knows too little to say anything of exposures. Much later it has made up
+/// floaters before the cameras that explain them: with 0.1, 0.3 factors are found half, not at all.
 const BEGIN: f64 = 0.02;
 /// Bytes of a view's sums.
 const BYTES: usize = 6 * 8;

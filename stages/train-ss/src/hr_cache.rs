@@ -1,9 +1,9 @@
 use std::sync::Arc;
 
-use pixels::{Picture, Resampling, to_u8};
+use pixels::{Image, Resampling, to_u8};
 
 /// The field's HR pixels of every training view as they were last rendered, in 8 bits, and the operators that make LR pixels
-/// of them. Before a pixel is first rendered it is the enlarged LR picture's.
+/// of them. Before a pixel is first rendered it is the enlarged LR image's.
 #[derive(Debug)]
 pub(crate) struct HrCache {
     /// HR pixels rendered together for an LR pixel, along x and y; no more than the smallest view has.
@@ -23,7 +23,7 @@ struct CachedView {
     kernel: Arc<KernelOperator>,
 }
 
-/// What made LR pictures of a size, and what its residuals ask of HR pixels.
+/// What made LR images of a size, and what its residuals ask of HR pixels.
 #[derive(Debug)]
 pub(crate) struct KernelOperator {
     operator: Resampling,
@@ -43,10 +43,10 @@ impl HrCache {
         Self { side, views: Vec::new() }
     }
 
-    /// Adds the next view: an RGB picture at HR size to begin with, and what makes it an LR picture.
-    pub(crate) fn add(&mut self, picture: &Picture, kernel: Arc<KernelOperator>) {
-        let rendered = picture.data.iter().map(|&v| to_u8(v)).collect();
-        let mut view = CachedView { width: picture.width, height: picture.height, rendered, projected: Vec::new(), kernel };
+    /// Adds the next view: an RGB image at HR size to begin with, and what makes it an LR image.
+    pub(crate) fn add(&mut self, image: &Image, kernel: Arc<KernelOperator>) {
+        let rendered = image.data.iter().map(|&v| to_u8(v)).collect();
+        let mut view = CachedView { width: image.width, height: image.height, rendered, projected: Vec::new(), kernel };
         view.project();
         self.views.push(view);
     }
@@ -85,7 +85,7 @@ impl HrCache {
         view: usize,
         [x, y]: [usize; 2],
         colours: &[[f32; 3]],
-        targets: &Picture,
+        targets: &Image,
         judge: impl Fn(usize, f32, f32) -> f32,
         back_projected: &mut [[f32; 3]],
     ) -> [f32; 3] {
@@ -143,7 +143,7 @@ impl HrCache {
         own
     }
 
-    /// Remembers the fresh sub-rays of an LR pixel.
+    /// Remembers the fresh sub-pixel rays of an LR pixel.
     pub(crate) fn remember(&mut self, view: usize, x: usize, y: usize, colours: &[[f32; 3]]) {
         // A block at the edge may lie off its LR pixel's centre.
         const REACH: usize = HrCache::REACH + 1;
@@ -239,21 +239,22 @@ mod tests {
 
     use super::*;
 
-    fn picture(width: usize, height: usize) -> Picture {
+    fn pattern(width: usize, height: usize) -> Image {
         // Whole 8-bit levels, away from black and white.
         let sample = |i: usize| (40 + (i * 7919 + i * i * 31) % 170) as f32 / 255.0;
-        Picture::new(width, height, 3, (0..width * height * 3).map(sample).collect())
+        Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole pictures, at any scale, also where the block is news.
+    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any scale, also where the block
+    /// is news.
     #[test]
     fn back_projections_are_the_operators_own() {
         for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
             let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
             let operator = Resampling::new(Filter::Lanczos, hr, lr);
             let inverse = operator.inverse(HrCache::REACH);
-            let image = picture(hr.0, hr.1);
-            let targets = picture(lr.0, lr.1);
+            let image = pattern(hr.0, hr.1);
+            let targets = pattern(lr.0, lr.1);
             let mut cache = HrCache::new(side);
             cache.add(&image, Arc::new(KernelOperator::new(operator.clone())));
             for y in 0..lr.1 {
@@ -283,13 +284,13 @@ mod tests {
     #[test]
     fn remembers_what_it_is_told() {
         let mut cache = HrCache::new([2, 2]);
-        cache.add(&picture(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
+        cache.add(&pattern(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         cache.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
         let bytes: Vec<u8> = cache.parts().flatten().copied().collect();
         assert_eq!(cache.len(), bytes.len());
         assert_eq!(bytes[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
         let mut other = HrCache::new([2, 2]);
-        other.add(&picture(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
+        other.add(&pattern(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
         other.restore(&bytes);
         assert!(other.parts().eq(cache.parts()));
     }
@@ -301,7 +302,7 @@ mod tests {
             for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
                 let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
                 let mut cache = HrCache::new(side);
-                cache.add(&picture(hr.0, hr.1), Arc::new(KernelOperator::new(Resampling::new(filter, hr, lr))));
+                cache.add(&pattern(hr.0, hr.1), Arc::new(KernelOperator::new(Resampling::new(filter, hr, lr))));
                 for k in 0..lr.0 * lr.1 {
                     let colours: Vec<[f32; 3]> = (0..side[0] * side[1]).map(|i| [(i * 7 + k) as f32 % 1.0, 0.3, 1.0]).collect();
                     cache.remember(0, k % lr.0, k / lr.0, &colours);
@@ -315,12 +316,12 @@ mod tests {
 
     /// Every HR pixel belongs to some block, so none is left unseen.
     #[test]
-    fn blocks_cover_the_picture() {
+    fn blocks_cover_the_image() {
         for (lr, hr) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
             let side = (hr as f64 / lr as f64).ceil() as usize;
             let mut cache = HrCache::new([side, side]);
             let operator = Resampling::new(Filter::Lanczos, (hr, hr), (lr, lr));
-            cache.add(&picture(hr, hr), Arc::new(KernelOperator::new(operator)));
+            cache.add(&pattern(hr, hr), Arc::new(KernelOperator::new(operator)));
             let mut seen = vec![false; hr];
             (0..lr).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
             assert!(seen.iter().all(|s| *s), "{lr} {hr}");

@@ -247,7 +247,7 @@ pub struct Photographs {
     /// Where they were taken from.
     pub views: Views,
     /// One for each view, of its camera's size.
-    pub pictures: Vec<Photograph>,
+    pub images: Vec<Photograph>,
 }
 
 impl Photographs {
@@ -260,8 +260,8 @@ impl Photographs {
     pub fn read_first(input: &artifact::GivenInput, most: usize) -> anyhow::Result<Self> {
         let mut views = Views::read(input)?;
         views.views.truncate(most);
-        let pictures = read_pictures(input, &views)?;
-        Ok(Self { views, pictures })
+        let images = read_images(input, &views)?;
+        Ok(Self { views, images })
     }
 
     /// Over the background, but where that is open.
@@ -270,18 +270,18 @@ impl Photographs {
         if background == scene::Background::Alpha {
             return self;
         }
-        let pictures = self.pictures.into_iter().map(|photograph| photograph.over(background.shown())).collect();
-        Self { pictures, ..self }
+        let images = self.images.into_iter().map(|photograph| photograph.over(background.shown())).collect();
+        Self { images, ..self }
     }
 }
 
-fn read_pictures(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
+fn read_images(input: &artifact::GivenInput, views: &Views) -> anyhow::Result<Vec<Photograph>> {
     let read = |view: &scene::View| -> anyhow::Result<Photograph> {
         let (name, k) = (&view.camera.name, view.camera.intrinsics);
         let place = input.folder().display();
         let photograph = view.read_photograph(input).bad_input(&place)?;
         let photograph = photograph.with_context(|| format!("view {name}: it has no image")).bad_input(&place)?;
-        let (width, height) = (photograph.picture.width, photograph.picture.height);
+        let (width, height) = (photograph.image.width, photograph.image.height);
         if (width, height) != (k.width as usize, k.height as usize) {
             let message = format!("{place}: view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
             return Err(Failure::BadInput(message).into());
@@ -314,7 +314,7 @@ pub fn supervision(
         let message = "input references: another background than the scene's; have one prep make both";
         return Err(Failure::BadInput(message.to_owned()).into());
     }
-    if photographs.pictures.iter().all(|p| p.mask.as_ref().is_some_and(|mask| mask.share() == 0.0)) {
+    if photographs.images.iter().all(|p| p.mask.as_ref().is_some_and(|mask| mask.share() == 0.0)) {
         return Err(Failure::BadInput("scene: masks leave no pixel of any photograph; white is what counts".to_owned()).into());
     }
     let known = input.path(DEGRADATION_FILE).exists();

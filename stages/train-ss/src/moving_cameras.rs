@@ -1,4 +1,4 @@
-use pixels::Picture;
+use pixels::Image;
 use poses::{CameraMove, Moved, Options, Pyramid, refine, take_back_common_motion};
 use radiance::RayField;
 use scene::Camera;
@@ -16,7 +16,7 @@ pub(crate) struct MovingCameras {
 /// Rounds of a training.
 const ROUNDS: u32 = 24;
 /// Shares of the training at the first and after the last round. It begins early, before the field has explained photographs that don't fit
-/// by haze, and ends before weights are averaged.
+/// by floaters, and ends before weights are averaged.
 const FIRST: f64 = 0.02;
 const LAST: f64 = 0.7;
 /// Share at which photographs are compared at their own size; before it at smaller ones, since a field that isn't sharp yet pulls from afar.
@@ -28,8 +28,8 @@ const SMALLER: u32 = 3;
 
 impl MovingCameras {
     /// Cameras, and their RGB photographs, NaN where nothing is known.
-    pub(crate) fn new<'a>(cameras: Vec<Camera>, photographs: impl Iterator<Item = &'a Picture>) -> Self {
-        let photographs = photographs.map(|picture| Pyramid::new(picture, SMALLER)).collect();
+    pub(crate) fn new<'a>(cameras: Vec<Camera>, photographs: impl Iterator<Item = &'a Image>) -> Self {
+        let photographs = photographs.map(|image| Pyramid::new(image, SMALLER)).collect();
         Self { were: cameras.clone(), now: cameras, photographs, rounds: 0 }
     }
 
@@ -114,8 +114,8 @@ mod tests {
             intrinsics,
             camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
-        let picture = Picture::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
-        let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], [&picture, &picture].into_iter());
+        let image = Image::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
+        let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], [&image, &image].into_iter());
         let mut moving = new();
         assert!(!moving.are_due(0.01) && moving.are_due(0.02));
         moving.step(&field, 0.02, 1.0, |_| [1.0; 3]).unwrap();

@@ -1,5 +1,5 @@
 use counter_rng::CounterRng;
-use pixels::Picture;
+use pixels::Image;
 
 /// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
 /// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
@@ -40,13 +40,13 @@ impl Focus {
 }
 
 /// Which pixels aren't flat, in order.
-pub(crate) fn detailed(picture: &Picture) -> impl Iterator<Item = usize> + '_ {
+pub(crate) fn detailed(image: &Image) -> impl Iterator<Item = usize> + '_ {
     let near = |at: usize, end: usize| at.saturating_sub(1)..(at + 2).min(end);
-    (0..picture.width * picture.height).filter(move |&pixel| {
-        let (x, y) = (pixel % picture.width, pixel / picture.width);
-        (0..picture.channels).any(|c| {
-            let around = near(y, picture.height).flat_map(|j| near(x, picture.width).map(move |i| (i, j)));
-            let value = |(i, j): (usize, usize)| picture.data[(j * picture.width + i) * picture.channels + c];
+    (0..image.width * image.height).filter(move |&pixel| {
+        let (x, y) = (pixel % image.width, pixel / image.width);
+        (0..image.channels).any(|c| {
+            let around = near(y, image.height).flat_map(|j| near(x, image.width).map(move |i| (i, j)));
+            let value = |(i, j): (usize, usize)| image.data[(j * image.width + i) * image.channels + c];
             let (low, high) = around.map(value).fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
             high - low > FLAT
         })
@@ -82,7 +82,7 @@ mod tests {
     /// Pixels with detail are drawn as often as asked for, and the weighted loss expects what even draws do.
     #[test]
     fn focus_keeps_the_expectation() {
-        let mut flat = Picture::new(20, 10, 3, vec![0.5; 600]);
+        let mut flat = Image::new(20, 10, 3, vec![0.5; 600]);
         flat.data[3 * (3 * 20 + 4)] = 0.9;
         assert!(detailed(&flat).eq((2..5).flat_map(|y| (3..6).map(move |x| 20 * y + x))), "what is around a dot");
         let focus = Focus::new(7.0, 200, detailed(&flat).map(|p| p as u64).collect());

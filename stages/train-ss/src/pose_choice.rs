@@ -1,8 +1,8 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use pixels::{Picture, psnr_of};
-use poses::{Shot, disagreement};
+use pixels::{Image, psnr_of};
+use poses::{Shot, photometric_error};
 use scene::Camera;
 
 use crate::field_trainer::read;
@@ -49,7 +49,7 @@ pub(crate) fn train(member: &Member<'_>, data: &TrainingData<'_>) -> anyhow::Res
 struct Judge<'a> {
     member: &'a Member<'a>,
     data: &'a TrainingData<'a>,
-    photographs: Vec<Picture>,
+    photographs: Vec<Image>,
     background: f32,
 }
 
@@ -57,12 +57,7 @@ impl<'a> Judge<'a> {
     fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
         let photographs = Photographs::read(data.input)?.over_background();
         let background = photographs.views.background.shown();
-        Ok(Self {
-            member,
-            data,
-            photographs: photographs.pictures.into_iter().map(scene::Photograph::known).collect(),
-            background,
-        })
+        Ok(Self { member, data, photographs: photographs.images.into_iter().map(scene::Photograph::known).collect(), background })
     }
 
     /// How far photographs are from their neighbours by what a training found; none where there is nothing to compare.
@@ -75,6 +70,6 @@ impl<'a> Judge<'a> {
         let shots = cameras.iter().zip(&self.photographs).enumerate();
         let shots: Vec<Shot<'_>> =
             shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
-        disagreement(&*field, &shots, self.background).map_err(|e| anyhow::anyhow!(e))
+        photometric_error(&*field, &shots, self.background).map_err(|e| anyhow::anyhow!(e))
     }
 }

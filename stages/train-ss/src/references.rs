@@ -1,4 +1,4 @@
-use pixels::{Exposure, Kernel, Picture, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
+use pixels::{Exposure, Image, Kernel, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
 use scene::Camera;
 
 use crate::Photographs;
@@ -12,18 +12,18 @@ const OPAQUE: f32 = 1.0 - 1e-4;
 /// References as they should join a training: of one with an LR photograph of its own the exposure is that photograph's, and it is left out where it
 /// shows something else. What was done is said. `kernel` made the LR photographs.
 ///
-/// Pictures with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the border of a thing
-/// would look like another exposure, since stored pictures have none of that.
+/// Images with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the
+/// border of a thing would look like another exposure, since stored images have none of that.
 pub(crate) fn checked(
     mut references: Photographs,
     photographs: &Photographs,
     kernel: Kernel,
     say: &dyn Fn(String),
 ) -> Photographs {
-    let pairs = references.views.views.into_iter().zip(references.pictures);
+    let pairs = references.views.views.into_iter().zip(references.images);
     let kept = pairs.filter_map(|(view, mut photograph)| {
         let Some(own) = own_photograph(photographs, &view.camera) else { return Some((view, photograph)) };
-        let (name, reference) = (&view.camera.name, &mut photograph.picture);
+        let (name, reference) = (&view.camera.name, &mut photograph.image);
         let [mut shrunk, own] = compared(reference, own, kernel);
         if let Some(exposure) = Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none()) {
             let [r, g, b] = exposure.gain;
@@ -37,51 +37,51 @@ pub(crate) fn checked(
         }
         (alike >= ALIKE).then_some((view, photograph))
     });
-    (references.views.views, references.pictures) = kept.unzip();
+    (references.views.views, references.images) = kept.unzip();
     references
 }
 
 /// The LR photograph that a camera took, where there is one.
-fn own_photograph<'a>(photographs: &'a Photographs, camera: &Camera) -> Option<&'a Picture> {
+fn own_photograph<'a>(photographs: &'a Photographs, camera: &Camera) -> Option<&'a Image> {
     let view = photographs.views.taken_by(camera)?;
     let place = photographs.views.views.iter().position(|other| std::ptr::eq(other, view))?;
-    Some(&photographs.pictures[place].picture)
+    Some(&photographs.images[place].image)
 }
 
 /// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as `prep` does it, from 8 bits to 8 bits.
-fn compared(reference: &Picture, own: &Picture, kernel: Kernel) -> [Picture; 2] {
+fn compared(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
     if is_transparent(reference) && kernel != Kernel::Average {
         let shrunk = resize_pillow(&as_stored(reference), own.width, own.height, kernel.filter());
-        return [Picture::premultiplied(&shrunk), own.clone()];
+        return [Image::premultiplied(&shrunk), own.clone()];
     }
-    let sizes = [reference, own].map(|picture| (picture.width, picture.height));
+    let sizes = [reference, own].map(|image| (image.width, image.height));
     let mut pair = [Resampling::new(kernel.filter(), sizes[0], sizes[1]).apply(reference), own.clone()];
     if is_transparent(reference) {
         // That kernel averages straight colours, those of what is transparent, too: only alpha is known there.
         let hidden: Vec<usize> = (0..own.width * own.height).filter(|i| own.data[4 * i + 3] < OPAQUE).collect();
-        pair.iter_mut().for_each(|picture| hidden.iter().for_each(|i| picture.data[4 * i..4 * i + 3].fill(0.0)));
+        pair.iter_mut().for_each(|image| hidden.iter().for_each(|i| image.data[4 * i..4 * i + 3].fill(0.0)));
     }
     pair
 }
 
-/// A picture with premultiplied alpha as its PNG has it: 8 bits, alpha straight.
-fn as_stored(picture: &Picture) -> Rgba8 {
+/// An image with premultiplied alpha as its PNG has it: 8 bits, alpha straight.
+fn as_stored(image: &Image) -> Rgba8 {
     let pixel = |p: &[f32]| {
         let straight = |colour: f32| if p[3] > 0.0 { to_u8(colour / p[3]) } else { 0 };
         [straight(p[0]), straight(p[1]), straight(p[2]), to_u8(p[3])]
     };
-    Rgba8::new(picture.width, picture.height, picture.data.chunks_exact(4).flat_map(pixel).collect())
+    Rgba8::new(image.width, image.height, image.data.chunks_exact(4).flat_map(pixel).collect())
 }
 
-fn is_transparent(picture: &Picture) -> bool {
-    picture.channels == 4 && picture.data.chunks_exact(4).any(|pixel| pixel[3] < 1.0)
+fn is_transparent(image: &Image) -> bool {
+    image.channels == 4 && image.data.chunks_exact(4).any(|pixel| pixel[3] < 1.0)
 }
 
-/// How alike two pictures of one size are, in dB over their colours; what differs in alpha counts, too.
-fn alikeness(one: &Picture, other: &Picture) -> f64 {
+/// How alike two images of one size are, in dB over their colours; what differs in alpha counts, too.
+fn alikeness(one: &Image, other: &Image) -> f64 {
     let channels = if is_transparent(one) || is_transparent(other) { 4 } else { 3 };
-    let samples = |picture: &Picture| -> Vec<f32> {
-        picture.data.chunks_exact(picture.channels).flat_map(|pixel| &pixel[..channels]).copied().collect()
+    let samples = |image: &Image| -> Vec<f32> {
+        image.data.chunks_exact(image.channels).flat_map(|pixel| &pixel[..channels]).copied().collect()
     };
     let (a, b) = (samples(one), samples(other));
     let colours = (3 * one.width * one.height) as f64;
@@ -96,37 +96,37 @@ mod tests {
     use super::*;
 
     /// Patches with fine stripes, as seen from there.
-    fn photographs(name: &str, picture: Picture) -> Photographs {
-        let (width, height) = (picture.width as u32, picture.height as u32);
+    fn photographs(name: &str, image: Image) -> Photographs {
+        let (width, height) = (image.width as u32, image.height as u32);
         let intrinsics = Intrinsics { width, height, fx: 20.0, fy: 20.0, cx: 8.0, cy: 8.0, distortion: Default::default() };
         let camera_to_world = [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]];
         let camera = Camera { name: name.into(), intrinsics, camera_to_world };
         let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-        Photographs { views, pictures: vec![picture.into()] }
+        Photographs { views, images: vec![image.into()] }
     }
 
-    fn fine() -> Picture {
+    fn hr() -> Image {
         let sample = |i: usize| {
             let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
             0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
         };
-        Picture::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
+        Image::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
     }
 
     #[test]
-    fn exposures_are_taken_back_and_other_pictures_are_left_out() {
-        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&fine()));
+    fn exposures_are_taken_back_and_other_images_are_left_out() {
+        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr()));
         let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
             let said = std::cell::RefCell::new(String::new());
-            let mut picture = fine();
-            picture.data.iter_mut().for_each(|v| *v = change(*v));
-            let kept = checked(photographs(name, picture), &lr(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
-            (kept.pictures.into_iter().next().map(|p| p.picture), kept.views.views.len(), said.into_inner())
+            let mut image = hr();
+            image.data.iter_mut().for_each(|v| *v = change(*v));
+            let kept = checked(photographs(name, image), &lr(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
+            (kept.images.into_iter().next().map(|p| p.image), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);
-        assert!(same.unwrap().data == fine().data && views == 1 && said.is_empty(), "{said}");
+        assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
         let (dark, views, said) = checked("a", &|v| 0.6 * v + 0.1);
-        let off = dark.unwrap().data.iter().zip(&fine().data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let off = dark.unwrap().data.iter().zip(&hr().data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"), "{off} {said}");
         let (other, views, said) = checked("a", &|v| 1.0 - v);
         assert!(other.is_none() && views == 0 && said.contains("left out"), "{said}");
@@ -152,14 +152,14 @@ mod tests {
                         lr.data.chunks_exact_mut(4).for_each(|p| (0..3).for_each(|c| p[c] *= p[3]));
                         lr
                     }
-                    _ => Picture::premultiplied(&resize_pillow(&hr, size / 2, size / 2, kernel.filter())),
+                    _ => Image::premultiplied(&resize_pillow(&hr, size / 2, size / 2, kernel.filter())),
                 };
-                let hr = Picture::premultiplied(&hr);
+                let hr = Image::premultiplied(&hr);
                 let said = std::cell::RefCell::new(String::new());
                 let given = photographs("a", lr.clone());
                 let kept = checked(photographs("a", hr.clone()), &given, kernel, &|text| said.borrow_mut().push_str(&text));
                 assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
-                assert_eq!(kept.pictures[0].picture, hr);
+                assert_eq!(kept.images[0].image, hr);
                 let [shrunk, own] = compared(&hr, &lr, kernel);
                 assert_eq!(alikeness(&shrunk, &own), 100.0, "{size} {kernel:?}");
             }
@@ -169,17 +169,17 @@ mod tests {
     /// Only what is there has an exposure.
     #[test]
     fn exposures_are_taken_back_from_under_alpha() {
-        let picture = |gain: f32, offset: f32| {
-            let fine = fine();
+        let image = |gain: f32, offset: f32| {
+            let hr = hr();
             let pixel = |(i, p): (usize, &[f32])| {
                 let alpha = [1.0, 0.5, 0.0][(i % 32 / 4) % 3];
                 [0, 1, 2].map(|c| alpha * (gain * p[c] + offset)).into_iter().chain([alpha])
             };
-            Picture::new(32, 32, 4, fine.data.chunks_exact(3).enumerate().flat_map(pixel).collect())
+            Image::new(32, 32, 4, hr.data.chunks_exact(3).enumerate().flat_map(pixel).collect())
         };
-        let mut dark = picture(0.6, 0.1);
+        let mut dark = image(0.6, 0.1);
         Exposure { gain: [0.6; 3], offset: [0.1; 3] }.take_back(&mut dark);
-        let off = dark.data.iter().zip(&picture(1.0, 0.0).data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let off = dark.data.iter().zip(&image(1.0, 0.0).data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(off < 1e-6, "{off}");
     }
 }

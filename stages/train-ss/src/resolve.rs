@@ -345,16 +345,16 @@ impl Resolved {
     pub fn grid_training(&self, grid: &GridParams, distortion: f64, floater_loss: f64) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
-            batch: self.max_rays_per_step as usize,
-            samples: grid.samples_per_step as usize,
-            rate: grid.learning_rate,
+            max_rays_per_step: self.max_rays_per_step as usize,
+            samples_per_step: grid.samples_per_step as usize,
+            learning_rate: grid.learning_rate,
             level_rate: grid.level_rate,
-            network_rate: grid.mlp_learning_rate,
-            final_rate: grid.learning_rate_decay,
+            mlp_learning_rate: grid.mlp_learning_rate,
+            learning_rate_decay: grid.learning_rate_decay,
             warm_up: 100,
-            averaging: grid.ema_decay as f32,
+            ema_decay: grid.ema_decay as f32,
             distortion: distortion as f32,
-            haze: floater_loss as f32,
+            floater_loss: floater_loss as f32,
             network_decay: grid.network_decay as f32,
             seed: self.seed,
         }
@@ -367,14 +367,14 @@ impl Resolved {
         let epochs = self.rays.div_ceil(self.epoch.max(1));
         torch_field::MlpTraining {
             rays: self.rays,
-            batch: self.max_rays_per_step as usize,
-            rate: mlp.learning_rate,
-            final_rate: mlp.learning_rate_decay,
+            max_rays_per_step: self.max_rays_per_step as usize,
+            learning_rate: mlp.learning_rate,
+            learning_rate_decay: mlp.learning_rate_decay,
             schedule: match mlp.schedule {
                 RateSchedule::Code => torch_field::Schedule::Epochs { epochs },
                 RateSchedule::Paper => torch_field::Schedule::Exponential,
             },
-            noise: density_noise_std,
+            density_noise_std,
             seed: self.seed,
         }
     }

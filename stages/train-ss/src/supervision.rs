@@ -3,7 +3,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use counter_rng::CounterRng;
-use pixels::{Filter, Picture, Resampling};
+use pixels::{Filter, Image, Resampling};
 use poses::Moved;
 use radiance::{Ray, RayField};
 use scene::{Background, Camera, Intrinsics, Photograph};
@@ -38,16 +38,17 @@ pub enum Order {
     Epochs,
 }
 
-/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-rays are cast through it.
+/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel rays are cast through it.
 ///
-/// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with
-/// y + (A - K)·Uy, where A averages, K is the operator that made the LR pictures y, and U enlarges. `kernel` minimises the
-/// squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
+/// `average` compares their mean with the LR pixel (mean squared error over the three channels); `refiltered` does so with y +
+/// (A - K)·Uy, where A averages, K is the operator that made the LR images y, and U enlarges. `kernel` minimises the squared
+/// distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes y of: those of the drawn LR pixel are
 /// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
-/// sub-ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more, learns slower.)
+/// sub-pixel ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more,
+/// learns slower.)
 ///
-/// Of an HR reference a block of pixels is drawn at a time, one for each sub-ray to meet, and altogether four times as many blocks as an LR picture has
-/// pixels.
+/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and altogether four times as
+/// many blocks as an LR image has pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
@@ -55,7 +56,7 @@ pub struct Supersampling {
     lr_views: usize,
     pixels: u64,
     background: Background,
-    /// Sub-rays along x and y, when all are cast and now.
+    /// Sub-pixel rays along x and y, when all are cast and now.
     full: [usize; 2],
     side: [usize; 2],
     supersample_warmup: f64,
@@ -70,9 +71,9 @@ pub struct Supersampling {
 
 struct TrainingView {
     /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels. NaN where nothing is known: pixels that don't count.
-    picture: Picture,
+    image: Image,
     /// A reference's own pixels.
-    hr: Option<Picture>,
+    hr: Option<Image>,
     /// How many numbers the pixels of the views before this one have.
     before: u64,
     intrinsics: Intrinsics,
@@ -84,16 +85,16 @@ struct TrainingView {
 }
 
 impl TrainingView {
-    fn new(picture: Picture, hr: Option<Picture>, before: u64, camera: &Camera) -> Self {
+    fn new(image: Image, hr: Option<Image>, before: u64, camera: &Camera) -> Self {
         let (intrinsics, none) = (camera.intrinsics, [0.0; 3]);
-        let mut view = Self { picture, hr, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
+        let mut view = Self { image, hr, before, intrinsics, origin: [0.0; 3], corner: none, right: none, down: none };
         view.place(camera);
         view
     }
 
     /// The photograph at its own size.
-    fn photograph(&self) -> &Picture {
-        self.hr.as_ref().unwrap_or(&self.picture)
+    fn photograph(&self) -> &Image {
+        self.hr.as_ref().unwrap_or(&self.image)
     }
 
     /// Has its rays cast from where a camera is.
@@ -111,15 +112,15 @@ impl TrainingView {
 pub struct SupersamplingOptions {
     /// What is compared.
     pub supervision: Supervision,
-    /// Size of the HR pictures that the field is to render, over that of the LR ones, per axis.
+    /// Size of the HR images that the field is to render, over that of the LR ones, per axis.
     pub scale: [f64; 2],
-    /// The filter that made the LR pictures.
+    /// The filter that made the LR images.
     pub filter: Filter,
-    /// Share of the training during which fewer sub-rays are cast.
+    /// Share of the training during which fewer sub-pixel rays are cast.
     pub supersample_warmup: f64,
     /// In which order pixels are drawn.
     pub order: Order,
-    /// Pixels at the start that come from the middle half of each picture's width and height alone.
+    /// Pixels at the start that come from the middle half of each image's width and height alone.
     pub precrop_bundles: u64,
     /// How many times as often a pixel with detail is drawn as a flat one, in random order.
     pub pixel_importance: f64,
@@ -135,8 +136,8 @@ pub struct SupersamplingOptions {
 const PIXEL: u64 = 100;
 const BACKGROUND: u64 = 101;
 
-/// How many times as often something of a reference is drawn as of an LR picture. On a small demo scene, six of twelve views at HR, there are 21.66 dB
-/// without them, 21.63 and 22.12 with 1 and 4.
+/// How many times as often something of a reference is drawn as of an LR image. On a small demo scene, six of twelve views at
+/// HR, there are 21.66 dB without them, 21.63 and 22.12 with 1 and 4.
 const REFERENCE_DRAWS: u64 = 4;
 
 /// Draws until one is of a pixel that counts; after so many the last is taken, and has no residual.
@@ -148,16 +149,16 @@ const SATURATED: f32 = 254.5 / 255.0;
 impl Supersampling {
     /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are neither drawn nor compared with.
     pub fn new(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Self {
-        let (background, lr_views) = (photographs.views.background, photographs.pictures.len());
-        let lr_pixels: u64 = photographs.pictures.iter().map(|p| (p.picture.width * p.picture.height) as u64).sum();
+        let (background, lr_views) = (photographs.views.background, photographs.images.len());
+        let lr_pixels: u64 = photographs.images.iter().map(|p| (p.image.width * p.image.height) as u64).sum();
         let hr_length = |length: usize, i: usize| ((length as f64 * options.scale[i]).round() as usize).max(1);
-        let operator = |picture: &Picture| {
-            let (lr, hr) = ((picture.width, picture.height), (hr_length(picture.width, 0), hr_length(picture.height, 1)));
+        let operator = |image: &Image| {
+            let (lr, hr) = ((image.width, image.height), (hr_length(image.width, 0), hr_length(image.height, 1)));
             (Resampling::new(Filter::Lanczos, lr, hr), Resampling::new(options.filter, hr, lr))
         };
-        let smallest = |i: usize, length: fn(&Picture) -> usize| {
-            let lr = photographs.pictures.iter().map(|p| hr_length(length(&p.picture), i));
-            lr.chain(references.iter().flat_map(|r| &r.pictures).map(|p| length(&p.picture))).min().unwrap_or(1)
+        let smallest = |i: usize, length: fn(&Image) -> usize| {
+            let lr = photographs.images.iter().map(|p| hr_length(length(&p.image), i));
+            lr.chain(references.iter().flat_map(|r| &r.images).map(|p| length(&p.image))).min().unwrap_or(1)
         };
         let smallest = [smallest(0, |p| p.width), smallest(1, |p| p.height)];
         let full = [0, 1].map(|i| ((options.scale[i] - 1e-6).ceil() as usize).clamp(1, smallest[i]));
@@ -168,41 +169,41 @@ impl Supersampling {
         let mut ready = Vec::new();
         let mut cameras = Vec::new();
         let all = [Some(photographs), references].into_iter().flatten();
-        for (view, Photograph { mut picture, mask }) in all.flat_map(|p| p.views.views.into_iter().zip(p.pictures)) {
+        for (view, Photograph { mut image, mask }) in all.flat_map(|p| p.views.views.into_iter().zip(p.images)) {
             match options.supervision {
                 // References are what they are: nothing has shrunk them.
                 _ if ready.len() >= lr_views => {}
                 Supervision::Average => {}
                 Supervision::Refiltered => {
-                    let (enlarge, shrink) = operator(&picture);
-                    picture = refiltered(&picture, &enlarge, &shrink);
+                    let (enlarge, shrink) = operator(&image);
+                    image = refiltered(&image, &enlarge, &shrink);
                 }
                 Supervision::Kernel => {
-                    let (enlarge, kernel) = kernels.entry((picture.width, picture.height)).or_insert_with(|| {
-                        let (enlarge, shrink) = operator(&picture);
+                    let (enlarge, kernel) = kernels.entry((image.width, image.height)).or_insert_with(|| {
+                        let (enlarge, shrink) = operator(&image);
                         (enlarge, Arc::new(KernelOperator::new(shrink)))
                     });
-                    cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&picture), kernel.clone());
+                    cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&image), kernel.clone());
                 }
             }
             let before = pixels;
-            let (whole, known) = (picture.clone(), Photograph { picture, mask }.known());
+            let (whole, known) = (image.clone(), Photograph { image, mask }.known());
             // What the kernel needs to know of pixels around those that don't count stays: what was photographed, since it blurred into its neighbours.
-            let (whole, picture, hr) = if ready.len() < lr_views {
+            let (whole, image, hr) = if ready.len() < lr_views {
                 (whole, known, None)
             } else {
                 (block_means(&whole, full), block_means(&known, full), Some(known))
             };
-            let count = (picture.width * picture.height) as u64;
+            let count = (image.width * image.height) as u64;
             // Each block of a reference has so many numbers.
             let draws = if hr.is_none() { 1 } else { (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1) };
             if options.pixel_importance > 1.0 {
-                let counts = |pixel: &usize| !picture.data[pixel * picture.channels].is_nan();
+                let counts = |pixel: &usize| !image.data[pixel * image.channels].is_nan();
                 let detailed: Vec<usize> = detailed(&whole).filter(counts).collect();
                 with_detail.extend((0..draws).flat_map(|k| detailed.iter().map(move |&pixel| before + k * count + pixel as u64)));
             }
             pixels += draws * count;
-            ready.push(TrainingView::new(picture, hr, before, &view.camera));
+            ready.push(TrainingView::new(image, hr, before, &view.camera));
             cameras.push(view.camera);
         }
         let SupersamplingOptions { supersample_warmup, order, precrop_bundles, pixel_importance, exposure, seed, .. } = *options;
@@ -228,7 +229,7 @@ impl Supersampling {
         }
     }
 
-    /// Sub-rays of an LR pixel along x and y, once all are cast.
+    /// Sub-pixel rays of an LR pixel along x and y, once all are cast.
     pub fn full_side(&self) -> [usize; 2] {
         self.full
     }
@@ -330,7 +331,7 @@ impl Supersampling {
                 place
             }
         };
-        let (width, height) = (self.views[view].picture.width as u64, self.views[view].picture.height as u64);
+        let (width, height) = (self.views[view].image.width as u64, self.views[view].image.height as u64);
         if bundle < self.precrop_bundles {
             let mut middle = |length: u64| length / 4 + rng.below((length / 2).max(1));
             let (x, y) = (middle(width), middle(height));
@@ -342,14 +343,14 @@ impl Supersampling {
     /// The view and its pixel that have a number among those of all views.
     fn place(&self, pixel: u64) -> (usize, usize) {
         let view = self.views.partition_point(|v| v.before <= pixel) - 1;
-        let TrainingView { picture, before, .. } = &self.views[view];
-        (view, (pixel - before) as usize % (picture.width * picture.height))
+        let TrainingView { image, before, .. } = &self.views[view];
+        (view, (pixel - before) as usize % (image.width * image.height))
     }
 
     /// Whether anything is known of a pixel.
     fn counts(&self, (view, pixel): (usize, usize)) -> bool {
-        let picture = &self.views[view].picture;
-        !picture.data[pixel * picture.channels].is_nan()
+        let image = &self.views[view].image;
+        !image.data[pixel * image.channels].is_nan()
     }
 
     /// What lies behind a bundle's rays: with an open background, or none, another colour each time, so that opacity is learnt.
@@ -374,40 +375,40 @@ fn unclipped_residual(prediction: f32, target: f32, back: f32) -> f32 {
     if (target >= SATURATED && residual > 0.0) || (target <= 1.0 - SATURATED && residual < 0.0) { 0.0 } else { residual }
 }
 
-/// The picture as averaging would have made it: y + (A - K)·Uy, with A the average over LR pixels.
-fn refiltered(picture: &Picture, enlarge: &Resampling, shrink: &Resampling) -> Picture {
-    let hr = enlarge.apply(picture);
-    let average = Resampling::new(Filter::Box, (hr.width, hr.height), (picture.width, picture.height));
+/// The image as averaging would have made it: y + (A - K)·Uy, with A the average over LR pixels.
+fn refiltered(image: &Image, enlarge: &Resampling, shrink: &Resampling) -> Image {
+    let hr = enlarge.apply(image);
+    let average = Resampling::new(Filter::Box, (hr.width, hr.height), (image.width, image.height));
     let mut out = average.apply(&hr);
-    for ((value, &y), ky) in out.data.iter_mut().zip(&picture.data).zip(shrink.apply(&hr).data) {
+    for ((value, &y), ky) in out.data.iter_mut().zip(&image.data).zip(shrink.apply(&hr).data) {
         *value += y - ky;
     }
     out
 }
 
-/// Where a block of a reference's pixels begins: the last of a row or column ends with the picture.
+/// Where a block of a reference's pixels begins: the last of a row or column ends with the image.
 fn block_start(block: usize, block_length: usize, length: usize) -> usize {
     (block * block_length).min(length.saturating_sub(block_length))
 }
 
-/// Means over blocks of a picture's pixels, of those that are known.
-fn block_means(picture: &Picture, block: [usize; 2]) -> Picture {
-    let (width, height) = (picture.width.div_ceil(block[0]), picture.height.div_ceil(block[1]));
-    let mut data = Vec::with_capacity(width * height * picture.channels);
+/// Means over blocks of an image's pixels, of those that are known.
+fn block_means(image: &Image, block: [usize; 2]) -> Image {
+    let (width, height) = (image.width.div_ceil(block[0]), image.height.div_ceil(block[1]));
+    let mut data = Vec::with_capacity(width * height * image.channels);
     for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
-        let (left, top) = (block_start(x, block[0], picture.width), block_start(y, block[1], picture.height));
-        let rows = top..(top + block[1]).min(picture.height);
-        let pixels = rows.flat_map(|j| (left..(left + block[0]).min(picture.width)).map(move |i| j * picture.width + i));
-        data.extend((0..picture.channels).map(|c| {
-            let known = pixels.clone().map(|pixel| picture.data[pixel * picture.channels + c]).filter(|v| !v.is_nan());
+        let (left, top) = (block_start(x, block[0], image.width), block_start(y, block[1], image.height));
+        let rows = top..(top + block[1]).min(image.height);
+        let pixels = rows.flat_map(|j| (left..(left + block[0]).min(image.width)).map(move |i| j * image.width + i));
+        data.extend((0..image.channels).map(|c| {
+            let known = pixels.clone().map(|pixel| image.data[pixel * image.channels + c]).filter(|v| !v.is_nan());
             let (sum, count) = known.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0f32));
             sum / count
         }));
     }
-    Picture::new(width, height, picture.channels, data)
+    Image::new(width, height, image.channels, data)
 }
 
-/// How often the sub-rays along a side double before all are cast: as many stages has the coarse share of the rays.
+/// How often the sub-pixel rays along a side double before all are cast: as many stages has the warm-up.
 pub(crate) fn warmup_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
@@ -431,8 +432,8 @@ impl radiance::Supervisor for Supersampling {
         let (index, pixel) = self.pixel(bundle);
         let view = &self.views[index];
         let background = self.behind(bundle);
-        let (x, y) = (pixel % view.picture.width, pixel / view.picture.width);
-        // Where the sub-rays begin, and how far apart they are, in pixels of its camera.
+        let (x, y) = (pixel % view.image.width, pixel / view.image.width);
+        // Where the sub-pixel rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.hr) {
             (Some(cache), _) => cache.block_in_pixels(index, x, y),
             (None, Some(hr)) => {
@@ -454,17 +455,17 @@ impl radiance::Supervisor for Supersampling {
 
     fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
         let (index, pixel) = self.pixel(bundle);
-        let picture = &self.views[index].picture;
-        let sample = &picture.data[pixel * picture.channels..][..picture.channels];
+        let image = &self.views[index].image;
+        let sample = &image.data[pixel * image.channels..][..image.channels];
         let share = 1.0 / colours.len() as f32;
         let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
-        let behind = if picture.channels == 4 { self.behind(bundle) } else { [0.0; 3] };
+        let behind = if image.channels == 4 { self.behind(bundle) } else { [0.0; 3] };
         let is_cropped = bundle < self.precrop_bundles;
         let weight = if is_cropped { 1.0 } else { self.focus.weight(self.views[index].before + pixel as u64) };
         if let Some(cache) = self.kernel(index) {
-            let at = [pixel % picture.width, pixel / picture.width];
+            let at = [pixel % image.width, pixel / image.width];
             let residual = |c: usize, prediction, target| unclipped_residual(prediction, target, back[c]);
-            let own = cache.back_project(index, at, colours, picture, residual, gradients);
+            let own = cache.back_project(index, at, colours, image, residual, gradients);
             gradients.as_flattened_mut().iter_mut().for_each(|g| *g *= weight * (2.0 / 3.0));
             return own.iter().map(|&r| f64::from(weight) * f64::from(r) * f64::from(r) / 3.0).sum();
         }
@@ -474,8 +475,8 @@ impl radiance::Supervisor for Supersampling {
         };
         let mut loss = 0.0;
         if let Some(hr) = self.views[index].hr.as_ref().filter(|_| self.side == self.full) {
-            let left = block_start(pixel % picture.width, self.full[0], hr.width);
-            let top = block_start(pixel / picture.width, self.full[1], hr.height);
+            let left = block_start(pixel % image.width, self.full[0], hr.width);
+            let top = block_start(pixel / image.width, self.full[1], hr.height);
             for (k, (colour, gradient)) in colours.iter().zip(gradients).enumerate() {
                 let at = (top + k / self.full[0]) * hr.width + left + k % self.full[0];
                 let sample = &hr.data[at * hr.channels..][..hr.channels];
@@ -503,17 +504,17 @@ impl radiance::Supervisor for Supersampling {
             return;
         }
         let (index, pixel) = self.pixel(bundle);
-        let picture = &self.views[index].picture;
+        let image = &self.views[index].image;
         if let Some(exposures) = &mut self.exposures {
-            let at = pixel * picture.channels;
+            let at = pixel * image.channels;
             let is_clipped = |y: f32| y >= SATURATED || y <= 1.0 - SATURATED;
-            let photographed = [0, 1, 2].map(|c| picture.data[at + c]).map(|y| if is_clipped(y) { f32::NAN } else { y });
+            let photographed = [0, 1, 2].map(|c| image.data[at + c]).map(|y| if is_clipped(y) { f32::NAN } else { y });
             let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
         let is_cached = self.side == self.full && index < self.lr_views;
         if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {
-            cache.remember(index, pixel % picture.width, pixel / picture.width, colours);
+            cache.remember(index, pixel % image.width, pixel / image.width, colours);
         }
     }
 }
@@ -540,12 +541,12 @@ mod tests {
         }
     }
 
-    fn fine_picture(width: usize, height: usize) -> Picture {
+    fn hr_image(width: usize, height: usize) -> Image {
         let sample = |i: usize| (60 + (i * 37 + i / 7 * 11) % 130) as f32 / 255.0;
-        Picture::new(width, height, 3, (0..width * height * 3).map(sample).collect())
+        Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    fn example(supervision: Supervision, scale: [f64; 2], picture: Option<Picture>) -> (Supersampling, Camera) {
+    fn example(supervision: Supervision, scale: [f64; 2], image: Option<Image>) -> (Supersampling, Camera) {
         let distortion = Distortion { radial: [0.1, -0.02, 0.01], tangential: [0.005, -0.003] };
         let camera = Camera {
             name: "a".into(),
@@ -554,14 +555,14 @@ mod tests {
         };
         let bounds = Bounds { min: [-1.; 3], max: [1.; 3], near: 0.1, far: 9.0, ..Default::default() };
         let views = Views::new(Background::White, bounds, vec![View::camera_only(camera.clone())]);
-        let picture = picture.unwrap_or_else(|| Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
-        let photographs = Photographs { views, pictures: vec![picture.into()] };
+        let image = image.unwrap_or_else(|| Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
+        let photographs = Photographs { views, images: vec![image.into()] };
         (Supersampling::new(photographs, None, &options(supervision, scale)), camera)
     }
 
-    /// The sub-rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
+    /// The sub-pixel rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
     #[test]
-    fn sub_rays_are_the_finer_cameras_pixel_rays() {
+    fn sub_pixel_rays_are_the_finer_cameras_pixel_rays() {
         let cases = [
             (Supervision::Average, [3.0, 3.0]),
             (Supervision::Kernel, [3.0, 3.0]),
@@ -631,10 +632,10 @@ mod tests {
         }
     }
 
-    /// Once the field renders the true HR picture, the kernel is content: no loss and no gradient. The average isn't.
+    /// Once the field renders the true HR image, the kernel is content: no loss and no gradient. The average isn't.
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
-        let truth = fine_picture(10, 8);
+        let truth = hr_image(10, 8);
         let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
         let worst = |kind| {
             let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
@@ -668,7 +669,7 @@ mod tests {
         for (prediction, target, residual) in cases {
             assert!((unclipped_residual(prediction, target, 1.0) - residual).abs() < 1e-6, "{prediction} {target}");
         }
-        let white = Picture::new(5, 4, 3, vec![1.0; 60]);
+        let white = Image::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
         let mut gradients = [[0.0; 3]; 4];
         assert!(supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
@@ -676,9 +677,9 @@ mod tests {
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
-    /// 1, 2, 4 … sub-rays a side, each for an equal part of the coarse share, and then all.
+    /// 1, 2, 4 … sub-pixel rays a side, each for an equal part of the warm-up, and then all.
     #[test]
-    fn sub_rays_double_until_all_are_cast() {
+    fn sub_pixel_rays_double_until_all_are_cast() {
         let rays_at = |scale: f64, done: f64| {
             let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
             supersampling.supersample_warmup = 0.3;
@@ -712,10 +713,10 @@ mod tests {
         for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
             let (plain, camera) = example(kind, [2.0, 2.0], None);
             let mask = pixels::Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
-            let picture = Picture::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
+            let image = Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-            let photograph = Photograph { picture, mask: Some(mask) };
-            let masked = Photographs { views, pictures: vec![photograph] };
+            let photograph = Photograph { image, mask: Some(mask) };
+            let masked = Photographs { views, images: vec![photograph] };
             let masked = Supersampling::new(masked, None, &options(kind, [2.0, 2.0]));
             let mut drawn = [false; 20];
             (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
@@ -738,18 +739,19 @@ mod tests {
         assert_eq!(unclipped_residual(0.2, f32::NAN, 1.0), 0.0);
     }
 
-    /// References join LR pictures as they are: whatever made those, each sub-ray is a reference's pixel, and all are met by some.
+    /// References join LR images as they are: whatever made those, each sub-pixel ray is a reference's pixel, and all are met
+    /// by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
         let given = |name: &str, width: usize, height: usize| {
             let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
             let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-            Photographs { views, pictures: vec![fine_picture(width, height).into()] }
+            Photographs { views, images: vec![hr_image(width, height).into()] }
         };
         // The last column of blocks overlaps the one before it.
         let (width, height) = (9, 8);
-        let truth = fine_picture(width, height);
+        let truth = hr_image(width, height);
         let camera = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Refiltered, Supervision::Kernel] {
             let mut joined = Supersampling::new(given("a", 5, 4), Some(given("a", width, height)), &options(kind, [2.0, 2.0]));
@@ -767,7 +769,7 @@ mod tests {
                     (0..72).find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6).expect("a pixel's ray")
                 });
                 pixels.iter().for_each(|&pixel| seen[pixel] = true);
-                // A tenth too bright in the last sub-ray's red, and right in all else.
+                // A tenth too bright in the last sub-pixel ray's red, and right in all else.
                 let mut colours = pixels.map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
                 colours[3][0] += 0.1;
                 let mut gradients = [[9.0; 3]; 4];
@@ -780,7 +782,7 @@ mod tests {
                 joined.remember(bundle, &colours);
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
-            // With fewer sub-rays they meet the block's mean together.
+            // With fewer sub-pixel rays they meet the block's mean together.
             joined.supersample_warmup = 0.5;
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
@@ -790,7 +792,7 @@ mod tests {
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
             assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
             joined.set_progress(1.0);
-            // LR pictures have what they had.
+            // LR images have what they had.
             let plain = Supersampling::new(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));
             let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
@@ -800,8 +802,8 @@ mod tests {
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // Of a larger one no more is drawn.
-        let large = Supersampling::new(given("a", 5, 4), Some(given("a", 20, 16)), &options(Supervision::Kernel, [2.0, 2.0]));
-        assert_eq!(large.pixels, 20 + 80);
+        let larger = Supersampling::new(given("a", 5, 4), Some(given("a", 20, 16)), &options(Supervision::Kernel, [2.0, 2.0]));
+        assert_eq!(larger.pixels, 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);
         let means = block_means(&masked, [2, 2]);

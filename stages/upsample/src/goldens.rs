@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use nets::Weights;
-use pixels::{Filter, Picture, psnr_of, read_png, resize_pillow};
+use pixels::{Filter, Image, psnr_of, read_png, resize_pillow};
 use tch::{Kind, Tensor, no_grad};
 
 use crate::imdn::Imdn;
@@ -123,13 +123,13 @@ fn imdn_as_released_scores_as_in_pytorch() {
         for row in rows {
             let view = row["view"].as_str().unwrap();
             let whole = read_png(&data.join(format!("nerf_synthetic/lego/{view}.png"))).unwrap();
-            let white = Picture::premultiplied(&whole).over(1.0).to_rgba8();
-            let high = resize_pillow(&white, 200, 200, Filter::Lanczos);
-            let low = resize_pillow(&high, 200 / scale, 200 / scale, Filter::Bicubic);
-            let input = nets::tensor_of(&Picture::premultiplied(&low).over(0.0)).unwrap();
-            let large = no_grad(|| network.enlarge(&input, [200, 200])).unwrap().clamp(0.0, 1.0);
-            let (large, truth) = (nets::picture_of(&large).unwrap(), Picture::premultiplied(&high).over(0.0));
-            let error: f64 = large.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+            let white = Image::premultiplied(&whole).over(1.0).to_rgba8();
+            let hr = resize_pillow(&white, 200, 200, Filter::Lanczos);
+            let lr = resize_pillow(&hr, 200 / scale, 200 / scale, Filter::Bicubic);
+            let input = nets::tensor_of(&Image::premultiplied(&lr).over(0.0)).unwrap();
+            let enlarged = no_grad(|| network.enlarge(&input, [200, 200])).unwrap().clamp(0.0, 1.0);
+            let (enlarged, truth) = (nets::image_of(&enlarged).unwrap(), Image::premultiplied(&hr).over(0.0));
+            let error: f64 = enlarged.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
             let (found, expected) = (psnr_of(error / truth.data.len() as f64), row["psnr"].as_f64().unwrap());
             assert!((found - expected).abs() < 0.02, "{view} ×{scale}: {found} dB where PyTorch has {expected}");
             assert!(expected > row["bicubic_psnr"].as_f64().unwrap() + 1.0, "{view} ×{scale}: no better than bicubic");

@@ -50,8 +50,8 @@ impl Network for Imdn {
         Some(self.scale)
     }
 
-    fn enlarge(&self, picture: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
-        let first = self.first.forward(picture, 1, 1)?;
+    fn enlarge(&self, image: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
+        let first = self.first.forward(image, 1, 1)?;
         let mut outputs = Vec::with_capacity(self.blocks.len());
         for block in &self.blocks {
             let x = block.forward(outputs.last().unwrap_or(&first))?;

@@ -63,7 +63,7 @@ pub(crate) fn root(square: i64) -> i64 {
     (square.max(0) as f64).sqrt().round() as i64
 }
 
-/// Standard deviation and mean of each channel over a picture, added: the contrast that channel attention looks at.
+/// Standard deviation and mean of each channel over an image, added: the contrast that channel attention looks at.
 pub(crate) fn contrast(x: &Tensor) -> Result<Tensor, TchError> {
     let places: &[i64] = &[2, 3];
     let mean = x.f_mean_dim(places, true, Kind::Float)?;

@@ -1,12 +1,12 @@
-//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each picture alone: the baselines of the paper's tables, and
-//! the training photographs at HR size, which `refine` takes the mean with.
+//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone: the baselines of the
+//! paper's tables, and the training photographs at HR size, which `refine` takes the mean with.
 //!
 //! * `bicubic`: Pillow's, on 8 bits, to the last bit.
 //! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much smaller.
 //! * `liif`: a network for any scale.
 //!
 //! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py` makes them from released checkpoints);
-//! every tensor's shape is checked. Pictures are composited on their background, enlarged as display-encoded sRGB, and are opaque
+//! every tensor's shape is checked. Images are composited on their background, enlarged as display-encoded sRGB, and are opaque
 //! afterwards: there is no depth to them. What doesn't count of a photograph, by its mask, doesn't when it is enlarged.
 //!
 //! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on how many there are.
@@ -21,7 +21,7 @@ mod swinir;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
 use nets::Weights;
-use pixels::{Filter, Mask, Picture, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png};
+use pixels::{Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png};
 use rayon::prelude::*;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -40,7 +40,7 @@ pub struct Params {
     pub file: Option<String>,
 }
 
-/// Ways to enlarge a picture.
+/// Ways to enlarge an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
@@ -99,8 +99,8 @@ impl Stage for Upsample {
                 context.check_interrupt()?;
                 let place = || format!("view {}", camera.name);
                 let photograph =
-                    view.read_photograph(input).bad_input(place())?.with_context(|| format!("{}: it has no picture", place()));
-                let Photograph { picture: lr, mask } = photograph.bad_input("input views")?.over(views.background.shown());
+                    view.read_photograph(input).bad_input(place())?.with_context(|| format!("{}: it has no image", place()));
+                let Photograph { image: lr, mask } = photograph.bad_input("input views")?.over(views.background.shown());
                 let hr = enlarge(network.as_deref(), &lr, camera).with_context(place)?;
                 write(context, &camera.name, &hr, mask.map(|mask| mask.resized((hr.width, hr.height), 0)))?;
                 progress.add(1);
@@ -119,13 +119,13 @@ impl Stage for Upsample {
     }
 }
 
-/// A network that enlarges pictures.
+/// A network that enlarges images.
 trait Network: Send {
     /// Times that it enlarges; `None`: any.
     fn scale(&self) -> Option<i64>;
 
-    /// A picture (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one scale enlarges by that.
-    fn enlarge(&self, picture: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
+    /// An image (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one scale enlarges by that.
+    fn enlarge(&self, image: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
 }
 
 /// How a network is made of its weights.
@@ -184,16 +184,16 @@ fn open(input: &GivenInput, file: &str) -> anyhow::Result<Weights> {
     Weights::read(&path).bad_input("input weights")
 }
 
-/// A picture at the size of a camera.
-fn enlarge(network: Option<&dyn Network>, lr: &Picture, camera: &Camera) -> anyhow::Result<Picture> {
+/// An image at the size of a camera.
+fn enlarge(network: Option<&dyn Network>, lr: &Image, camera: &Camera) -> anyhow::Result<Image> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let Some(network) = network else {
         let hr = resize_pillow(&lr.to_rgba8(), width as usize, height as usize, Filter::Bicubic);
-        return Ok(Picture::premultiplied(&hr).over(0.0));
+        return Ok(Image::premultiplied(&hr).over(0.0));
     };
     let size = [i64::from(height), i64::from(width)];
     let hr = no_grad(|| network.enlarge(&nets::tensor_of(lr)?, size))?.f_clamp(0.0, 1.0)?;
-    Ok(nets::picture_of(&hr)?)
+    Ok(nets::image_of(&hr)?)
 }
 
 fn mask_file(name: &str) -> String {
@@ -201,7 +201,7 @@ fn mask_file(name: &str) -> String {
 }
 
 /// A view's files: opaque colours, a preview, and what counts of them.
-fn write(context: &Context, name: &str, hr: &Picture, mask: Option<Mask>) -> anyhow::Result<()> {
+fn write(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyhow::Result<()> {
     if let Some(mask) = mask {
         write_png(&context.output_path(&mask_file(name))?, &mask.to_rgba8())?;
     }

@@ -51,8 +51,8 @@ impl Liif {
     }
 
     /// Features of each pixel, with those around it: places × channels.
-    fn features(&self, picture: &Tensor) -> Result<Tensor, TchError> {
-        let first = self.head.forward(&picture.f_sub_scalar(0.5)?.f_div_scalar(0.5)?, 1, 1)?;
+    fn features(&self, image: &Tensor) -> Result<Tensor, TchError> {
+        let first = self.head.forward(&image.f_sub_scalar(0.5)?.f_div_scalar(0.5)?, 1, 1)?;
         let mut x = first.shallow_clone();
         for [one, two] in &self.blocks {
             x = two.forward(&one.forward(&x, 1, 1)?.f_relu()?, 1, 1)?.f_add(&x)?;
@@ -86,19 +86,19 @@ impl Network for Liif {
         None
     }
 
-    fn enlarge(&self, picture: &Tensor, [rows, columns]: [i64; 2]) -> Result<Tensor, TchError> {
-        let [_, _, low_rows, low_columns] = picture.size()[..] else {
-            return Err(TchError::Shape("a picture has four dimensions".to_owned()));
+    fn enlarge(&self, image: &Tensor, [rows, columns]: [i64; 2]) -> Result<Tensor, TchError> {
+        let [_, _, lr_rows, lr_columns] = image.size()[..] else {
+            return Err(TchError::Shape("an image has four dimensions".to_owned()));
         };
         let (first, others) = self.layers.split_first().ok_or_else(|| TchError::Shape("no layers".to_owned()))?;
-        let features = self.features(picture)?;
+        let features = self.features(image)?;
         let width = features.size()[1];
         // The first layer is linear: what features give it is the same for all pixels that take them, and so is the cell.
         let known = first.part(&features, 0, width)?;
-        let cell = [2.0 * low_rows as f64 / rows as f64, 2.0 * low_columns as f64 / columns as f64].map(|c| c as f32);
+        let cell = [2.0 * lr_rows as f64 / rows as f64, 2.0 * lr_columns as f64 / columns as f64].map(|c| c as f32);
         let constant = first.part(&Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?, width + 2, width + 4)?.f_add(first.bias())?;
         let sides = [-1.0, 1.0];
-        let (down, across) = (sides.map(|s| nearest(low_rows, rows, s)), sides.map(|s| nearest(low_columns, columns, s)));
+        let (down, across) = (sides.map(|s| nearest(lr_rows, rows, s)), sides.map(|s| nearest(lr_columns, columns, s)));
         let mut chunks = Vec::new();
         for start in (0..(rows * columns) as usize).step_by(CHUNK) {
             let pixels = start..(start + CHUNK).min((rows * columns) as usize);
@@ -112,7 +112,7 @@ impl Network for Liif {
                 let (mut index, mut offsets, mut share) = (Vec::new(), Vec::new(), Vec::new());
                 for p in pixels.clone() {
                     let (y, x) = place(p, v, h);
-                    index.push((y.index * low_columns as usize + x.index) as i64);
+                    index.push((y.index * lr_columns as usize + x.index) as i64);
                     offsets.extend([y.offset as f32, x.offset as f32]);
                     let all = area(p, 0, 0) + area(p, 0, 1) + area(p, 1, 0) + area(p, 1, 1);
                     // Nearer features weigh more: each gets the area on the other side.

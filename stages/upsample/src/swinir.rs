@@ -17,13 +17,13 @@ pub(crate) struct SwinIr {
     scale: i64,
 }
 
-/// Mean colour of the pictures that it was trained on.
+/// Mean colour of the images that it was trained on.
 const MEAN: [f32; 3] = [0.4488, 0.4371, 0.4040];
 /// What leaks through the ReLUs between three convolutions in a row, and of the real-world head.
 const SLOPE: f64 = 0.2;
 /// What leaks through the ReLU before enlarging.
 const HEAD_SLOPE: f64 = 0.01;
-/// What keeps places in a window that aren't neighbours in the picture from seeing each other.
+/// What keeps places in a window that aren't neighbours in the image from seeing each other.
 const FAR: f32 = -100.0;
 
 /// Transformer blocks, and a convolution after them.
@@ -35,14 +35,14 @@ struct Group {
 /// One convolution, or three of which the middle ones are narrow.
 struct Convs(Vec<Conv>);
 
-/// From features to a larger picture.
+/// From features to a larger image.
 enum Head {
     /// Pixels shuffled one or several times, by so many; the classical models.
     Shuffled { before: Conv, steps: Vec<(Conv, i64)>, last: Conv },
     /// Shuffled at once; the lightweight models.
     Direct { up: Conv, by: i64 },
     /// Pixels repeated and filtered; the real-world models.
-    Repeated { before: Conv, steps: Vec<Conv>, high: Conv, last: Conv },
+    Repeated { before: Conv, steps: Vec<Conv>, hr: Conv, last: Conv },
 }
 
 /// Attention within windows, then a network of two layers, each added to what came in.
@@ -84,12 +84,12 @@ impl Network for SwinIr {
         Some(self.scale)
     }
 
-    fn enlarge(&self, picture: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
-        let [_, _, rows, columns] = picture.size()[..] else {
-            return Err(TchError::Shape("a picture has four dimensions".to_owned()));
+    fn enlarge(&self, image: &Tensor, _: [i64; 2]) -> Result<Tensor, TchError> {
+        let [_, _, rows, columns] = image.size()[..] else {
+            return Err(TchError::Shape("an image has four dimensions".to_owned()));
         };
         let mean = Tensor::f_from_slice(&MEAN)?.f_reshape([1, 3, 1, 1])?;
-        let whole = self.whole_windows(&picture.f_sub(&mean)?)?;
+        let whole = self.whole_windows(&image.f_sub(&mean)?)?;
         let first = self.first.forward(&whole, 1, 1)?;
         let mut x = first.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         if let Some(norm) = &self.embedded {
@@ -100,20 +100,20 @@ impl Network for SwinIr {
             x = group.forward(&x, self.window, &mask)?;
         }
         let deep = self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
-        let large = self.head.forward(&deep)?.f_add(&mean)?;
-        large.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
+        let hr = self.head.forward(&deep)?.f_add(&mean)?;
+        hr.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
     }
 }
 
 impl SwinIr {
-    /// The picture mirrored beyond its last row and column until windows are whole.
-    fn whole_windows(&self, picture: &Tensor) -> Result<Tensor, TchError> {
-        let mut x = picture.shallow_clone();
+    /// The image mirrored beyond its last row and column until windows are whole.
+    fn whole_windows(&self, image: &Tensor) -> Result<Tensor, TchError> {
+        let mut x = image.shallow_clone();
         for axis in [2, 3] {
-            let size = picture.size()[axis];
+            let size = image.size()[axis];
             let lacks = size.rem_euclid(self.window);
             if lacks > 0 {
-                // Mirrored at the last one, as often as it takes: a picture may be smaller than a window.
+                // Mirrored at the last one, as often as it takes: an image may be smaller than a window.
                 let period = (2 * (size - 1)).max(1);
                 let source = |i: i64| if i % period < size { i % period } else { period - i % period };
                 let index: Vec<i64> = (0..size + self.window - lacks).map(source).collect();
@@ -182,8 +182,8 @@ impl Head {
         if weights.has("conv_up1.weight") {
             let steps = count(weights, 1, |i| format!("conv_up{i}.weight"));
             let read = (1..=steps).map(|i| conv(&format!("conv_up{i}"), middle, middle)).collect::<Result<Vec<_>, _>>()?;
-            let high = conv("conv_hr", middle, middle)?;
-            return Ok((Self::Repeated { before, steps: read, high, last }, 1 << steps.min(8)));
+            let hr = conv("conv_hr", middle, middle)?;
+            return Ok((Self::Repeated { before, steps: read, hr, last }, 1 << steps.min(8)));
         }
         let (mut scale, mut steps) = (1, Vec::new());
         for i in 0..count(weights, 0, |i| format!("upsample.{}.weight", 2 * i)) {
@@ -205,13 +205,13 @@ impl Head {
                 }
                 last.forward(&x, 1, 1)
             }
-            Self::Repeated { before, steps, high, last } => {
+            Self::Repeated { before, steps, hr, last } => {
                 let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
                 for conv in steps {
                     let repeated = x.f_repeat_interleave_self_int(2, 2, None)?.f_repeat_interleave_self_int(2, 3, None)?;
                     x = leaky(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
                 }
-                last.forward(&leaky(&high.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
+                last.forward(&leaky(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
             }
         }
     }

@@ -109,7 +109,7 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
     encode(context, params, &frames, &context.output_path(&format!("{prefix}video.mp4"))?)
 }
 
-/// Two pictures of one height as one.
+/// Two images of one height as one.
 fn side_by_side(left: &Rgba8, right: &Rgba8) -> Rgba8 {
     let rows = left.data.chunks_exact(4 * left.width).zip(right.data.chunks_exact(4 * right.width));
     Rgba8::new(left.width + right.width, left.height, rows.flat_map(|(a, b)| [a, b].concat()).collect())
@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_have_even_sizes_and_both_pictures() {
+    fn frames_have_even_sizes_and_both_images() {
         let one = |width: usize, level: u8| Rgba8::new(width, 3, vec![level; 4 * width * 3]);
         let frame = even(&side_by_side(&one(3, 10), &one(2, 20)));
         assert_eq!((frame.width, frame.height), (6, 4));

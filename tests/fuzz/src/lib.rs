@@ -4,21 +4,21 @@ use std::path::{Path, PathBuf};
 
 use dataset::Dataset;
 
-/// A 4×3 picture, as PNG.
-const PICTURE: (usize, usize) = (4, 3);
+/// A 4×3 image, as PNG.
+const SIZE: (usize, usize) = (4, 3);
 
 /// A folder in memory where there is one, with `images/a.png` and `images/b.png`.
 pub struct Folder(tempfile::TempDir);
 
 impl Folder {
-    /// An empty one, with pictures.
+    /// An empty one, with images.
     pub fn new() -> Self {
         let memory = Path::new("/dev/shm");
         let dir = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() };
         let folder = Self(dir.expect("a temporary folder"));
-        let picture = pixels::Rgba8::new(PICTURE.0, PICTURE.1, vec![128; 4 * PICTURE.0 * PICTURE.1]);
+        let image = pixels::Rgba8::new(SIZE.0, SIZE.1, vec![128; 4 * SIZE.0 * SIZE.1]);
         for name in ["a", "b"] {
-            folder.write(&format!("images/{name}.png"), &pixels::encode_png(&picture));
+            folder.write(&format!("images/{name}.png"), &pixels::encode_png(&image));
         }
         folder
     }
@@ -35,12 +35,12 @@ impl Folder {
         std::fs::write(path, bytes).expect("a file");
     }
 
-    /// Reads the data set and its first pictures. Errors are what is expected; a panic, a hang or much memory isn't.
+    /// Reads the data set and its first images. Errors are what is expected; a panic, a hang or much memory isn't.
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
             for frame in set.frames.iter().take(2) {
                 // Nothing that a file names may lie outside the folder.
-                let image = frame.image.canonicalize().expect("a picture that was looked at");
+                let image = frame.image.canonicalize().expect("an image that was looked at");
                 assert!(image.starts_with(self.0.path().canonicalize().expect("the folder")), "{}", image.display());
                 frame.photograph().ok();
             }

@@ -17,7 +17,7 @@ pub fn out_of_memory(text: &str) -> Option<String> {
 
 /// What helps where memory is short.
 pub const MEMORY_REMEDY: &str =
-    "end other programs, run one stage at a time (`nerf-sr run --jobs 1`), or give it fewer or smaller pictures";
+    "end other programs, run one stage at a time (`nerf-sr run --jobs 1`), or give it fewer or smaller images";
 
 /// `99532800 bytes` or `2.00 GiB` at the beginning of a text.
 fn amount(text: &str) -> Option<String> {

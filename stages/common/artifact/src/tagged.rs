@@ -160,32 +160,33 @@ mod tests {
         Schema::new("x", &described()).unwrap()
     }
 
-    fn map(value: Value) -> Map<String, Value> {
+    fn map(value: &Value) -> Map<String, Value> {
         value.as_object().cloned().unwrap()
+    }
+
+    fn with(base: &Value, name: &str, value: u32) -> Value {
+        let mut changed = base.clone();
+        changed[name] = json!(value);
+        changed
     }
 
     #[test]
     fn both_ways_of_writing_resolve_alike() {
         let grid = json!({"field": "grid", "rays": 30, "levels": 8, "steps": null, "seed": 0});
         let mlp = json!({"field": "mlp", "rays": null, "layers": 8, "seed": 0});
-        let with = |base: &Value, name: &str, value: Value| {
-            let mut changed = base.clone();
-            changed[name] = value;
-            changed
-        };
         for (given, expected) in [
             (json!({}), grid.clone()),
             (json!({"field": "grid"}), grid.clone()),
             (json!({"field": {"grid": {}}}), grid.clone()),
-            (json!({"levels": 4}), with(&grid, "levels", json!(4))),
-            (json!({"field": {"grid": {"levels": 4.0}}}), with(&grid, "levels", json!(4))),
-            (json!({"field": {"grid": {"levels": 4}}, "levels": 5}), with(&grid, "levels", json!(5))),
+            (json!({"levels": 4}), with(&grid, "levels", 4)),
+            (json!({"field": {"grid": {"levels": 4.0}}}), with(&grid, "levels", 4)),
+            (json!({"field": {"grid": {"levels": 4}}, "levels": 5}), with(&grid, "levels", 5)),
             (json!({"field": "mlp"}), mlp.clone()),
             (json!({"field": {"mlp": {}}}), mlp.clone()),
-            (json!({"field": "mlp", "layers": 2}), with(&mlp, "layers", json!(2))),
-            (json!({"field": {"mlp": {"rays": 5}}}), with(&mlp, "rays", json!(5))),
+            (json!({"field": "mlp", "layers": 2}), with(&mlp, "layers", 2)),
+            (json!({"field": {"mlp": {"rays": 5}}}), with(&mlp, "rays", 5)),
         ] {
-            assert_eq!(schema().resolve(&map(given.clone())).unwrap(), expected, "{given}");
+            assert_eq!(schema().resolve(&map(&given)).unwrap(), expected, "{given}");
         }
     }
 
@@ -203,7 +204,7 @@ mod tests {
             (json!({"field": {"grid": {}, "mlp": {}}}), "is not one of"),
             (json!({"field": null}), "null is not one of"),
         ] {
-            let problems = schema().resolve(&map(given.clone())).unwrap_err();
+            let problems = schema().resolve(&map(&given)).unwrap_err();
             assert!(problems[0].to_string().contains(words), "{given}: {}", problems[0]);
         }
     }
@@ -220,14 +221,14 @@ mod tests {
             (json!({"levels": 4}), json!({"layers": 5}), json!({"levels": 4, "layers": 5})),
         ] {
             let mut given = Map::new();
-            [&earlier, &later].into_iter().for_each(|layer| schema().lay_over(&mut given, &map(layer.clone())));
+            [&earlier, &later].into_iter().for_each(|layer| schema().lay_over(&mut given, &map(layer)));
             assert_eq!(Value::Object(given), expected, "{earlier}, then {later}");
         }
     }
 
     #[test]
     fn the_stage_gets_what_its_type_has() {
-        let resolved = schema().resolve(&map(json!({"field": "mlp"}))).unwrap();
+        let resolved = schema().resolve(&map(&json!({"field": "mlp"}))).unwrap();
         assert_eq!(schema().nested(&resolved), json!({"field": {"mlp": {"rays": null, "layers": 8}}, "seed": 0}));
         assert_eq!(schema().by_scene(&resolved), ["rays"]);
         assert_eq!(schema().names(), ["field", "layers", "levels", "rays", "seed", "steps"]);

@@ -5,8 +5,8 @@ use artifact::counted;
 use crate::transforms::{self, Missing};
 use crate::{Dataset, DatasetError, Format, Split, is_file};
 
-/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. A picture that isn't there is an
-/// error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
+/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. An image that isn't
+/// there is an error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("transforms_train.json");
     let mut frames = transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;
@@ -89,17 +89,17 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_where_a_picture_should_be_is_named() {
+    fn what_stands_where_an_image_should_be_is_named() {
         let dir = folder(&with_pose("1"));
-        let picture = dir.path().join("train/r_0.png");
-        std::fs::remove_file(&picture).unwrap();
+        let image = dir.path().join("train/r_0.png");
+        std::fs::remove_file(&image).unwrap();
         let message = || Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(message().ends_with("r_0.png is not there; remove the frame or restore the file"), "{}", message());
-        std::os::unix::fs::symlink("r_0.png", &picture).unwrap();
+        std::os::unix::fs::symlink("r_0.png", &image).unwrap();
         assert!(message().contains("r_0.png is a symbolic link that leads nowhere"), "{}", message());
-        std::fs::remove_file(&picture).unwrap();
-        std::fs::create_dir(&picture).unwrap();
-        assert!(message().contains("r_0.png is a folder, not a picture"), "{}", message());
+        std::fs::remove_file(&image).unwrap();
+        std::fs::create_dir(&image).unwrap();
+        assert!(message().contains("r_0.png is a folder, not an image"), "{}", message());
     }
 
     /// Whatever a frame is called, a message stays on its line and moves no cursor.

@@ -57,7 +57,7 @@ fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
     found
 }
 
-/// Reads the model with most images, the first of several, and the pictures that it names.
+/// Reads the model with most images, the first of several, and the images that it names.
 pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, DatasetError> {
     let mut chosen: Option<(&PathBuf, Model)> = None;
     let mut sizes = Vec::new();
@@ -80,12 +80,12 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
     if models.len() > 1 {
         notes.push(format!("of {} models the one with most images is taken: {}", models.len(), sizes.join(", ")));
     }
-    let pictures = if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
+    let root = if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
     let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     for (index, image) in model.images.iter().enumerate() {
         let of_frame = |reason: String| DatasetError::Frame { path: list.clone(), index, file: image.name.clone(), reason };
         let file = relative_path(&image.name).map_err(of_frame)?;
-        match find(&pictures.join(&file), "a picture") {
+        match find(&root.join(&file), "an image") {
             Found::File => {}
             Found::Nothing(_) => {
                 missing.push(&image.name);
@@ -93,12 +93,12 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
             }
             Found::Other(reason) => return Err(of_frame(format!("{reason}; put the photograph there"))),
         }
-        frames.push(model.frame(image, pictures.join(&file)).map_err(of_frame)?);
+        frames.push(model.frame(image, root.join(&file)).map_err(of_frame)?);
         files.push(file);
     }
     if frames.is_empty() {
         let reason = match missing.first() {
-            Some(first) => format!("not one of its {} pictures is in {}, first {first}", missing.len(), shown(&pictures)),
+            Some(first) => format!("not one of its {} images is in {}, first {first}", missing.len(), shown(&root)),
             None => "it has no images; at least one is needed".to_owned(),
         };
         return Err(DatasetError::format(&list, reason));
@@ -241,15 +241,15 @@ impl Model {
         Ok(())
     }
 
-    fn frame(&self, image: &Image, picture: PathBuf) -> Result<Frame, String> {
+    fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, String> {
         let camera = self.cameras.get(&image.camera).ok_or_else(|| format!("there is no camera {}", image.camera))?;
-        let stored = look(&picture).map_err(|e| e.to_string())?;
+        let stored = look(&file).map_err(|e| e.to_string())?;
         let (taken_with, turned) = fitted(*camera, stored).map_err(|reason| format!("{reason} (camera {})", image.camera))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let depths = depths(image, &self.points);
         let frame = Frame {
             name: String::new(),
-            image: picture,
+            image: file,
             turned,
             mask: None,
             depth: None,
@@ -434,7 +434,7 @@ mod tests {
         assert_eq!(relative(&one), relative(&other));
         let [a, b] = &one.frames[..] else { panic!("two frames") };
         assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
-        // Pictures of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0, 1) at depth 1 + 3.
+        // Images of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0, 1) at depth 1 + 3.
         assert_eq!(
             b.taken_with,
             Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0, distortion: SIMPLE }
@@ -506,7 +506,7 @@ mod tests {
         let forged = reads(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
         assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
         let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
-        assert!(none.contains("not one of its 2 pictures"), "{none}");
+        assert!(none.contains("not one of its 2 images"), "{none}");
         assert!(reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images"));
     }
 

@@ -16,7 +16,7 @@ pub(crate) enum Found {
     Other(String),
 }
 
-/// Looks at a place where a file is wanted, which `wanted` names ("a picture").
+/// Looks at a place where a file is wanted, which `wanted` names ("an image").
 pub(crate) fn find(path: &Path, wanted: &str) -> Found {
     match fs::metadata(path) {
         Ok(there) if there.is_file() => Found::File,
@@ -82,13 +82,13 @@ mod tests {
         symlink("loop", at("loop")).unwrap();
         symlink("gone", at("dangling")).unwrap();
         symlink("file", at("link")).unwrap();
-        let found = |name: &str| find(&at(name), "a picture");
+        let found = |name: &str| find(&at(name), "an image");
         assert_eq!((found("file"), found("link")), (Found::File, Found::File));
         for (name, words) in [
-            ("folder", "folder is a folder, not a picture"),
-            ("pipe", "pipe is a named pipe (FIFO), not a picture"),
-            ("socket", "socket is a socket, not a picture"),
-            ("device", "device is a device, not a picture"),
+            ("folder", "folder is a folder, not an image"),
+            ("pipe", "pipe is a named pipe (FIFO), not an image"),
+            ("socket", "socket is a socket, not an image"),
+            ("device", "device is a device, not an image"),
             ("loop", "loop is a symbolic link that leads nowhere"),
             ("loop/x.png", "loop is a symbolic link that leads nowhere"),
             ("dangling/x.png", "dangling is a symbolic link to gone, which is not there"),

@@ -12,17 +12,17 @@ use crate::found::shown;
 pub struct Frame {
     /// Unique within its side of the folder's own split; fit for a file's name.
     pub name: String,
-    /// The picture: PNG, JPEG or EXR.
+    /// The image: PNG, JPEG or EXR.
     pub image: PathBuf,
     /// Whether it has to be turned as its EXIF data ask to be what its camera saw.
     pub turned: bool,
-    /// What is to be left out of it: a picture of its size, black there, white elsewhere.
+    /// What is to be left out of it: an image of its size, black there, white elsewhere.
     pub mask: Option<PathBuf>,
     /// True depth (EXR, channels `Z` and `A`), where the data has it.
     pub depth: Option<PathBuf>,
-    /// What it was taken with; its size is the stored picture's.
+    /// What it was taken with; its size is the stored image's.
     pub taken_with: Intrinsics,
-    /// Where distortion is to be undone, the pinhole camera as whose picture it is read.
+    /// Where distortion is to be undone, the pinhole camera as whose image it is read.
     pub pinhole: Option<Intrinsics>,
     /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
     pub camera_to_world: [[f64; 4]; 3],
@@ -41,7 +41,7 @@ impl Frame {
         Camera { name: self.name.clone(), intrinsics: self.intrinsics(), camera_to_world: self.camera_to_world }
     }
 
-    /// Refuses what no camera can be. Whether each place in a distorted picture has its ray is asked where that matters.
+    /// Refuses what no camera can be. Whether each place in a distorted image has its ray is asked where that matters.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
         let distortion = self.taken_with.distortion;
         if !distortion.is_finite() {
@@ -64,7 +64,7 @@ pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> 
     pose([back.x_axis, -back.y_axis, -back.z_axis], -(back * translation))
 }
 
-/// Names for pictures, by their paths inside the data set: the files' names alone where those differ, else with their folders.
+/// Names for images, by their paths inside the data set: the files' names alone where those differ, else with their folders.
 pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
     let text = |index: usize, part: Option<&std::ffi::OsStr>| {
         // Names become files' names and are printed everywhere: no control characters.

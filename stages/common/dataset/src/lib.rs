@@ -6,16 +6,16 @@
 //! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and its
-//! lens's distortion; [`Frame::photograph`] reads its picture, upright as its poses have it. [`Dataset::undistorted`] has pictures read as
-//! pinhole cameras would have taken them.
+//! lens's distortion; [`Frame::photograph`] reads its image, upright as its poses have it. [`Dataset::undistorted`] has images
+//! read as pinhole cameras would have taken them.
 //!
-//! Units: lengths are those of the poses; pixels count from the stored picture's top left corner, whose first pixel has its centre
+//! Units: lengths are those of the poses; pixels count from the stored image's top left corner, whose first pixel has its centre
 //! at (0.5, 0.5). Everything a file says is checked: sizes before anything is allocated, paths before anything is opened.
 //!
 //! ```no_run
 //! let set = dataset::Dataset::read("my-photographs".as_ref())?;
 //! println!("{}: {} photographs", set.format, set.frames.len());
-//! let (picture, camera) = (set.frames[0].photograph()?, set.frames[0].camera());
+//! let (image, camera) = (set.frames[0].photograph()?, set.frames[0].camera());
 //! # Ok::<(), dataset::DatasetError>(())
 //! ```
 
@@ -125,7 +125,7 @@ pub enum DatasetError {
         /// What is wrong and what to do.
         reason: String,
     },
-    /// A picture that can't be read.
+    /// An image that can't be read.
     #[error("{}", printable(&.0.to_string()))]
     Pixels(pixels::PixelError),
 }
@@ -144,7 +144,7 @@ impl DatasetError {
 }
 
 impl Dataset {
-    /// Reads a folder, whichever form it has. Pictures are looked at for their size alone.
+    /// Reads a folder, whichever form it has. Images are looked at for their size alone.
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
         // The most explicit form first: a folder often has what its poses were made from, too.
         let mut set = if is_file(&folder.join("transforms_train.json"))? {
@@ -180,15 +180,15 @@ impl Dataset {
         self
     }
 
-    /// Has pictures read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same size, with a
-    /// border cut off where the lens saw no more.
+    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same
+    /// size, with a border cut off where the lens saw no more.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
         let mut undone = 0;
         for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
             undone += 1;
             let pinhole = frame.taken_with.pinhole().ok_or_else(|| {
                 let reason = format!(
-                    "lens distortion {} leaves no pinhole's picture; are its coefficients right?",
+                    "lens distortion {} leaves no pinhole's image; are its coefficients right?",
                     frame.taken_with.distortion
                 );
                 DatasetError::format(&frame.image, reason)
@@ -215,7 +215,7 @@ impl Dataset {
         self
     }
 
-    /// Says what is done to pictures that aren't all alike, upright and from a pinhole.
+    /// Says what is done to images that aren't all alike, upright and from a pinhole.
     fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
         let (distorted, turned) = (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turned));

@@ -7,22 +7,22 @@ use scene::{Distortion, Intrinsics};
 
 use crate::found::{Found, find};
 use crate::frame::{names, pose};
-use crate::photograph::{Stored, fitted, is_picture_name, look};
+use crate::photograph::{Stored, fitted, is_image_name, look};
 use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal length), near and far.
 const NUMBERS: usize = 17;
 
-/// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the pictures beside it, sorted by name.
+/// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the images beside it, sorted by name.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
-    let (pictures, from) = pictures(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
-    let files: Vec<PathBuf> = pictures.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
+    let (images, from) = images(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
+    let files: Vec<PathBuf> = images.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
     let names = names(&path, &files)?;
     let (distortion, note) = distortion(folder, &rows);
     let mut frames = Vec::with_capacity(rows.len());
-    for (index, ((row, image), name)) in rows.iter().zip(pictures).zip(names).enumerate() {
+    for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
         let file = name.clone();
         let of_frame = |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
         let frame = look(&image)
@@ -87,13 +87,13 @@ fn frame(row: &[f64; NUMBERS], distortion: Distortion, stored: Stored, name: Str
     })
 }
 
-/// Pictures of a folder by name, and what is named like one but can't be read, in words.
-fn pictures_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
-    let named = std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_picture_name(p));
+/// Images of a folder by name, and what is named like one but can't be read, in words.
+fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
+    let named = std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_image_name(p));
     let mut named: Vec<PathBuf> = named.collect();
     named.sort();
     let mut odd = None;
-    named.retain(|path| match find(path, "a picture") {
+    named.retain(|path| match find(path, "an image") {
         Found::File => true,
         Found::Nothing(reason) | Found::Other(reason) => {
             odd.get_or_insert(reason);
@@ -103,13 +103,13 @@ fn pictures_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
     Some((named, odd))
 }
 
-/// All pictures of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
-fn pictures(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
+/// All images of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
+fn images(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
     let mut folders = vec!["images".to_owned()];
     folders.extend((2..=64).map(|n| format!("images_{n}")));
     let mut seen = Vec::new();
     for name in folders {
-        let Some((files, odd)) = pictures_of(&folder.join(&name)) else { continue };
+        let Some((files, odd)) = images_of(&folder.join(&name)) else { continue };
         if files.len() == count {
             return Ok((files, name));
         }
@@ -117,7 +117,7 @@ fn pictures(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), Strin
         seen.push(format!("{name} has {}{odd}", files.len()));
     }
     let seen = if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
-    Err(format!("{count} poses, but {seen}; pictures and poses must be as many"))
+    Err(format!("{count} poses, but {seen}; images and poses must be as many"))
 }
 
 /// Opening brackets in the header of an array of numbers, at most: a dictionary's and its shape's are two. The parser takes twice the time for each
@@ -221,7 +221,7 @@ mod tests {
         assert_eq!(distortion().0, 0.0);
         std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
         let cameras = |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
-        // Its pictures are twice as large.
+        // Its images are twice as large.
         cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
         assert_eq!(
             distortion(),
@@ -262,7 +262,7 @@ mod tests {
         std::fs::create_dir(dir.path().join("images/IMG_9.png")).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
-            message.contains("2 poses, but images has 1 (") && message.contains("IMG_9.png is a folder, not a picture)"),
+            message.contains("2 poses, but images has 1 (") && message.contains("IMG_9.png is a folder, not an image)"),
             "{message}"
         );
         // A header that claims more than there is.

@@ -9,8 +9,8 @@ use scene::Intrinsics;
 
 use crate::{DatasetError, Frame};
 
-/// Whether a file's name is that of a picture.
-pub(crate) fn is_picture_name(path: &Path) -> bool {
+/// Whether a file's name is that of an image.
+pub(crate) fn is_image_name(path: &Path) -> bool {
     let extension = path.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     matches!(extension.as_deref(), Some("png" | "jpg" | "jpeg" | "exr"))
 }
@@ -32,7 +32,7 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
     }
 }
 
-/// What a picture's header says.
+/// What an image's header says.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Stored {
     /// Columns and rows.
@@ -41,7 +41,7 @@ pub(crate) struct Stored {
     pub(crate) is_sideways: bool,
 }
 
-/// Looks at a picture's header.
+/// Looks at an image's header.
 pub(crate) fn look(path: &Path) -> Result<Stored, PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
@@ -65,9 +65,9 @@ fn is_sideways(turn: Orientation) -> bool {
     matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// The intrinsics for the stored picture, whose size may differ from what was said of it, but not in shape; and whether the picture has to be
-/// turned as its EXIF data ask. Poses are commonly found for pictures as they are stored, so it is turned only where its shape fits no
-/// other way.
+/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in shape; and whether the image
+/// has to be turned as its EXIF data ask. Poses are commonly found for images as they are stored, so it is turned only where
+/// its shape fits no other way.
 pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let (width, height) = stored.size;
     let fits = |(width, height): (u32, u32)| {
@@ -82,11 +82,11 @@ pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool)
     } else if stored.is_sideways && fits((height, width)) {
         Ok((k.resized(height, width), true))
     } else {
-        Err(format!("the picture has {width}×{height} pixels, its camera {}×{}: another shape", k.width, k.height))
+        Err(format!("the image has {width}×{height} pixels, its camera {}×{}: another shape", k.width, k.height))
     }
 }
 
-/// The picture as it is stored, or turned as its EXIF data ask.
+/// The image as it is stored, or turned as its EXIF data ask.
 fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     if is_exr(path) {
@@ -94,7 +94,7 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
     }
     let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let mut image = DynamicImage::from_decoder(decoder).map_err(|e| format(format!("not a whole picture ({e})")))?;
+    let mut image = DynamicImage::from_decoder(decoder).map_err(|e| format(format!("not a whole image ({e})")))?;
     if turned {
         image.apply_orientation(turn);
     }
@@ -119,7 +119,7 @@ fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
 }
 
 impl Frame {
-    /// The picture that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as sharp as it was.
+    /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as sharp as it was.
     pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
         self.seen(&self.image)
     }
@@ -129,7 +129,7 @@ impl Frame {
         self.mask.as_ref().map(|path| Ok(Mask::of(&self.seen(path)?))).transpose()
     }
 
-    /// A picture of the photograph's pixels as the camera sees it.
+    /// An image of the photograph's pixels as the camera sees it.
     fn seen(&self, path: &Path) -> Result<Rgba8, DatasetError> {
         let image = read(path, self.turned)?;
         let k = self.taken_with;
@@ -141,7 +141,7 @@ impl Frame {
     }
 }
 
-/// The picture that a pinhole camera would have taken, by cubic interpolation.
+/// The image that a pinhole camera would have taken, by cubic interpolation.
 fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> Rgba8 {
     let mut data = Vec::with_capacity(image.data.len());
     for y in 0..image.height {
@@ -162,7 +162,7 @@ pub(crate) mod tests {
     use super::*;
     use scene::Distortion;
 
-    /// A picture whose red says the column and whose green says the row.
+    /// An image whose red says the column and whose green says the row.
     fn ramp(width: usize, height: usize) -> Rgba8 {
         let pixel = |i: usize| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, 90, 255];
         Rgba8::new(width, height, (0..width * height).flat_map(pixel).collect())
@@ -199,7 +199,7 @@ pub(crate) mod tests {
         let message = look(&path).unwrap_err().to_string();
         assert!(
             message
-                .ends_with("20000×20000 pixels; at most 268435456 are read (16384×16384, for example): make the picture smaller"),
+                .ends_with("20000×20000 pixels; at most 268435456 are read (16384×16384, for example): make the image smaller"),
             "{message}"
         );
         // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's shape says so, else left alone.
@@ -217,14 +217,14 @@ pub(crate) mod tests {
         let upright = super::read(&path, true).unwrap();
         assert_eq!((upright.width, upright.height), (16, 32));
         assert!(upright.data[0] < 20 && upright.data[1] > 200, "its bottom left corner is now its top left one");
-        std::fs::write(&path, "no picture").unwrap();
+        std::fs::write(&path, "no image").unwrap();
         assert!(look(&path).unwrap_err().to_string().contains("a.png"));
         let other = dir.path().join("a.tiff");
-        std::fs::write(&other, "no picture").unwrap();
+        std::fs::write(&other, "no image").unwrap();
         assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
     }
 
-    /// A pinhole picture seen through a lens and undone is the pinhole picture again.
+    /// A pinhole image seen through a lens and undone is the pinhole image again.
     #[test]
     fn distortion_is_undone() {
         let distortion = Distortion { radial: [-0.12, 0.02, 0.0], tangential: [0.002, -0.001] };
@@ -241,14 +241,14 @@ pub(crate) mod tests {
             }
             at
         };
-        let picture = |of: &dyn Fn(f64, f64) -> [f64; 2]| {
+        let image = |of: &dyn Fn(f64, f64) -> [f64; 2]| {
             let pixel = |i: usize| colour(of((i % 120) as f64 + 0.5, (i / 120) as f64 + 0.5));
             Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
         };
         let pinhole = intrinsics.pinhole().unwrap();
         assert!(pinhole.fx != intrinsics.fx);
-        let expected = picture(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
-        let found = undistorted(&picture(&ray), &intrinsics, &pinhole);
+        let expected = image(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
+        let found = undistorted(&image(&ray), &intrinsics, &pinhole);
         let worst = found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{worst}");
     }

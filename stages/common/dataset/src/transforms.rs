@@ -54,7 +54,7 @@ struct FrameEntry {
     own: LensEntry,
 }
 
-/// What to do about a picture that isn't there.
+/// What to do about an image that isn't there.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Missing {
     /// It is an error.
@@ -66,7 +66,7 @@ pub(crate) enum Missing {
 /// A file's frames.
 pub(crate) struct Read {
     pub(crate) frames: Vec<Frame>,
-    /// The first of the frames whose picture isn't there, and how many there are.
+    /// The first of the frames whose image isn't there, and how many there are.
     missing: (Option<String>, usize),
     split: Option<Split>,
 }
@@ -105,8 +105,8 @@ pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Resu
     for (index, entry) in transforms.frames.iter().enumerate() {
         let of_frame =
             |reason: String| DatasetError::Frame { path: path.to_path_buf(), index, file: entry.file_path.clone(), reason };
-        let file = picture_file(folder, &entry.file_path).map_err(of_frame)?;
-        match find(&folder.join(&file), "a picture") {
+        let file = image_file(folder, &entry.file_path).map_err(of_frame)?;
+        match find(&folder.join(&file), "an image") {
             Found::File => {}
             Found::Nothing(reason) if on_missing == Missing::Refused => {
                 return Err(of_frame(format!("{reason}; remove the frame or restore the file")));
@@ -116,13 +116,13 @@ pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Resu
                 missing += 1;
                 continue;
             }
-            Found::Other(reason) => return Err(of_frame(format!("{reason}; remove the frame or name its picture"))),
+            Found::Other(reason) => return Err(of_frame(format!("{reason}; remove the frame or name its image"))),
         }
         frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
         files.push(file);
     }
     if let Some(first) = first_missing.as_ref().filter(|_| frames.is_empty()) {
-        return Err(DatasetError::format(path, format!("not one of its {missing} pictures is there, first {first}")));
+        return Err(DatasetError::format(path, format!("not one of its {missing} images is there, first {first}")));
     }
     for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
         frame.name = name;
@@ -150,8 +150,8 @@ fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
     })
 }
 
-/// The picture's path inside the folder. NeRF's files leave `.png` out.
-fn picture_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
+/// The image's path inside the folder. NeRF's files leave `.png` out.
+fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
     let mut file = relative_path(text)?;
     let known = ["png", "jpg", "jpeg", "exr"];
     let has_one = file.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()));
@@ -177,7 +177,7 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
     let beside = |text: &Option<String>| -> Result<Option<PathBuf>, String> {
         let Some(text) = text else { return Ok(None) };
         let path = folder.join(relative_path(text)?);
-        match find(&path, "a picture") {
+        match find(&path, "an image") {
             Found::File => Ok(Some(path)),
             Found::Nothing(reason) | Found::Other(reason) => Err(format!("{reason}; remove the entry or restore the file")),
         }
@@ -205,20 +205,20 @@ impl LensEntry {
     }
 }
 
-/// What a picture was taken with, and whether it has to be turned.
+/// What an image was taken with, and whether it has to be turned.
 fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
     if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model) {
-        return Err(format!("camera_model {model:?} is not supported; undistort the pictures first (colmap image_undistorter)"));
+        return Err(format!("camera_model {model:?} is not supported; undistort the images first (colmap image_undistorter)"));
     }
     if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k.0 != 0.0) {
-        return Err("fisheye lenses are not supported; undistort the pictures first".to_owned());
+        return Err("fisheye lenses are not supported; undistort the images first".to_owned());
     }
-    // The size that the numbers are for; the stored picture may be a smaller copy.
+    // The size that the numbers are for; the stored image may be a smaller copy.
     let whole = |value: Option<Number>, name: &str, stored: u32| match value {
         None => Ok(stored),
         Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(v)) => Err(format!("{name} is {v}; a picture has at least one pixel")),
+        Some(Number(v)) => Err(format!("{name} is {v}; an image has at least one pixel")),
     };
     let (width, height) = (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
     let focal = |length: Option<Number>, angle: Option<Number>, name: &str, size: u32| match (length, angle) {
@@ -323,6 +323,6 @@ mod tests {
             assert!(message.contains(words) && message.contains("frame 0 (images/a.png)"), "{message}");
         }
         let nothing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
-        assert!(set(nothing).unwrap_err().to_string().contains("not one of its 1 pictures is there"));
+        assert!(set(nothing).unwrap_err().to_string().contains("not one of its 1 images is there"));
     }
 }

@@ -28,8 +28,8 @@ fn fern_is_read() {
         let [near, far] = frame.depths.unwrap();
         assert!((camera.centre() - first.centre()).length() < near && near < far, "{} {near} {far}", frame.name);
     }
-    let picture = frame.photograph().unwrap();
-    assert_eq!((picture.width, picture.height), (4032, 3024));
+    let image = frame.photograph().unwrap();
+    assert_eq!((image.width, image.height), (4032, 3024));
     // COLMAP's model says what poses_bounds.npy can't.
     assert!((k.distortion.radial[0] - 0.01975).abs() < 1e-5, "{:?}", k.distortion);
 }

@@ -1,6 +1,6 @@
 //! Whatever radiance field an artifact holds, ready to cast rays through: what stages that render have in common.
 //!
-//! * [`Members`]: all fields of an artifact. What they render is averaged: each errs in its own way where pictures leave it open.
+//! * [`Members`]: all fields of an artifact. What they render is averaged: each errs in its own way where images leave it open.
 //!
 //! ```no_run
 //! use artifact::GivenInput;

@@ -19,7 +19,7 @@ impl Conv {
         })
     }
 
-    /// Of pictures (count × inputs × rows × columns).
+    /// Of images (count × inputs × rows × columns).
     pub fn forward(&self, x: &Tensor, stride: i64, padding: i64) -> Result<Tensor, TchError> {
         x.f_conv2d(&self.kernel, Some(&self.bias), [stride; 2], [padding; 2], [1, 1], 1)
     }

@@ -2,7 +2,7 @@
 //!
 //! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes don't depend on threads.
 //! * [`device`]: the device that a stage was asked to use, or why it can't be.
-//! * [`tensor_of`], [`picture_of`]: pictures as tensors.
+//! * [`tensor_of`], [`image_of`]: images as tensors.
 //! * [`Adam`]: the optimiser, on gradients that are given.
 //! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have; [`Conv`]: a layer of them.
 //!
@@ -15,7 +15,7 @@
 
 mod adam;
 mod conv;
-mod picture;
+mod image;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ use tch::{Cuda, Device, Kind, TchError, Tensor};
 
 pub use adam::{Adam, all_finite};
 pub use conv::Conv;
-pub use picture::{picture_of, tensor_of};
+pub use image::{image_of, tensor_of};
 
 /// Makes libtorch repeat its bytes: sums are split by thread, so it gets one.
 pub fn deterministic() {

@@ -20,7 +20,7 @@ pub struct PerceptualLoss {
 const BLOCKS: [(i64, usize); 5] = [(64, 2), (128, 2), (256, 4), (512, 4), (512, 4)];
 /// Weights of the blocks' differences.
 const SHARES: [f64; 5] = [1.0, 0.75, 0.5, 0.5, 1.0];
-/// Means of Caffe's training pictures: blue, green, red.
+/// Means of Caffe's training images: blue, green, red.
 const CAFFE_MEAN: [f32; 3] = [103.939, 116.779, 123.68];
 /// Means and deviations of ImageNet: red, green, blue.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
@@ -73,7 +73,7 @@ impl PerceptualLoss {
         self.blocks.len()
     }
 
-    /// Distance of pictures in -1..1 (count × 3 × rows × columns) from what they should be.
+    /// Distance of images in -1..1 (count × 3 × rows × columns) from what they should be.
     pub(crate) fn distance(&self, found: &Tensor, truth: &Tensor) -> Result<Tensor, TchError> {
         let mut sum = None::<Tensor>;
         let features = self.features(found)?;
@@ -89,8 +89,8 @@ impl PerceptualLoss {
         sum.ok_or_else(|| TchError::Shape("no block to compare".to_owned()))
     }
 
-    fn features(&self, pictures: &Tensor) -> Result<Vec<Tensor>, TchError> {
-        let unit = pictures.f_add_scalar(1.0)?.f_mul_scalar(0.5)?;
+    fn features(&self, images: &Tensor) -> Result<Vec<Tensor>, TchError> {
+        let unit = images.f_add_scalar(1.0)?.f_mul_scalar(0.5)?;
         let constant = |v: [f32; 3]| Tensor::f_from_slice(&v)?.f_reshape([1, 3, 1, 1]);
         let mut x = if self.caffe {
             unit.f_flip([1])?.f_mul_scalar(255.0)?.f_sub(&constant(CAFFE_MEAN)?)?

@@ -1,6 +1,6 @@
 use std::collections::BTreeSet;
 
-use pixels::Picture;
+use pixels::Image;
 use rayon::prelude::*;
 use refinement::{KnownView, RefinementError, Rendered};
 use scene::Surface;
@@ -22,14 +22,14 @@ type Corner = (usize, usize);
 impl PaperRefiner {
     /// A view redrawn by patches of 64×64 that overlap by so many pixels, at most by half, and are blended. Each gets `count` patches of references that show the same: where its own
     /// pixels are seen there, by depth and with nothing before them. One that has fewer is given itself instead, as in the reference.
-    /// A picture of three channels in 0..1.
+    /// An image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,
         references: &[&KnownView],
         count: usize,
         overlap: usize,
-    ) -> Result<Picture, RefinementError> {
+    ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
         if view.width < PATCH || view.height < PATCH {
             let reason = format!("{}×{} pixels; the paper's network needs {PATCH}×{PATCH}", view.width, view.height);
@@ -73,13 +73,13 @@ fn starts(size: usize, overlap: usize) -> Vec<usize> {
     all
 }
 
-/// A patch of a picture, row by row, in -1..1.
-pub(crate) fn patch(picture: &Picture, (x, y): Corner) -> Vec<f32> {
+/// A patch of an image, row by row, in -1..1.
+pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
     let mut samples = Vec::with_capacity(PATCH * PATCH * 3);
     for row in y..y + PATCH {
         for column in x..x + PATCH {
-            let at = (row * picture.width + column) * picture.channels;
-            samples.extend(picture.data[at..at + 3].iter().map(|v| 2.0 * v - 1.0));
+            let at = (row * image.width + column) * image.channels;
+            samples.extend(image.data[at..at + 3].iter().map(|v| 2.0 * v - 1.0));
         }
     }
     samples
@@ -109,8 +109,8 @@ fn matches(rendered: &Rendered, references: &[&KnownView], (x, y): Corner, count
     found.into_iter().map(|(_, r, at)| (r, at)).filter(|patch| taken.insert(*patch)).take(count).collect()
 }
 
-/// Patches in -1..1 as a picture in 0..1: where they overlap, each weighs by how far it is from its own border.
-fn stitch(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Picture {
+/// Patches in -1..1 as an image in 0..1: where they overlap, each weighs by how far it is from its own border.
+fn stitch(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Image {
     let (mut sum, mut weights) = (vec![0.0f32; width * height * 3], vec![0.0f32; width * height]);
     let inward = |i: usize| (i + 1).min(PATCH - i) as f32;
     for ((x, y), samples) in patches {
@@ -122,7 +122,7 @@ fn stitch(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Pictur
         }
     }
     sum.chunks_exact_mut(3).zip(weights).for_each(|(pixel, w)| pixel.iter_mut().for_each(|v| *v = (*v / w).clamp(0.0, 1.0)));
-    Picture::new(width, height, 3, sum)
+    Image::new(width, height, 3, sum)
 }
 
 #[cfg(test)]
@@ -131,15 +131,15 @@ mod tests {
 
     use super::*;
 
-    fn picture(width: usize, height: usize, channels: usize) -> Picture {
+    fn image(width: usize, height: usize, channels: usize) -> Image {
         let data = (0..width * height * channels).map(|i| (i * 37 % 101) as f32 / 100.0).collect();
-        Picture::new(width, height, channels, data)
+        Image::new(width, height, channels, data)
     }
 
     #[test]
-    fn patches_that_do_nothing_are_stitched_to_the_picture() {
+    fn patches_that_do_nothing_are_stitched_to_the_image() {
         for (width, height, overlap) in [(64, 64, 16), (65, 200, 0), (150, 112, 16), (150, 112, 0), (129, 300, 100)] {
-            let whole = picture(width, height, 3);
+            let whole = image(width, height, 3);
             let corners =
                 starts(height, overlap).into_iter().flat_map(|y| starts(width, overlap).into_iter().map(move |x| (x, y)));
             let patches: Vec<_> = corners.map(|corner| (corner, patch(&whole, corner))).collect();
@@ -166,19 +166,19 @@ mod tests {
             intrinsics: Intrinsics { width, height, fx: 100.0, fy: 100.0, cx: 80.0, cy: 48.0, distortion: Default::default() },
             camera_to_world: [[1.0, 0.0, 0.0, pixels / 50.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
-        let (view, count) = (picture(width as usize, height as usize, 4), (width * height) as usize);
+        let (view, count) = (image(width as usize, height as usize, 4), (width * height) as usize);
         let rendered = Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
-        KnownView { rendered, truth: picture(width as usize, height as usize, 3) }
+        KnownView { rendered, truth: image(width as usize, height as usize, 3) }
     }
 
-    /// Before a wall, all pixels of a patch agree on where a reference shows it; a reference that doesn't look there has none.
+    /// Before a wall, a reference shows all pixels of a patch at one place; a reference that doesn't look there has none.
     #[test]
     fn reference_patches_show_the_same_place() {
         let (view, right, away) = (known(0.0), known(20.0), known(400.0));
         assert_eq!(matches(&view.rendered, &[&right], (48, 16), 8), [(0, (28, 16))]);
         assert_eq!(matches(&view.rendered, &[&away, &right], (48, 16), 8), [(1, (28, 16))]);
         assert!(matches(&view.rendered, &[&away], (48, 16), 8).is_empty());
-        // At the border the patch is moved into the picture.
+        // At the border the patch is moved into the image.
         assert_eq!(matches(&view.rendered, &[&right], (0, 0), 8), [(0, (0, 0))]);
     }
 
@@ -193,7 +193,7 @@ mod tests {
             assert!(drawn.data.iter().all(|v| (0.0..=1.0).contains(v)));
         }
         let mut small = view.rendered.clone();
-        small.view = picture(63, 96, 4);
+        small.view = image(63, 96, 4);
         assert!(network.refine(&small, &[], 8, OVERLAP).unwrap_err().to_string().contains("64×64"));
     }
 }

@@ -1,12 +1,13 @@
 use counter_rng::CounterRng;
-use pixels::Picture;
+use pixels::Image;
 
-/// A random perspective, as torchvision draws them: every corner of a picture moves inwards by at most a share of its half width and height.
+/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at most a share of its half width
+/// and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
-    /// From places of the warped picture to those of the picture: (ax + by + c, dx + ey + f) / (gx + hy + 1).
+    /// From places of the warped image to those of the image: (ax + by + c, dx + ey + f) / (gx + hy + 1).
     map: [f64; 8],
-    /// The rectangle that the picture fills once it is warped: x, y, and one past the end.
+    /// The rectangle that the image fills once it is warped: x, y, and one past the end.
     pub(crate) filled: [usize; 4],
 }
 
@@ -34,8 +35,8 @@ impl Perspective {
         Self { map, filled: [low(|p| p.0), low(|p| p.1), high(|p| p.0), high(|p| p.1)] }
     }
 
-    /// The warped picture's colour at a pixel, bilinear; black outside.
-    pub(crate) fn colour(&self, picture: &Picture, x: usize, y: usize) -> [f32; 3] {
+    /// The warped image's colour at a pixel, bilinear; black outside.
+    pub(crate) fn colour(&self, image: &Image, x: usize, y: usize) -> [f32; 3] {
         let (x, y, [a, b, c, d, e, f, g, h]) = (x as f64, y as f64, self.map);
         let w = g * x + h * y + 1.0;
         let (u, v) = ((a * x + b * y + c) / w, (d * x + e * y + f) / w);
@@ -43,13 +44,13 @@ impl Perspective {
         let mut colour = [0.0f32; 3];
         for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
             let (column, row) = (left + dx, top + dy);
-            // NaN is in no picture.
-            if !(0.0..picture.width as f64).contains(&column) || !(0.0..picture.height as f64).contains(&row) {
+            // NaN is in no image.
+            if !(0.0..image.width as f64).contains(&column) || !(0.0..image.height as f64).contains(&row) {
                 continue;
             }
             let share = (1.0 - (u - column).abs()) * (1.0 - (v - row).abs());
-            let at = (row as usize * picture.width + column as usize) * picture.channels;
-            (0..3).for_each(|c| colour[c] += share as f32 * picture.data[at + c]);
+            let at = (row as usize * image.width + column as usize) * image.channels;
+            (0..3).for_each(|c| colour[c] += share as f32 * image.data[at + c]);
         }
         colour
     }
@@ -102,9 +103,9 @@ mod tests {
 
     #[test]
     fn nothing_changes_by_none_and_the_filled_rectangle_holds_all() {
-        let picture = Picture::new(40, 30, 3, (0..3600).map(|i| 0.1 + i as f32 / 4000.0).collect());
+        let image = Image::new(40, 30, 3, (0..3600).map(|i| 0.1 + i as f32 / 4000.0).collect());
         let none = Perspective::identity(40, 30);
-        assert_eq!(none.colour(&picture, 7, 5), [0, 1, 2].map(|c| picture.data[(5 * 40 + 7) * 3 + c]));
+        assert_eq!(none.colour(&image, 7, 5), [0, 1, 2].map(|c| image.data[(5 * 40 + 7) * 3 + c]));
         for seed in 0..20 {
             let warp = Perspective::draw(40, 30, &mut CounterRng::new(seed, 1, 2));
             let [left, top, right, bottom] = warp.filled;
@@ -112,9 +113,9 @@ mod tests {
             for (x, y) in (0..40).flat_map(|x| (0..30).map(move |y| (x, y))) {
                 // The border fades over a pixel.
                 let inside = x + 1 >= left && x <= right && y + 1 >= top && y <= bottom;
-                assert!(inside || warp.colour(&picture, x, y).iter().all(|c| *c < 1e-6), "seed {seed} at {x}, {y}");
+                assert!(inside || warp.colour(&image, x, y).iter().all(|c| *c < 1e-6), "seed {seed} at {x}, {y}");
             }
-            assert!(warp.colour(&picture, 20, 15)[0] > 0.05);
+            assert!(warp.colour(&image, 20, 15)[0] > 0.05);
         }
     }
 }

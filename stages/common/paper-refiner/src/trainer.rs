@@ -27,7 +27,7 @@ pub struct PaperTraining {
 }
 
 /// Trains a [`PaperRefiner`] on rendered views of references beside the references themselves: a patch of both, warped by one of 200 random
-/// perspectives, with reference patches that lie within a fixed window around it in the picture that isn't warped. Its error is
+/// perspectives, with reference patches that lie within a fixed window around it in the image that isn't warped. Its error is
 /// the mean absolute one, of -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
@@ -36,7 +36,7 @@ pub struct PaperTrainer {
     adam: Adam,
 }
 
-/// Perspectives of a picture, the one that changes nothing among them.
+/// Perspectives of an image, the one that changes nothing among them.
 const PERSPECTIVES: u64 = 200;
 /// Pixels that a reference patch lies away at most.
 const WINDOW: usize = 64;
@@ -104,7 +104,7 @@ impl Training for PaperTrainer {
     }
 }
 
-/// L1 of pictures in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
+/// L1 of images in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
 pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&PerceptualLoss>) -> Result<(Tensor, f64), TchError> {
     let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
     let error = first.f_double_value(&[])?;
@@ -117,7 +117,7 @@ struct TrainingPatch<'a> {
     warp: Perspective,
     patch: usize,
     corner: (usize, usize),
-    /// Corners in the picture that isn't warped.
+    /// Corners in the image that isn't warped.
     references: Vec<(usize, usize)>,
 }
 
@@ -173,7 +173,7 @@ impl PaperTraining {
 
 #[cfg(test)]
 mod tests {
-    use pixels::Picture;
+    use pixels::Image;
     use refinement::Rendered;
     use scene::{Camera, Intrinsics};
 
@@ -197,9 +197,9 @@ mod tests {
             },
             camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
-        let view = Picture::new(48, 40, 4, view);
+        let view = Image::new(48, 40, 4, view);
         let rendered = Rendered { camera, view, depth: vec![2.0; 48 * 40], opacity: vec![1.0; 48 * 40] };
-        KnownView { rendered, truth: Picture::new(48, 40, 3, truth) }
+        KnownView { rendered, truth: Image::new(48, 40, 3, truth) }
     }
 
     const OPTIONS: PaperTraining = PaperTraining { steps: 60, batch: 4, patch: 16, references: 2, rate: 3e-3, seed: 5 };

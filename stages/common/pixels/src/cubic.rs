@@ -1,7 +1,7 @@
-use crate::Picture;
+use crate::Image;
 
-/// What a picture of that size (columns, rows) shows at a position in pixels from its top left corner: cubic interpolation (Catmull and
-/// Rom 1974) of its pixels, whose centres lie at halves; beyond its border it goes on. Nothing is clamped.
+/// What an image of that size (columns, rows) shows at a position in pixels from its top left corner: cubic interpolation
+/// (Catmull and Rom 1974) of its pixels, whose centres lie at halves; beyond its border it goes on. Nothing is clamped.
 pub fn sample_cubic<const N: usize>(
     (width, height): (usize, usize),
     [x, y]: [f64; 2],
@@ -28,7 +28,7 @@ fn catmull_rom(t: f64) -> [f64; 4] {
     [0.5 * (-t3 + 2.0 * t2 - t), 0.5 * (3.0 * t3 - 5.0 * t2 + 2.0), 0.5 * (-3.0 * t3 + 4.0 * t2 + t), 0.5 * (t3 - t2)]
 }
 
-impl Picture {
+impl Image {
     /// The first three channels at a position in pixels from the top left corner, by [`sample_cubic`], clamped to [0, 1].
     ///
     /// # Panics
@@ -48,11 +48,11 @@ mod tests {
 
     #[test]
     fn pixels_are_met_and_lines_are_kept() {
-        let picture = Picture::new(8, 6, 3, (0..48).flat_map(|i| [(i % 8) as f32 / 8.0, (i / 8) as f32 / 8.0, 0.5]).collect());
-        assert_eq!(picture.colour_at([3.5, 2.5]), [3.0 / 8.0, 2.0 / 8.0, 0.5]);
-        let between = picture.colour_at([3.75, 2.9]);
+        let image = Image::new(8, 6, 3, (0..48).flat_map(|i| [(i % 8) as f32 / 8.0, (i / 8) as f32 / 8.0, 0.5]).collect());
+        assert_eq!(image.colour_at([3.5, 2.5]), [3.0 / 8.0, 2.0 / 8.0, 0.5]);
+        let between = image.colour_at([3.75, 2.9]);
         assert!((between[0] - 3.25 / 8.0).abs() < 1e-6 && (between[1] - 2.4 / 8.0).abs() < 1e-6, "{between:?}");
-        assert_eq!(picture.colour_at([-5.0, 99.0]), [0.0, 5.0 / 8.0, 0.5]);
-        assert!(picture.colour_at([f32::NAN, 1.0]).iter().all(|v| v.is_nan()));
+        assert_eq!(image.colour_at([-5.0, 99.0]), [0.0, 5.0 / 8.0, 0.5]);
+        assert!(image.colour_at([f32::NAN, 1.0]).iter().all(|v| v.is_nan()));
     }
 }

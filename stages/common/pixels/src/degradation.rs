@@ -3,7 +3,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::Filter;
 
-/// How LR pictures are made from HR ones.
+/// How LR images are made from HR ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kernel {
@@ -28,15 +28,15 @@ impl Kernel {
     }
 }
 
-/// Name of the file, beside the LR pictures, that says how they were made.
+/// Name of the file, beside the LR images, that says how they were made.
 pub const DEGRADATION_FILE: &str = "degradation.json";
 
-/// `degradation.json`: what made LR pictures of HR ones.
+/// `degradation.json`: what made LR images of HR ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Degradation {
     /// The kernel.
     pub kernel: Kernel,
-    /// Width and height of the HR pictures.
+    /// Width and height of the HR images.
     pub hr: [u32; 2],
 }

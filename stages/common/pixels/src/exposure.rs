@@ -1,6 +1,6 @@
-use crate::Picture;
+use crate::Image;
 
-/// How another exposure made a picture from what it should be, channel by channel: v ↦ gain · v + offset.
+/// How another exposure made an image from what it should be, channel by channel: v ↦ gain · v + offset.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
     /// Factors of red, green and blue.
@@ -13,17 +13,18 @@ pub struct Exposure {
 const CLIPPED: [f32; 2] = [0.02, 0.98];
 /// Fewer blocks say too little.
 const LEAST_BLOCKS: f64 = 12.0;
-/// Factors beyond these are no exposure: the pictures show different things.
+/// Factors beyond these are no exposure: the images show different things.
 const POSSIBLE: [f32; 2] = [0.1, 10.0];
 
 impl Exposure {
-    /// The exposure of a picture against another of its size that has the right one: the line through both by least squares, a channel at a time. Means of
-    /// square blocks of pixels are compared, of what is clipped in neither. None where too little is left, or no line fits.
+    /// The exposure of an image against another of its size that has the right one: the line through both by least squares, a
+    /// channel at a time. Means of square blocks of pixels are compared, of what is clipped in neither. None where too little
+    /// is left, or no line fits.
     ///
     /// # Panics
     /// With fewer than three channels, other sizes, or no pixels in a block.
-    pub fn between(right: &Picture, seen: &Picture, block: usize) -> Option<Self> {
-        assert_eq!((right.width, right.height), (seen.width, seen.height), "pictures of one size");
+    pub fn between(right: &Image, seen: &Image, block: usize) -> Option<Self> {
+        assert_eq!((right.width, right.height), (seen.width, seen.height), "images of one size");
         let mut exposure = Self { gain: [1.0; 3], offset: [0.0; 3] };
         for c in 0..3 {
             let (mut n, mut x, mut y, mut xx, mut xy) = (0.0f64, 0.0, 0.0, 0.0, 0.0);
@@ -48,9 +49,9 @@ impl Exposure {
         self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1) && self.offset.iter().all(|o| o.abs() <= 0.05)
     }
 
-    /// Gives a picture the right exposure: colours in 0..1, or from 0 to alpha where they are premultiplied.
-    pub fn take_back(&self, picture: &mut Picture) {
-        for pixel in picture.data.chunks_exact_mut(picture.channels) {
+    /// Gives an image the right exposure: colours in 0..1, or from 0 to alpha where they are premultiplied.
+    pub fn take_back(&self, image: &mut Image) {
+        for pixel in image.data.chunks_exact_mut(image.channels) {
             let alpha = if let [_, _, _, alpha] = pixel { *alpha } else { 1.0 };
             for (c, value) in pixel.iter_mut().take(3).enumerate() {
                 *value = ((*value - self.offset[c] * alpha) / self.gain[c]).clamp(0.0, alpha.max(0.0));
@@ -59,8 +60,8 @@ impl Exposure {
     }
 }
 
-/// Means of both pictures' channel over blocks, of those blocks of which at least half is clipped in neither.
-fn block_means(right: &Picture, seen: &Picture, channel: usize, block: usize) -> Vec<[f64; 2]> {
+/// Means of both images' channel over blocks, of those blocks of which at least half is clipped in neither.
+fn block_means(right: &Image, seen: &Image, channel: usize, block: usize) -> Vec<[f64; 2]> {
     let (width, height) = (seen.width, seen.height);
     let is_known = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
     let starts = |size: usize| (0..size).step_by(block);
@@ -68,7 +69,7 @@ fn block_means(right: &Picture, seen: &Picture, channel: usize, block: usize) ->
         let (mut n, mut sum) = (0usize, [0.0f64; 2]);
         for row in y..(y + block).min(height) {
             for column in x..(x + block).min(width) {
-                let pair = [right, seen].map(|picture| picture.data[(row * width + column) * picture.channels + channel]);
+                let pair = [right, seen].map(|image| image.data[(row * width + column) * image.channels + channel]);
                 if pair.into_iter().all(is_known) {
                     n += 1;
                     (0..2).for_each(|i| sum[i] += f64::from(pair[i]));

@@ -9,7 +9,7 @@ use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, Line
 use exr::meta::header::Header;
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
-use crate::{MAX_PIXELS, Picture, PixelError};
+use crate::{Image, MAX_PIXELS, PixelError};
 
 /// Precision of an EXR channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,10 +60,10 @@ impl ExrImage {
     }
 
     /// Channels R, G, B and A together, where it has them.
-    pub fn premultiplied(&self) -> Option<Picture> {
+    pub fn premultiplied(&self) -> Option<Image> {
         let [Some(r), Some(g), Some(b), Some(a)] = ["R", "G", "B", "A"].map(|name| self.channel(name)) else { return None };
         let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
-        Some(Picture::new(self.width, self.height, 4, data))
+        Some(Image::new(self.width, self.height, 4, data))
     }
 }
 

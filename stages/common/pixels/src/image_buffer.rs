@@ -22,7 +22,7 @@ impl Rgba8 {
 
 /// Floating-point samples, row by row, channels interleaved.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Picture {
+pub struct Image {
     /// Columns.
     pub width: usize,
     /// Rows.
@@ -33,13 +33,13 @@ pub struct Picture {
     pub data: Vec<f32>,
 }
 
-impl Picture {
+impl Image {
     /// Wraps samples.
     ///
     /// # Panics
     /// When there aren't `width · height · channels` of them.
     pub fn new(width: usize, height: usize, channels: usize, data: Vec<f32>) -> Self {
-        assert_eq!(data.len(), width * height * channels, "a picture has `channels` samples a pixel");
+        assert_eq!(data.len(), width * height * channels, "an image has `channels` samples a pixel");
         Self { width, height, channels, data }
     }
 
@@ -56,10 +56,10 @@ impl Picture {
     /// RGBA with premultiplied alpha over a grey level, in floating point as the paper does: rgb + (1-a)·background.
     ///
     /// # Panics
-    /// On a picture without alpha.
+    /// On an image without alpha.
     #[must_use]
     pub fn over(&self, background: f32) -> Self {
-        assert_eq!(self.channels, 4, "only a picture with alpha can lie over something");
+        assert_eq!(self.channels, 4, "only an image with alpha can lie over something");
         let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
         Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())
     }

@@ -1,14 +1,14 @@
 //! Image buffers and what happens to pixels on the way in and out.
 //!
-//! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Picture`]: floating-point samples, channels interleaved.
-//! * [`read_premultiplied`]: a view's picture, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
+//! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Image`]: floating-point samples, channels interleaved.
+//! * [`read_premultiplied`]: a view's image, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat;
 //!   [`VIEW_CHANNELS`]: what a rendered view's EXR has.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
-//! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR pictures.
-//! * [`Exposure`]: what another exposure made of a picture.
-//! * [`Mask`]: which pixels of a picture count.
-//! * [`sample_cubic`], [`Picture::colour_at`]: a picture between its pixels.
+//! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR images.
+//! * [`Exposure`]: what another exposure made of an image.
+//! * [`Mask`]: which pixels of an image count.
+//! * [`sample_cubic`], [`Image::colour_at`]: an image between its pixels.
 //! * [`psnr_of`]: a mean squared error in dB.
 //! * [`heat`]: a value in [0, 1] as a colour, for depth and error maps.
 //!
@@ -26,9 +26,9 @@ mod exposure;
 mod exr_file;
 mod heat;
 mod image_buffer;
+mod image_file;
 mod mask;
 mod operator;
-mod picture_file;
 mod pillow_resample;
 mod png_file;
 mod pool;
@@ -39,10 +39,10 @@ pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exposure::Exposure;
 pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr};
 pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
-pub use image_buffer::{Picture, Rgba8, psnr_of, to_u8};
+pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
+pub use image_file::read_premultiplied;
 pub use mask::Mask;
 pub use operator::{AxisTaps, Resampling};
-pub use picture_file::read_premultiplied;
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};
 pub use pool::average_pool;
@@ -50,7 +50,7 @@ pub use srgb::srgb_from_linear;
 
 use std::path::PathBuf;
 
-/// A picture that can't be read or written.
+/// An image that can't be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PixelError {
     /// The file is not there, or reading or writing failed.
@@ -61,18 +61,16 @@ pub enum PixelError {
         /// Why.
         source: std::io::Error,
     },
-    /// The file is no picture of the kind, is cut short or damaged.
-    #[error("{path}: {reason}; export the picture again")]
+    /// The file is no image of the kind, is cut short or damaged.
+    #[error("{path}: {reason}; export the image again")]
     Format {
         /// The file.
         path: PathBuf,
         /// What is wrong.
         reason: String,
     },
-    /// A picture that is larger than any that is read.
-    #[error(
-        "{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for example): make the picture smaller"
-    )]
+    /// An image that is larger than any that is read.
+    #[error("{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for example): make the image smaller")]
     TooLarge {
         /// The file.
         path: PathBuf,
@@ -97,5 +95,5 @@ pub enum PixelError {
     },
 }
 
-/// More pixels than any picture has; a header that says so is damaged or hostile.
+/// More pixels than any image has; a header that says so is damaged or hostile.
 pub const MAX_PIXELS: usize = 1 << 28;

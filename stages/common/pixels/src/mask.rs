@@ -1,8 +1,9 @@
 use std::path::Path;
 
-use crate::{Picture, PixelError, Rgba8, read_png};
+use crate::{Image, PixelError, Rgba8, read_png};
 
-/// Which pixels of a picture count, row by row; the others show what doesn't belong to the scene, people who walked by for example.
+/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene, people who walked by for
+/// example.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mask {
     /// Columns.
@@ -14,17 +15,17 @@ pub struct Mask {
 }
 
 impl Mask {
-    /// From a picture: what is dark or transparent there doesn't count.
+    /// From an image: what is dark or transparent there doesn't count.
     pub fn of(image: &Rgba8) -> Self {
         let is_bright = |p: &[u8]| p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128;
         Self { width: image.width, height: image.height, counts: image.data.chunks_exact(4).map(is_bright).collect() }
     }
 
-    /// Reads a PNG, see [`Mask::of`], for a picture of that size.
+    /// Reads a PNG, see [`Mask::of`], for an image of that size.
     pub fn read(path: &Path, (width, height): (usize, usize)) -> Result<Self, PixelError> {
         let image = read_png(path)?;
         if (image.width, image.height) != (width, height) {
-            let reason = format!("{}×{} pixels where its picture has {width}×{height}", image.width, image.height);
+            let reason = format!("{}×{} pixels where its image has {width}×{height}", image.width, image.height);
             return Err(PixelError::Format { path: path.to_path_buf(), reason });
         }
         Ok(Self::of(&image))
@@ -36,8 +37,8 @@ impl Mask {
         Rgba8::new(self.width, self.height, self.counts.iter().flat_map(pixel).collect())
     }
 
-    /// The mask of the picture at another size: a pixel counts where all that lies under it does, and under so many pixels around it, which
-    /// its kernel reads.
+    /// The mask of the image at another size: a pixel counts where all that lies under it does, and under so many pixels around
+    /// it, which its kernel reads.
     #[must_use]
     pub fn resized(&self, (width, height): (usize, usize), around: usize) -> Self {
         // Columns or rows under the pixels around one.
@@ -59,17 +60,17 @@ impl Mask {
         self.counts.iter().filter(|c| **c).count() as f64 / self.counts.len().max(1) as f64
     }
 
-    /// Gives a picture another's pixels where its own don't count, so that the two don't differ there.
+    /// Gives an image another's pixels where its own don't count, so that the two don't differ there.
     ///
     /// # Panics
     /// When the sizes differ.
-    pub fn fill(&self, picture: &mut Picture, other: &Picture) {
+    pub fn fill(&self, image: &mut Image, other: &Image) {
         let size = (self.width, self.height);
         assert!(
-            (picture.width, picture.height) == size && (other.width, other.height) == size,
-            "a mask and its pictures have one size"
+            (image.width, image.height) == size && (other.width, other.height) == size,
+            "a mask and its images have one size"
         );
-        let pixels = picture.data.chunks_exact_mut(picture.channels).zip(other.data.chunks_exact(other.channels));
+        let pixels = image.data.chunks_exact_mut(image.channels).zip(other.data.chunks_exact(other.channels));
         for ((to, from), counts) in pixels.zip(&self.counts) {
             if !counts {
                 to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
@@ -109,8 +110,8 @@ mod tests {
 
     #[test]
     fn what_does_not_count_is_filled() {
-        let mut picture = Picture::new(2, 1, 3, vec![0.1; 6]);
-        mask(2, &["#."]).fill(&mut picture, &Picture::new(2, 1, 4, vec![0.7; 8]));
-        assert_eq!(picture.data, [0.1, 0.1, 0.1, 0.7, 0.7, 0.7]);
+        let mut image = Image::new(2, 1, 3, vec![0.1; 6]);
+        mask(2, &["#."]).fill(&mut image, &Image::new(2, 1, 4, vec![0.7; 8]));
+        assert_eq!(image.data, [0.1, 0.1, 0.1, 0.7, 0.7, 0.7]);
     }
 }

@@ -1,4 +1,4 @@
-use crate::Picture;
+use crate::Image;
 use crate::pillow_resample::{Filter, coefficients};
 
 /// A resampling along one axis as a linear map in floats: output `i` is Σ weight·input over a run of inputs that starts at
@@ -106,7 +106,7 @@ impl AxisTaps {
 /// Keeps the pseudo-inverse bounded: what a kernel weakens to less than this share of power isn't asked for.
 const RIDGE: f64 = 0.02;
 
-/// A separable resampling of pictures as a linear operator: what [`resize_pillow`](crate::resize_pillow) does, without its
+/// A separable resampling of images as a linear operator: what [`resize_pillow`](crate::resize_pillow) does, without its
 /// rounding and clipping. `apply` and `adjoint` are each other's transpose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Resampling {
@@ -117,7 +117,7 @@ pub struct Resampling {
 }
 
 impl Resampling {
-    /// From pictures of one size (width, height) to another.
+    /// From images of one size (width, height) to another.
     ///
     /// # Panics
     /// When a side is 0.
@@ -130,15 +130,15 @@ impl Resampling {
         Self { x: self.x.inverse(reach), y: self.y.inverse(reach) }
     }
 
-    /// The resampled picture.
+    /// The resampled image.
     ///
     /// # Panics
-    /// When the picture hasn't the operator's input size.
-    pub fn apply(&self, picture: &Picture) -> Picture {
-        assert_eq!((picture.width, picture.height), (self.x.inputs, self.y.inputs), "the operator is for another size");
-        let (width, height, channels) = (self.x.outputs(), self.y.outputs(), picture.channels);
-        let mut narrow = vec![0.0; width * picture.height * channels];
-        for (row, out) in picture.data.chunks_exact(picture.width * channels).zip(narrow.chunks_exact_mut(width * channels)) {
+    /// When the image hasn't the operator's input size.
+    pub fn apply(&self, image: &Image) -> Image {
+        assert_eq!((image.width, image.height), (self.x.inputs, self.y.inputs), "the operator is for another size");
+        let (width, height, channels) = (self.x.outputs(), self.y.outputs(), image.channels);
+        let mut narrow = vec![0.0; width * image.height * channels];
+        for (row, out) in image.data.chunks_exact(image.width * channels).zip(narrow.chunks_exact_mut(width * channels)) {
             for (i, pixel) in out.chunks_exact_mut(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
                 for (from, w) in row[first * channels..].chunks_exact(channels).zip(weights) {
@@ -153,25 +153,25 @@ impl Resampling {
                 out.iter_mut().zip(row).for_each(|(sum, v)| *sum += w * v);
             }
         }
-        Picture::new(width, height, channels, data)
+        Image::new(width, height, channels, data)
     }
 
     /// The transpose: spreads each output sample over the inputs it was made from.
     ///
     /// # Panics
-    /// When the picture hasn't the operator's output size.
-    pub fn adjoint(&self, picture: &Picture) -> Picture {
-        assert_eq!((picture.width, picture.height), (self.x.outputs(), self.y.outputs()), "the operator is for another size");
-        let (width, height, channels) = (self.x.inputs, self.y.inputs, picture.channels);
-        let mut tall = vec![0.0; picture.width * height * channels];
-        for (j, row) in picture.data.chunks_exact(picture.width * channels).enumerate() {
+    /// When the image hasn't the operator's output size.
+    pub fn adjoint(&self, image: &Image) -> Image {
+        assert_eq!((image.width, image.height), (self.x.outputs(), self.y.outputs()), "the operator is for another size");
+        let (width, height, channels) = (self.x.inputs, self.y.inputs, image.channels);
+        let mut tall = vec![0.0; image.width * height * channels];
+        for (j, row) in image.data.chunks_exact(image.width * channels).enumerate() {
             let (first, weights) = self.y.run(j);
             for (out, w) in tall[first * row.len()..].chunks_exact_mut(row.len()).zip(weights) {
                 out.iter_mut().zip(row).for_each(|(sum, v)| *sum += w * v);
             }
         }
         let mut data = vec![0.0; width * height * channels];
-        for (row, out) in tall.chunks_exact(picture.width * channels).zip(data.chunks_exact_mut(width * channels)) {
+        for (row, out) in tall.chunks_exact(image.width * channels).zip(data.chunks_exact_mut(width * channels)) {
             for (i, pixel) in row.chunks_exact(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
                 for (to, w) in out[first * channels..].chunks_exact_mut(channels).zip(weights) {
@@ -179,7 +179,7 @@ impl Resampling {
                 }
             }
         }
-        Picture::new(width, height, channels, data)
+        Image::new(width, height, channels, data)
     }
 }
 
@@ -190,13 +190,13 @@ mod tests {
     use super::*;
     use crate::{Rgba8, resize_pillow};
 
-    fn picture(width: usize, height: usize, seed: u64) -> Picture {
+    fn image(width: usize, height: usize, seed: u64) -> Image {
         let mut x = seed;
         let data = (0..width * height * 3).map(|_| {
             x = x.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             (x >> 40) as f32 / (1 << 24) as f32
         });
-        Picture::new(width, height, 3, data.collect())
+        Image::new(width, height, 3, data.collect())
     }
 
     /// K·(s·Pᵀ) is the identity but for the ridge, for every filter that blurs no more than it must; and a flat residual asks the
@@ -204,15 +204,15 @@ mod tests {
     #[test]
     fn inverse_undoes_the_map() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
-            for (fine, coarse) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
-                let map = AxisTaps::new(filter, fine, coarse);
+            for (hr, lr) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
+                let map = AxisTaps::new(filter, hr, lr);
                 let inverse = map.inverse(40);
-                let scale = fine as f32 / coarse as f32;
-                for a in 0..coarse {
-                    for b in 0..coarse {
-                        let entry: f32 = (0..fine).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
+                let scale = hr as f32 / lr as f32;
+                for a in 0..lr {
+                    for b in 0..lr {
+                        let entry: f32 = (0..hr).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
                         let expected = f32::from(u8::from(a == b));
-                        assert!((entry - expected).abs() < 0.06, "{filter:?} {fine} → {coarse}: {a} {b} {entry}");
+                        assert!((entry - expected).abs() < 0.06, "{filter:?} {hr} → {lr}: {a} {b} {entry}");
                     }
                 }
             }
@@ -232,24 +232,24 @@ mod tests {
             filter in prop::sample::select(vec![Filter::Box, Filter::Bicubic, Filter::Lanczos]),
         ) {
             let operator = Resampling::new(filter, (w, h), (v, u));
-            let (x, y) = (picture(w, h, seed), picture(v, u, !seed));
-            let dot = |a: &Picture, b: &Picture| a.data.iter().zip(&b.data).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>();
+            let (x, y) = (image(w, h, seed), image(v, u, !seed));
+            let dot = |a: &Image, b: &Image| a.data.iter().zip(&b.data).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>();
             let (left, right) = (dot(&operator.apply(&x), &y), dot(&x, &operator.adjoint(&y)));
             prop_assert!((left - right).abs() < 1e-4 * left.abs().max(1.0), "{left} {right}");
         }
     }
 
-    /// The operator is what made the LR pictures: only Pillow's rounding lies between.
+    /// The operator is what made the LR images: only Pillow's rounding lies between.
     #[test]
     fn agrees_with_the_bytes_that_pillow_makes() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
             for (width, height) in [(20, 15), (27, 11), (13, 30), (40, 45)] {
-                let mut image = picture(40, 30, 7).to_rgba8();
+                let mut image = image(40, 30, 7).to_rgba8();
                 // Away from black and white nothing is clipped.
                 image.data.chunks_exact_mut(4).for_each(|p| p[..3].iter_mut().for_each(|c| *c = 64 + *c / 2));
                 let bytes: Rgba8 = resize_pillow(&image, width, height, filter);
                 let operator = Resampling::new(filter, (40, 30), (width, height));
-                let floats = operator.apply(&Picture::premultiplied(&image).over(1.0));
+                let floats = operator.apply(&Image::premultiplied(&image).over(1.0));
                 for (p, q) in bytes.data.chunks_exact(4).zip(floats.data.chunks_exact(3)) {
                     // Two passes, each rounded to half a level.
                     (0..3).for_each(|c| assert!((f32::from(p[c]) / 255.0 - q[c]).abs() < 1.3 / 255.0, "{filter:?} {p:?} {q:?}"));

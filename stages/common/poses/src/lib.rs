@@ -2,43 +2,44 @@
 //!
 //! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
 //! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
-//! * [`Moved`]: how far cameras have gone, in words for a log; [`disagreement`]: whether that was for the better.
+//! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that was for the better.
 //! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
 //!
-//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the picture, and the rendered depth how
-//! that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a step takes one rendering
-//! of some thousand pixels, and any field will do that renders colour and depth: nothing is differentiated but photographs.
+//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the image, and the rendered
+//! depth how that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a
+//! step takes one rendering of some thousand pixels, and any field will do that renders colour and depth: nothing is
+//! differentiated but photographs.
 //!
 //! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up, looking along -z).
 //!
 //! ```
 //! use poses::{Pyramid, Refinement, refine};
-//! use pixels::Picture;
+//! use pixels::Image;
 //! use radiance::{Architecture, Field};
 //! use scene::{Bounds, Camera, Intrinsics};
 //! let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Default::default() };
 //! let field = Field::new(Architecture::default(), bounds, 7);
 //! let intrinsics = Intrinsics::from_angle_x(16, 16, 0.69);
 //! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
-//! let photograph = Picture::new(16, 16, 3, vec![0.5; 16 * 16 * 3]);
+//! let photograph = Image::new(16, 16, 3, vec![0.5; 16 * 16 * 3]);
 //! let pyramid = Pyramid::new(&photograph, 2);
 //! let Refinement { camera: found, before, after, .. } = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
 //! // A grey wall says nothing of where it was seen from.
 //! assert!(found == camera && before == after);
 //! ```
 
-mod agreement;
+mod photometric;
 
 use std::error::Error;
 use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix6, Vector6};
-use pixels::{Filter, Picture, Resampling};
+use pixels::{Filter, Image, Resampling};
 use radiance::{Ray, RayField};
 use scene::Camera;
 
-pub use agreement::{Shot, disagreement};
+pub use photometric::{Shot, photometric_error};
 
 /// A photograph at several sizes.
 #[derive(Clone, Debug)]
@@ -73,12 +74,12 @@ const LEAST: usize = 24;
 const STEEP: f32 = 3.0 / 255.0;
 
 impl Pyramid {
-    /// Of an RGB picture over its background; NaN where nothing is known. Each level has half the width of the one before it; there are at most
-    /// `smaller` below the picture itself.
+    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the width of the one before it;
+    /// there are at most `smaller` below the image itself.
     ///
     /// # Panics
-    /// When the picture has other than three channels.
-    pub fn new(photograph: &Picture, smaller: u32) -> Self {
+    /// When the image has other than three channels.
+    pub fn new(photograph: &Image, smaller: u32) -> Self {
         assert_eq!(photograph.channels, 3, "a photograph over its background");
         let size = |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
         let is_large = |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= SMALLEST);
@@ -90,16 +91,16 @@ impl Pyramid {
         Self { levels: (0..=smaller).take_while(is_large).map(level).collect() }
     }
 
-    /// How many levels lie below the picture itself.
+    /// How many levels lie below the image itself.
     pub fn smaller(&self) -> u32 {
         self.levels.len() as u32 - 1
     }
 }
 
 impl PyramidLevel {
-    fn new(picture: &Picture) -> Self {
-        let (width, height) = (picture.width, picture.height);
-        let colour = |x: usize, y: usize| [0, 1, 2].map(|c| picture.data[(y * width + x) * 3 + c]);
+    fn new(image: &Image) -> Self {
+        let (width, height) = (image.width, image.height);
+        let colour = |x: usize, y: usize| [0, 1, 2].map(|c| image.data[(y * width + x) * 3 + c]);
         let inner = |n: usize| 1..n.saturating_sub(1);
         let telling = |(x, y): (usize, usize)| {
             let [left, right, up, down] = [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
@@ -250,7 +251,7 @@ impl Equations {
     }
 }
 
-/// The ray through a position in the picture, exact and as fields take it.
+/// The ray through a position in the image, exact and as fields take it.
 fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::CameraRay, Ray) {
     let ray = camera.ray(x, y);
     let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());

@@ -47,7 +47,7 @@ fn camera(i: usize) -> Camera {
     placed(&bare, rotation, DVec3::new(0.5 * angle.sin(), 0.4 * angle.cos(), 4.0))
 }
 
-fn photograph(camera: &Camera) -> Picture {
+fn photograph(camera: &Camera) -> Image {
     let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
     // A pixel is the mean of what it covers.
     let rays: Vec<Ray> = (0..9 * width * height)
@@ -60,7 +60,7 @@ fn photograph(camera: &Camera) -> Picture {
         .collect();
     let subs = BallAndWall.render(&rays).unwrap();
     let mean = |of: &[Pixel]| [0, 1, 2].map(|c| of.iter().map(|p| p.colour[c]).sum::<f32>() / 9.0);
-    Picture::new(width, height, 3, subs.chunks_exact(9).flat_map(mean).collect())
+    Image::new(width, height, 3, subs.chunks_exact(9).flat_map(mean).collect())
 }
 
 /// Mean distance in pixels at which two cameras see the same places.
@@ -133,7 +133,7 @@ fn moved_cameras_come_back() {
     }
 }
 
-/// What says nothing moves nothing: grey walls, unknown pixels, a field of fog, numbers that aren't.
+/// What says nothing moves nothing: grey walls, unknown pixels, a semi-transparent field, numbers that aren't.
 #[test]
 fn what_says_nothing_moves_nothing() {
     struct Everywhere(Pixel);
@@ -144,17 +144,17 @@ fn what_says_nothing_moves_nothing() {
     }
     let camera = camera(1);
     let whole = photograph(&camera);
-    let grey = Picture { data: vec![0.5; whole.data.len()], ..whole.clone() };
-    let unknown = Picture { data: vec![f32::NAN; whole.data.len()], ..whole.clone() };
-    let one_row = Picture::new(64, 1, 3, vec![0.3; 192]);
+    let grey = Image { data: vec![0.5; whole.data.len()], ..whole.clone() };
+    let unknown = Image { data: vec![f32::NAN; whole.data.len()], ..whole.clone() };
+    let one_row = Image::new(64, 1, 3, vec![0.3; 192]);
     let nothing = Pixel { median_depth: f32::INFINITY, ..Pixel::default() };
     let wrong = Pixel { colour: [f32::NAN; 3], opacity: 1.0, median_depth: 3.0, ..Pixel::default() };
-    for picture in [&grey, &unknown, &one_row, &whole] {
-        let pyramid = Pyramid::new(picture, 2);
+    for image in [&grey, &unknown, &one_row, &whole] {
+        let pyramid = Pyramid::new(image, 2);
         for field in [&Everywhere(nothing) as &dyn RayField, &Everywhere(wrong)] {
             assert_eq!(refine(field, &camera, &pyramid, 1, &Options::default()).unwrap().camera, camera);
         }
-        if !std::ptr::eq(picture, &raw const whole) {
+        if !std::ptr::eq(image, &raw const whole) {
             assert_eq!(refine(&BallAndWall, &camera, &pyramid, 7, &Options::default()).unwrap().camera, camera);
         }
     }
@@ -199,11 +199,12 @@ fn common_motion_is_taken_back() {
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
 }
 
-/// By the true surfaces photographs agree from where they were taken, and not from beside; exposures that are known are no difference.
+/// By the true surfaces the photometric error is small from where photographs were taken, and not from beside; exposures that
+/// are known are no difference.
 #[test]
-fn photographs_agree_from_where_they_were_taken() {
+fn photometric_error_is_least_from_where_photographs_were_taken() {
     let cameras: Vec<Camera> = (0..6).map(camera).collect();
-    let mut photographs: Vec<Picture> = cameras.iter().map(photograph).collect();
+    let mut photographs: Vec<Image> = cameras.iter().map(photograph).collect();
     photographs[2].data.iter_mut().for_each(|v| *v *= 0.5);
     photographs[3].data[..64 * 3].fill(f32::NAN);
     let exposure = |i: usize| if i == 2 { [2.0; 3] } else { [1.0; 3] };
@@ -211,7 +212,7 @@ fn photographs_agree_from_where_they_were_taken() {
         let shots = cameras.iter().zip(&photographs).enumerate();
         let shots: Vec<Shot> =
             shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
-        disagreement(&BallAndWall, &shots, 1.0).unwrap()
+        photometric_error(&BallAndWall, &shots, 1.0).unwrap()
     };
     let right = judged(&cameras, &exposure).unwrap();
     assert!(right < 3e-4, "{right}");
@@ -221,6 +222,6 @@ fn photographs_agree_from_where_they_were_taken() {
     let wrong = judged(&off, &exposure).unwrap();
     assert!(wrong > 5.0 * right, "{wrong} {right}");
     assert!(judged(&cameras, &|_| [1.0; 3]).unwrap() > 5.0 * right);
-    // One alone has nobody to agree with.
+    // One alone has none to be compared with.
     assert_eq!(judged(&cameras[..1], &exposure), None);
 }

@@ -289,8 +289,8 @@ impl Chunk {
         }
     }
 
-    /// Goes back from each ray's colour gradient, and from the distortion and haze losses times their factors: adds to the networks' partial sums
-    /// (`lanes`) and appends to `into`. `transposed` are the weights output by output.
+    /// Goes back from each ray's colour gradient, and from the distortion and floater losses times their factors: adds to the
+    /// networks' partial sums (`lanes`) and appends to `into`. `transposed` are the weights output by output.
     #[allow(clippy::too_many_arguments, reason = "what a pass reads and where it adds; a struct of them would have one use")]
     pub(crate) fn backward(
         &mut self,
@@ -338,11 +338,11 @@ impl Chunk {
             let seen_behind: f32 = (0..3).map(|c| g[c] * background[c]).sum();
             let behind = self.sums[r].transmittance * seen_behind;
             let len = places.len();
-            let haze = regularisers.haze * self.sums[r].transmittance;
-            if haze > 0.0 {
+            let floater = regularisers.floater_loss * self.sums[r].transmittance;
+            if floater > 0.0 {
                 for (shade, &k) in shade.iter_mut().zip(places) {
                     let colour = std::array::from_fn(|c| self.colour[c * m + k as usize]);
-                    *shade = haze.mul_add(likeness(colour, background), *shade);
+                    *shade = floater.mul_add(likeness(colour, background), *shade);
                 }
             }
             if regularisers.distortion > 0.0 {

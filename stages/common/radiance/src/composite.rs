@@ -42,16 +42,17 @@ pub(crate) fn optical_depth_gradients(shade: &[f32], transmittance: &[f32], weig
 pub(crate) struct Regularisers {
     /// Of the distortion loss.
     pub(crate) distortion: f32,
-    /// Of the haze loss: T·Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which would make haze darker instead of thinner, or by the ray's
-    /// transmittance T. What stops a ray is paint of the background's colour, not haze: it would become thin and darker, and look the same.
-    pub(crate) haze: f32,
+    /// Of the floater loss: T·Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which would make floaters darker
+    /// instead of thinner, or by the ray's transmittance T. What stops a ray is paint of the background's colour, no floater:
+    /// it would become thin and darker, and look the same.
+    pub(crate) floater_loss: f32,
 }
 
 /// How far apart colours at most are for matter to pass for the background.
 pub const LIKE_BACKGROUND: f32 = 0.1;
 
-/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether it is there no picture
-/// tells that sees it before the background alone.
+/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether
+/// it is there no image tells that sees it before the background alone.
 pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
     let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();
     (1.0 - squared / (LIKE_BACKGROUND * LIKE_BACKGROUND)).max(0.0)

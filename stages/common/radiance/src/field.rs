@@ -173,7 +173,7 @@ pub enum FieldError {
 pub(crate) const CHUNK_RAYS: usize = 64;
 
 impl Field {
-    /// A field before training: faint fog, drawn from a seed.
+    /// A field before training: faint density, drawn from a seed.
     pub fn new(architecture: Architecture, bounds: Bounds, seed: u64) -> Self {
         let mut field = Self::empty(architecture, bounds);
         for (i, value) in field.grid.iter_mut().enumerate() {
@@ -265,8 +265,9 @@ impl Field {
         own.zip(other.grid.iter().chain(&other.network)).for_each(|(own, other)| *own = 0.5 * (*own + other));
     }
 
-    /// Keeps a training that goes on from this field to the cells that may hold something, and those around them. Elsewhere no picture says anything, or that
-    /// there is nothing: opened again, it would fill with what is as bright as the background, which pictures taken before it don't show.
+    /// Keeps a training that goes on from this field to the cells that may hold something, and those around them. Elsewhere no
+    /// image says anything, or that there is nothing: opened again, it would fill with what is as bright as the background,
+    /// which images taken before it don't show.
     pub fn limit_to_occupied(&mut self) {
         self.occupancy.limit_to_occupied();
     }

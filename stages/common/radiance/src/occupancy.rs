@@ -128,7 +128,7 @@ impl Occupancy {
         }
         let possible = self.hull.as_ref().map_or(CELLS, |h| h.iter().filter(|k| **k).count()).max(1);
         let mean = (self.density.iter().map(|&d| f64::from(d)).sum::<f64>() / possible as f64) as f32;
-        // A hundredth of a step's light is worth a sample; while all is fog, only what is denser than the mean.
+        // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what is denser than the mean.
         let threshold = mean.min(0.01 / step);
         let allowed = |cell: usize| self.hull.as_ref().is_none_or(|h| h[cell]);
         let occupied: Vec<bool> = self.density.iter().enumerate().map(|(i, &d)| d >= threshold && allowed(i)).collect();

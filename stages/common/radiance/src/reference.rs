@@ -100,7 +100,7 @@ fn example() -> (Field, Vec<Ray>) {
     let mut field =
         Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() }, 3);
     let mut rng = CounterRng::new(8, 8, 8);
-    // Features of the size that training reaches, and fog thick enough that every sample counts.
+    // Features of the size that training reaches, and density high enough that every sample counts.
     field.grid.iter_mut().for_each(|g| *g = rng.uniform() - 0.5);
     let rays = (0..20)
         .map(|_| {
@@ -144,9 +144,9 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and haze, where neither likeness to the background nor what comes through
-    // to it is learnt from.
-    let regularisers = Regularisers { haze: 0.3, ..Regularisers::default() };
+    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater loss, where neither likeness
+    // to the background nor what comes through to it is learnt from.
+    let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
             let (shaded, through) = judge.shaded(&rays[i], &samples[i], &kept[i]);
@@ -162,9 +162,10 @@ fn fused_passes_equal_the_plain_ones() {
     let loss = |judge: &Judge<'_>| -> f64 {
         let dot = |i: usize| -> f64 {
             let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);
-            let haze: f64 = shaded.iter().zip(&likenesses[i]).map(|((weight, _), likeness)| weight * likeness).sum();
+            let floaters: f64 = shaded.iter().zip(&likenesses[i]).map(|((weight, _), likeness)| weight * likeness).sum();
             let colour = judge.ray(&rays[i], &samples[i], &kept[i]);
-            colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>() + f64::from(regularisers.haze) * haze
+            colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
+                + f64::from(regularisers.floater_loss) * floaters
         };
         (0..rays.len()).map(dot).sum()
     };
@@ -267,7 +268,7 @@ fn every_family_renders_and_trains_to_equal_bits() {
         let mut lanes = vec![0.0; field.network.len() * LANES];
         let mut features = FeatureGradients::default();
         let backgrounds = vec![[0.5; 3]; rays.len()];
-        let regularisers = Regularisers { distortion: 0.2, haze: 0.3 };
+        let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
         chunk.backward(
             &field,
             &field.network,

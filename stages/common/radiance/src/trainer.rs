@@ -38,25 +38,25 @@ pub struct TrainingOptions {
     /// Rays in all.
     pub rays: u64,
     /// Most rays in a step.
-    pub batch: usize,
-    /// Samples a step aims at; while space is still full of fog, steps have fewer rays.
-    pub samples: usize,
+    pub max_rays_per_step: usize,
+    /// Samples that a step aims at; while space is full of semi-transparent density, steps have fewer rays.
+    pub samples_per_step: usize,
     /// Learning rate of the grid's coarsest level at its highest.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Learning rate of a level over that of the next coarser one.
     pub level_rate: f64,
-    /// Learning rate of the networks at its highest.
-    pub network_rate: f64,
+    /// Learning rate of the MLPs at its highest.
+    pub mlp_learning_rate: f64,
     /// Learning rate at the end, as a share of the highest.
-    pub final_rate: f64,
+    pub learning_rate_decay: f64,
     /// Steps of linear warm-up.
     pub warm_up: u64,
-    /// Share of the weights' running average that is kept at each of its steps; 0 for no average.
-    pub averaging: f32,
+    /// Share that the weights' exponential moving average keeps at each of its steps; 0 for no average.
+    pub ema_decay: f32,
     /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision gives.
     pub distortion: f32,
-    /// Weight of the haze loss, the mean over all rays: opacity that has the background's colour.
-    pub haze: f32,
+    /// Weight of the floater loss, the mean over all rays: opacity that has the background's colour.
+    pub floater_loss: f32,
     /// Weight decay of the networks.
     pub network_decay: f32,
     /// Seed of everything that is drawn.
@@ -66,14 +66,14 @@ pub struct TrainingOptions {
 impl TrainingOptions {
     /// Rays in a step, where a ray had so many samples in the one before.
     pub fn rays_of_step(&self, samples_per_ray: f64) -> usize {
-        let wanted = (self.samples as f64 / samples_per_ray.max(0.1)) as usize;
-        wanted.clamp(256, self.batch.max(256))
+        let wanted = (self.samples_per_step as f64 / samples_per_ray.max(0.1)) as usize;
+        wanted.clamp(256, self.max_rays_per_step.max(256))
     }
 
     /// What learning rates are multiplied with in a step: they rise at first, and fall exponentially.
     pub fn schedule(&self, tally: &Tally) -> f64 {
         let warm = ((tally.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
-        tally.rate_scale * warm * self.final_rate.powf(tally.done(self.rays))
+        tally.rate_scale * warm * self.learning_rate_decay.powf(tally.done(self.rays))
     }
 
     /// Share of a step by which the samples of a ray are shifted, by its number in the training.
@@ -83,12 +83,12 @@ impl TrainingOptions {
 
     /// Learning rate of a level, for a schedule.
     pub fn rate_of_level(&self, level: usize, schedule: f64) -> f64 {
-        self.rate * schedule * self.level_rate.powi(level as i32)
+        self.learning_rate * schedule * self.level_rate.powi(level as i32)
     }
 
     /// Whether weights go into their average now.
     pub fn averages(&self, tally: &Tally) -> bool {
-        self.averaging > 0.0 && tally.done(self.rays) > AVERAGE_FROM && tally.steps.is_multiple_of(AVERAGE_EVERY)
+        self.ema_decay > 0.0 && tally.done(self.rays) > AVERAGE_FROM && tally.steps.is_multiple_of(AVERAGE_EVERY)
     }
 }
 
@@ -285,7 +285,7 @@ impl Trainer {
     fn apply(&mut self) {
         let options = &self.options;
         let (schedule, step) = (options.schedule(&self.tally), self.tally.steps + 1);
-        let network_step = AdamStep::new(step, options.network_rate * schedule, options.network_decay);
+        let network_step = AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
         // All of a network is touched, always.
         self.touched_network.fill(1);
         adam(
@@ -329,7 +329,7 @@ impl Trainer {
         }
         let field = &self.field;
         let average = self.average.get_or_insert_with(|| Moments { grid: field.grid.clone(), network: field.network.clone() });
-        let new = 1.0 - self.options.averaging;
+        let new = 1.0 - self.options.ema_decay;
         let pairs = [(&mut average.grid, &field.grid), (&mut average.network, &field.network)];
         for (average, now) in pairs {
             average.par_iter_mut().with_min_len(1 << 16).zip(now).for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
@@ -456,7 +456,7 @@ impl Shard {
         let chunk_bundles = (CHUNK_RAYS / bundle).max(1);
         let scale = 1.0 / bundles as f32;
         let of_ray = |weight: f32| weight * scale / bundle as f32;
-        let regularisers = Regularisers { distortion: of_ray(options.distortion), haze: of_ray(options.haze) };
+        let regularisers = Regularisers { distortion: of_ray(options.distortion), floater_loss: of_ray(options.floater_loss) };
         let mut next = range.start;
         while next < range.end {
             let here = next..(next + chunk_bundles).min(range.end);
@@ -533,25 +533,25 @@ mod tests {
         }
     }
 
-    /// A white cloud before white is as good as nothing to the pictures, and stays; by the haze loss it goes.
+    /// A white floater before white is as good as nothing to the images, and stays; by the floater loss it goes.
     #[test]
     fn what_passes_for_the_background_goes() {
         let architecture =
             Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
         let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
-        let trained = |field: Field, background: f32, haze: f32| {
+        let trained = |field: Field, background: f32, floater_loss: f32| {
             let options = TrainingOptions {
                 rays: 80 * 256,
-                batch: 256,
-                samples: 1 << 20,
-                rate: 1e-2,
+                max_rays_per_step: 256,
+                samples_per_step: 1 << 20,
+                learning_rate: 1e-2,
                 level_rate: 0.8,
-                network_rate: 1e-2,
-                final_rate: 0.25,
+                mlp_learning_rate: 1e-2,
+                learning_rate_decay: 0.25,
                 warm_up: 5,
-                averaging: 0.0,
+                ema_decay: 0.0,
                 distortion: 0.0,
-                haze,
+                floater_loss,
                 network_decay: 0.0,
                 seed: 9,
             };
@@ -563,9 +563,9 @@ mod tests {
             let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
             (field, opacity)
         };
-        let (cloud, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0);
-        let ((_, without), (_, with)) = (trained(cloud.clone(), 1.0, 0.0), trained(cloud, 1.0, 1e-3));
-        println!("opacity {opacity} before black, then before white {without}, with the haze loss {with}");
+        let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0);
+        let ((_, without), (_, with)) = (trained(floater.clone(), 1.0, 0.0), trained(floater, 1.0, 1e-3));
+        println!("opacity {opacity} before black, then before white {without}, with the floater loss {with}");
         assert!(opacity > 0.5 && without > 0.5 * opacity && with < 0.1 * without);
     }
 }

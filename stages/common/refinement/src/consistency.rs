@@ -1,5 +1,5 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{DEGRADATION_FILE, Degradation, Filter, Picture, Resampling};
+use pixels::{DEGRADATION_FILE, Degradation, Filter, Image, Resampling};
 use scene::{Camera, Photograph, Views};
 
 use crate::Rendered;
@@ -11,7 +11,7 @@ pub struct LrObservations<'a> {
     filter: Filter,
 }
 
-/// LR pixels that the nearest picture looks at on each side.
+/// LR pixels that the nearest image looks at on each side.
 const REACH: usize = 12;
 
 impl<'a> LrObservations<'a> {
@@ -31,7 +31,7 @@ impl<'a> LrObservations<'a> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
         let photograph = view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
-        let is_smaller = |p: &Photograph| p.picture.width <= k.width as usize && p.picture.height <= k.height as usize;
+        let is_smaller = |p: &Photograph| p.image.width <= k.width as usize && p.image.height <= k.height as usize;
         Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
     }
 
@@ -42,9 +42,10 @@ impl<'a> LrObservations<'a> {
         Ok(rendered.with_colours(&colours))
     }
 
-    /// The picture nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1]. Where the
-    /// photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask leaves it out.
-    pub fn project(&self, refined: &Picture, Photograph { picture: photograph, mask }: &Photograph) -> Picture {
+    /// The image nearest to `refined` that the kernel makes `photograph` of: refined + K⁺(photograph - K·refined), in [0, 1].
+    /// Where the photograph was clipped to black or white and the prediction lies beyond, it says nothing, nor where its mask
+    /// leaves it out.
+    pub fn project(&self, refined: &Image, Photograph { image: photograph, mask }: &Photograph) -> Image {
         let kernel = Resampling::new(self.filter, (refined.width, refined.height), (photograph.width, photograph.height));
         let mut residual = kernel.apply(refined);
         for (r, &y) in residual.data.iter_mut().zip(&photograph.data) {
@@ -52,7 +53,7 @@ impl<'a> LrObservations<'a> {
             *r = if clipped { 0.0 } else { y - *r };
         }
         if let Some(mask) = mask {
-            let none = Picture { data: vec![0.0; residual.data.len()], ..residual.clone() };
+            let none = Image { data: vec![0.0; residual.data.len()], ..residual.clone() };
             mask.fill(&mut residual, &none);
         }
         let share = (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
@@ -77,21 +78,21 @@ mod tests {
                 0.5 + 0.3 * ((i % hr_width * (c + 3)) as f32 * 0.08).sin() * ((i / hr_width) as f32 * 0.21).cos()
             };
             let data = (0..hr_size.0 * hr_size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
-            let truth = Picture::new(hr_size.0, hr_size.1, 3, data);
+            let truth = Image::new(hr_size.0, hr_size.1, 3, data);
             let kernel = Resampling::new(filter, hr_size, lr_size);
             let lr = Photograph::from(kernel.apply(&truth));
             let views = Views::new(scene::Background::White, scene::Bounds::default(), Vec::new());
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
             let observations = LrObservations { input: &input, views, filter };
-            let error = |a: &Picture, b: &Picture| {
+            let error = |a: &Image, b: &Image| {
                 let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
                 (squares.sum::<f64>() / a.data.len() as f64).sqrt()
             };
             assert!(error(&observations.project(&truth, &lr), &truth) < 1e-5, "{filter:?}");
-            let softer = Picture { data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(), ..truth.clone() };
+            let softer = Image { data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(), ..truth.clone() };
             let projected = observations.project(&softer, &lr);
-            let (off, was) = (error(&kernel.apply(&projected), &lr.picture), error(&kernel.apply(&softer), &lr.picture));
+            let (off, was) = (error(&kernel.apply(&projected), &lr.image), error(&kernel.apply(&softer), &lr.image));
             assert!(off < 0.1 * was, "{filter:?}: {off} of {was} is left");
             let (off, was) = (error(&projected, &truth), error(&softer, &truth));
             assert!(off < 0.9 * was, "{filter:?}: {off} of {was} is left");

@@ -1,11 +1,11 @@
-use pixels::Picture;
+use pixels::Image;
 use tch::{TchError, Tensor};
 
 /// Pixels along each side of a fold: the network sees 2×2 pixels as one of four times as many channels, which widens what it sees
 /// around a pixel at the same cost.
 pub(crate) const FOLD: usize = 2;
 
-/// Where a square of a picture lies, in pixels; it may reach over the border, which goes on.
+/// Where a square of an image lies, in pixels; it may reach over the border, which goes on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Square {
     pub(crate) x: isize,
@@ -32,12 +32,12 @@ impl Square {
         }
     }
 
-    /// A picture's samples at a place in the square; beyond the border, those at the border.
-    pub(crate) fn of(self, picture: &Picture, column: usize, row: usize) -> &[f32] {
+    /// An image's samples at a place in the square; beyond the border, those at the border.
+    pub(crate) fn of(self, image: &Image, column: usize, row: usize) -> &[f32] {
         let clamped = |start: isize, by: usize, size: usize| (start + by as isize).clamp(0, size as isize - 1) as usize;
-        let (column, row) = (clamped(self.x, column, picture.width), clamped(self.y, row, picture.height));
-        let at = row * picture.width + column;
-        &picture.data[at * picture.channels..(at + 1) * picture.channels]
+        let (column, row) = (clamped(self.x, column, image.width), clamped(self.y, row, image.height));
+        let at = row * image.width + column;
+        &image.data[at * image.channels..(at + 1) * image.channels]
     }
 
     /// Takes folded samples apart again: calls with column, row (in the square) and a pixel's samples.
@@ -106,16 +106,16 @@ mod tests {
 
     #[test]
     fn what_is_folded_unfolds() {
-        let picture = Picture::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
+        let image = Image::new(7, 5, 3, (0..105).map(|v| v as f32).collect());
         let square = Square { x: -2, y: 1, size: (6, 4) };
         let mut folded = Vec::new();
-        square.fold(|x, y| folded.extend_from_slice(square.of(&picture, x, y)));
+        square.fold(|x, y| folded.extend_from_slice(square.of(&image, x, y)));
         let again = samples(&square.tensor(&folded, 3).unwrap()).unwrap();
         assert_eq!(again, folded);
         let mut count = 0;
         square.unfold(&again, 3, |x, y, pixel| {
             let (column, row) = ((x as isize - 2).clamp(0, 6) as usize, (y + 1).min(4));
-            assert_eq!(pixel, &picture.data[(row * 7 + column) * 3..][..3]);
+            assert_eq!(pixel, &image.data[(row * 7 + column) * 3..][..3]);
             count += 1;
         });
         assert_eq!(count, 24);

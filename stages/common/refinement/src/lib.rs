@@ -1,13 +1,13 @@
 //! Refinement of rendered views: a small network that gives them the detail they systematically lack.
 //!
-//! A field that was trained from LR pictures renders edges softer than they are, and the same way everywhere in a scene. The network sees a
-//! rendered view and predicts what to add. It learns that one size down, where the truth is known: a field trained from LR pictures that
-//! were shrunk once more renders views of LR size, whose truth the LR pictures are.
+//! A field that was trained from LR images renders edges softer than they are, and the same way everywhere in a scene. The
+//! network sees a rendered view and predicts what to add. It learns that one size down, where the truth is known: a field
+//! trained from LR images that were shrunk once more renders views of LR size, whose truth the LR images are.
 //!
-//! Where true pictures of some views are known at HR, references, a reference-based network sees what they show of each pixel,
+//! Where true images of some views are known at HR, references, a reference-based network sees what they show of each pixel,
 //! too. The field's depth says where they show it, and whether they see it at all.
 //!
-//! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true picture, an example or a reference.
+//! * [`Rendered`]: a view as a field rendered it; [`KnownView`]: the same with its true image, an example or a reference.
 //! * [`Refiner`]: the network; [`Refiner::refine`] refines a view, tile by tile.
 //! * [`with_references`]: a view as a reference-based network takes it; [`Guidance`] says how references are looked at.
 //! * [`LrObservations`]: LR images that views are made consistent with (data consistency).
@@ -20,11 +20,11 @@
 //! depend on the number of threads.
 //!
 //! ```
-//! use pixels::Picture;
+//! use pixels::Image;
 //! use refinement::{Refiner, RefinerArchitecture};
 //! nets::deterministic();
 //! let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance: None }, 7)?;
-//! let view = Picture::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
+//! let view = Image::new(9, 5, 4, vec![0.5; 9 * 5 * 4]);
 //! // A network that hasn't learnt anything adds nothing.
 //! assert_eq!(refiner.refine(&view)?.data, vec![0.5; 9 * 5 * 3]);
 //! # Ok::<(), refinement::RefinementError>(())

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use counter_rng::CounterRng;
-use pixels::Picture;
+use pixels::Image;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -62,10 +62,10 @@ pub struct RefinerFile {
     pub rendered_psnr: f64,
     /// Mean PSNR of those views refined, in dB.
     pub refined_psnr: f64,
-    /// Share of what references saw of those views that they were trusted with, where the network knows references.
+    /// Confidence in references, as a share of what they saw of those views, where the network knows references.
     #[serde(default)]
     pub trusted: Option<f64>,
-    /// Whether the network takes views that agree with LR photographs of their own.
+    /// Whether the network takes views that are consistent with LR photographs of their own.
     #[serde(default)]
     pub agreeing: bool,
 }
@@ -83,7 +83,7 @@ pub struct Refiner {
 pub(crate) const INPUTS: usize = 4;
 /// The same with the difference to references, their confidence, and what their own views lack.
 pub(crate) const REFERENCE_INPUTS: usize = 11;
-/// Channels of a picture.
+/// Channels of an image.
 pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
 const TILE: usize = 128;
@@ -168,10 +168,10 @@ impl Refiner {
     }
 
     /// The view with `strength` times what the network adds; a reference-based network takes it from
-    /// [`with_references`](crate::with_references). A picture of three channels in
+    /// [`with_references`](crate::with_references). An image of three channels in
     /// 0..1. The network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another way, and the mean of its answers is
     /// added (Timofte et al. 2016).
-    pub fn refine_by(&self, view: &Picture, strength: f32, turns: u32) -> Result<Picture, RefinementError> {
+    pub fn refine_by(&self, view: &Image, strength: f32, turns: u32) -> Result<Image, RefinementError> {
         let inputs = self.architecture.inputs();
         if view.channels != inputs {
             return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
@@ -203,11 +203,11 @@ impl Refiner {
                 }
             }
         }
-        Ok(Picture::new(width, height, OUTPUTS, data))
+        Ok(Image::new(width, height, OUTPUTS, data))
     }
 
     /// What the network adds to a square of a view, the mean over turns: row by row, channels interleaved.
-    fn added(&self, view: &Picture, square: Square, turns: &[Turn]) -> Result<Vec<f32>, TchError> {
+    fn added(&self, view: &Image, square: Square, turns: &[Turn]) -> Result<Vec<f32>, TchError> {
         let around = square.grown(self.reach());
         let inputs = self.architecture.inputs();
         let mut sum = vec![0.0; square.size.0 * square.size.1 * OUTPUTS];
@@ -231,7 +231,7 @@ impl Refiner {
     }
 
     /// The view with all that the network adds to it as it is.
-    pub fn refine(&self, view: &Picture) -> Result<Picture, RefinementError> {
+    pub fn refine(&self, view: &Image) -> Result<Image, RefinementError> {
         self.refine_by(view, 1.0, 1)
     }
 }
@@ -262,9 +262,9 @@ fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
 mod tests {
     use super::*;
 
-    fn picture(width: usize, height: usize) -> Picture {
+    fn image(width: usize, height: usize) -> Image {
         let mut rng = CounterRng::new(1, 2, 3);
-        Picture::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| rng.uniform()).collect())
+        Image::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| rng.uniform()).collect())
     }
 
     /// A network whose every weight says something.
@@ -285,7 +285,7 @@ mod tests {
         let architecture = RefinerArchitecture { channels: 6, blocks: 2, guidance: None };
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
-            let view = picture(width, height);
+            let view = image(width, height);
             let square = Square { x: 0, y: 0, size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)) };
             let around = square.grown(refiner.reach());
             let mut input = Vec::new();
@@ -304,15 +304,15 @@ mod tests {
         }
     }
 
-    /// A rehearsal with little to learn pushes features below 0 everywhere. What the network adds must still follow what it sees, or it would never
-    /// learn again.
+    /// Internal learning from little pushes features below 0 everywhere. What the network adds must still follow what it sees,
+    /// or it would never learn again.
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
         let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
-        let (dark, view) = (Picture::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), picture(16, 16));
-        let added = |view: &Picture| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
+        let (dark, view) = (Image::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), image(16, 16));
+        let added = |view: &Image| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
         let apart = added(&dark).iter().zip(added(&view)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart > 0.01, "{apart}");
     }
@@ -322,11 +322,11 @@ mod tests {
     fn all_turns_together_prefer_no_direction() {
         nets::deterministic();
         let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
-        let view = picture(150, 10);
-        let mirrored = |p: &Picture| {
+        let view = image(150, 10);
+        let mirrored = |p: &Image| {
             let data =
                 p.data.chunks_exact(p.width * p.channels).flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
-            Picture::new(p.width, p.height, p.channels, data.collect())
+            Image::new(p.width, p.height, p.channels, data.collect())
         };
         let apart = |turns: u32| {
             let straight = mirrored(&refiner.refine_by(&view, 1.0, turns).unwrap());
@@ -354,10 +354,7 @@ mod tests {
         {
             assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
         }
-        assert!(matches!(
-            again.refine(&picture(8, 8)),
-            Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })
-        ));
+        assert!(matches!(again.refine(&image(8, 8)), Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })));
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

@@ -3,7 +3,7 @@ use std::path::Path;
 
 use counter_rng::CounterRng;
 use nets::Adam;
-use pixels::{Picture, psnr_of};
+use pixels::{Image, psnr_of};
 use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
@@ -60,7 +60,7 @@ pub struct RefinerTrainer {
 struct Pool {
     round: u64,
     /// Which example, and as the network takes it.
-    views: Vec<(usize, Picture)>,
+    views: Vec<(usize, Image)>,
 }
 
 impl Pool {
@@ -124,7 +124,7 @@ impl RefinerTrainer {
     /// serves them best.
     pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
-        let view = |(i, example): (usize, &KnownView)| -> Picture {
+        let view = |(i, example): (usize, &KnownView)| -> Image {
             let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
             let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
             let drawn = (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
@@ -132,7 +132,7 @@ impl RefinerTrainer {
             conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
             conditioned.view
         };
-        let views: Vec<Picture> = examples.iter().enumerate().map(view).collect();
+        let views: Vec<Image> = examples.iter().enumerate().map(view).collect();
         let confidence = (uses.seen > 0).then(|| uses.confidence_share());
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
@@ -239,8 +239,8 @@ fn shard(
 /// A view as the network takes it, beside what it should look like.
 #[derive(Clone, Copy)]
 struct Subject<'a> {
-    view: &'a Picture,
-    truth: &'a Picture,
+    view: &'a Image,
+    truth: &'a Image,
 }
 
 /// A square of a view, as it is shown to the network.
@@ -311,7 +311,7 @@ impl<'a> TrainingSquare<'a> {
 }
 
 /// Range of the green in a square of the truth.
-fn contrast(truth: &Picture, square: Square) -> f32 {
+fn contrast(truth: &Image, square: Square) -> f32 {
     let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
     square.fold(|x, y| {
         let green = square.of(truth, x, y)[1];
@@ -350,9 +350,9 @@ mod tests {
             // A wall at distance 2, along which the camera moves by a pixel a phase.
             camera_to_world: [[1.0, 0.0, 0.0, phase as f64 / 16.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
-        let view = Picture::new(32, 32, 4, view);
+        let view = Image::new(32, 32, 4, view);
         let rendered = Rendered { camera, view, depth: vec![2.0; 32 * 32], opacity: vec![1.0; 32 * 32] };
-        KnownView { rendered, truth: Picture::new(32, 32, 3, truth) }
+        KnownView { rendered, truth: Image::new(32, 32, 3, truth) }
     }
 
     fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {

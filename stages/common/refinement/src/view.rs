@@ -1,4 +1,4 @@
-use pixels::{Exposure, ExrImage, Picture};
+use pixels::{Exposure, ExrImage, Image};
 use scene::{Camera, Photograph, Surface};
 
 use crate::RefinementError;
@@ -9,7 +9,7 @@ pub struct Rendered {
     /// Where from; its intrinsics have the view's size.
     pub camera: Camera,
     /// Colour, on the background that is shown, and opacity.
-    pub view: Picture,
+    pub view: Image,
     /// Camera-space z-depth in scene units, a number a pixel.
     pub depth: Vec<f32>,
     /// Opacity, a number a pixel.
@@ -20,7 +20,7 @@ impl Rendered {
     /// From a view's file, over a grey level.
     pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
         let refuse = |reason: String| Err(RefinementError::View { name: camera.name.clone(), reason });
-        let (Some(picture), Some(depth)) = (image.premultiplied(), image.channel("Z")) else {
+        let (Some(premultiplied), Some(depth)) = (image.premultiplied(), image.channel("Z")) else {
             return refuse("channels R, G, B, A and Z are expected".to_owned());
         };
         let k = &camera.intrinsics;
@@ -28,16 +28,17 @@ impl Rendered {
             let (width, height) = (image.width, image.height);
             return refuse(format!("{width}×{height} pixels where its camera has {}×{}", k.width, k.height));
         }
-        let over = picture.over(background);
-        let pixels = over.data.chunks_exact(3).zip(picture.data.chunks_exact(4)).flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
-        let view = Picture::new(image.width, image.height, 4, pixels.collect());
-        Ok(Self { opacity: picture.channel(3), depth: depth.to_vec(), view, camera })
+        let over = premultiplied.over(background);
+        let pixels =
+            over.data.chunks_exact(3).zip(premultiplied.data.chunks_exact(4)).flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
+        let view = Image::new(image.width, image.height, 4, pixels.collect());
+        Ok(Self { opacity: premultiplied.channel(3), depth: depth.to_vec(), view, camera })
     }
 
     /// Its colours alone.
-    pub fn colours(&self) -> Picture {
+    pub fn colours(&self) -> Image {
         let colours = self.view.data.chunks_exact(4).flat_map(|p| [p[0], p[1], p[2]]);
-        Picture::new(self.view.width, self.view.height, 3, colours.collect())
+        Image::new(self.view.width, self.view.height, 3, colours.collect())
     }
 
     /// The same view with other colours.
@@ -45,7 +46,7 @@ impl Rendered {
     /// # Panics
     /// Where they aren't of its size.
     #[must_use]
-    pub fn with_colours(mut self, colours: &Picture) -> Self {
+    pub fn with_colours(mut self, colours: &Image) -> Self {
         assert_eq!((colours.width, colours.height), (self.view.width, self.view.height), "colours of its size");
         for (pixel, colour) in self.view.data.chunks_exact_mut(4).zip(colours.data.chunks_exact(3)) {
             pixel[..3].copy_from_slice(colour);
@@ -59,22 +60,22 @@ impl Rendered {
     }
 }
 
-/// A rendered view whose true picture is known: an example to learn from, or a reference for other views.
+/// A rendered view whose true image is known: an example to learn from, or a reference for other views.
 #[derive(Clone, Debug)]
 pub struct KnownView {
     /// As rendered.
     pub rendered: Rendered,
     /// Colour, on the background that is shown; of the view's size. What is rendered, where nothing is known.
-    pub truth: Picture,
+    pub truth: Image,
 }
 
 impl KnownView {
     /// A rendered view with its photograph, over the same background. Where that doesn't count it is taken for what is rendered, and so says nothing.
     pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
-        let (view, name, Photograph { picture: mut truth, mask }) = (&rendered.view, &rendered.camera.name, photograph);
+        let (view, name, Photograph { image: mut truth, mask }) = (&rendered.view, &rendered.camera.name, photograph);
         if (view.width, view.height) != (truth.width, truth.height) {
             let reason = format!(
-                "{}×{} pixels where its picture has {}×{}; render it for the picture's camera",
+                "{}×{} pixels where its image has {}×{}; render it for the image's camera",
                 view.width, view.height, truth.width, truth.height
             );
             return Err(RefinementError::View { name: name.clone(), reason });
@@ -88,13 +89,13 @@ impl KnownView {
 const BLOCK: usize = 8;
 
 impl KnownView {
-    /// The exposure of the true picture against the rendered view, which has the exposure of the pictures that the field learnt from.
+    /// The exposure of the true image against the rendered view, which has the exposure of the images that the field learnt from.
     /// None where too little says what it is.
     pub fn exposure(&self) -> Option<Exposure> {
         Exposure::between(&self.rendered.view, &self.truth, BLOCK)
     }
 
-    /// The same view with a true picture as the rendered one's exposure would have made it.
+    /// The same view with a true image as the rendered one's exposure would have made it.
     #[must_use]
     pub fn without(mut self, exposure: &Exposure) -> Self {
         exposure.take_back(&mut self.truth);
@@ -109,7 +110,7 @@ mod tests {
 
     use super::*;
 
-    /// A view of coarse patches, and a picture that differs from it by fine detail and an exposure.
+    /// A view of coarse patches, and an image that differs from it by fine detail and an exposure.
     fn view(gain: f32, offset: f32) -> KnownView {
         let (width, height) = (96, 64);
         let camera = Camera {
@@ -135,9 +136,9 @@ mod tests {
             truth.extend(colour.map(|v| (gain * (v + 0.2 * (rng.uniform() - 0.5)) + offset).clamp(0.0, 1.0)));
         }
         let count = width * height;
-        let view = Picture::new(width, height, 4, view);
+        let view = Image::new(width, height, 4, view);
         let rendered = Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
-        KnownView { rendered, truth: Picture::new(width, height, 3, truth) }
+        KnownView { rendered, truth: Image::new(width, height, 3, truth) }
     }
 
     #[test]

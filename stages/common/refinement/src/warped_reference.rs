@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use pixels::Picture;
+use pixels::Image;
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -72,7 +72,7 @@ impl Use {
 #[derive(Clone, Debug)]
 pub struct ConditionedView {
     /// As a reference-based refiner takes it: colour, opacity, difference to the references, their confidence, and what their own views lack.
-    pub view: Picture,
+    pub view: Image,
     /// What each reference was of use for.
     pub uses: Vec<Use>,
 }
@@ -102,7 +102,7 @@ impl WarpedReference {
         let (colour, theirs) = (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
         let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
-        // A picture with a hole in it shows nothing there.
+        // An image with a hole in it shows nothing there.
         let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
         if is_shown { Self { difference, lacking, place, visibility, confidence: visibility } } else { Self::default() }
     }
@@ -126,9 +126,9 @@ impl ReferenceFeatures {
                 });
                 // The best counts most. What has no confidence fades, as if it weren't seen.
                 let weight = confidence.powi(4);
-                let agrees = confidence / visibility.max(f32::MIN_POSITIVE);
-                (0..3).for_each(|c| sum[c] += weight * agrees * difference[c]);
-                (0..3).for_each(|c| lacks[c] += weight * agrees * lacking[c]);
+                let share = confidence / visibility.max(f32::MIN_POSITIVE);
+                (0..3).for_each(|c| sum[c] += weight * share * difference[c]);
+                (0..3).for_each(|c| lacks[c] += weight * share * lacking[c]);
                 *weights += weight;
                 *best = best.max(confidence);
             }
@@ -216,7 +216,7 @@ pub fn with_references(rendered: &Rendered, references: &[&KnownView], guidance:
     let uses: Vec<Vec<Use>> = data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate().map(band).collect();
     let mut sums = vec![Use::default(); references.len()];
     uses.iter().for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
-    ConditionedView { view: Picture::new(width, height, REFERENCE_INPUTS, data), uses: sums }
+    ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), uses: sums }
 }
 
 /// Rows of a view that are looked at together: memory is bounded, whatever its size.
@@ -257,10 +257,10 @@ mod tests {
             },
             camera_to_world: [[1.0, 0.0, 0.0, right as f64 * 2.0 / 300.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
-        let view = Picture::new(WIDTH, HEIGHT, 4, view);
+        let view = Image::new(WIDTH, HEIGHT, 4, view);
         let depth = (0..WIDTH * HEIGHT).map(depth).collect();
         let rendered = Rendered { camera, view, depth, opacity: vec![1.0; WIDTH * HEIGHT] };
-        KnownView { rendered, truth: Picture::new(WIDTH, HEIGHT, 3, truth) }
+        KnownView { rendered, truth: Image::new(WIDTH, HEIGHT, 3, truth) }
     }
 
     /// Share of the view that is known of, confidence there, and how far what is shown there is from the truth, weighted by the confidence.
@@ -315,7 +315,7 @@ mod tests {
     /// What something stands before is shown only by references that needn't see it.
     #[test]
     fn what_is_hidden_is_not_shown() {
-        // The reference has a plate before the middle third of its picture.
+        // The reference has a plate before the middle third of its image.
         let plate = |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
         let seen = |occlusion: bool| {

@@ -90,8 +90,8 @@ pub enum CameraError {
         /// The number.
         value: f64,
     },
-    /// Distortion by which a place in the picture would belong to no ray, or to several.
-    #[error("lens distortion {0} can't be undone within the picture; are its coefficients right?")]
+    /// Distortion by which a place in the image would belong to no ray, or to several.
+    #[error("lens distortion {0} can't be undone within the image; are its coefficients right?")]
     Distortion(Distortion),
     /// An image without pixels.
     #[error("image size {width}×{height}; both must be at least 1")]
@@ -173,7 +173,7 @@ impl Camera {
         let straight = [k.cx + k.fx * p.x / depth, k.cy - k.fy * p.y / depth];
         let [x, y] = k.distort(straight);
         if !k.distortion.is_none() {
-            // A distortion may fold back into the picture what lies outside.
+            // A distortion may fold back into the image what lies outside.
             let [u, v] = k.undistort([x, y]);
             let off = (u - straight[0]).hypot(v - straight[1]);
             if off.is_nan() || off > 1e-3 {
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_distortion_would_fold_into_the_picture_is_not_seen() {
+    fn what_a_distortion_would_fold_into_the_image_is_not_seen() {
         let mut camera = camera(DVec3::Z, 0.0, DVec3::ZERO);
         camera.intrinsics.distortion.radial[0] = -0.4;
         camera.check().unwrap();
@@ -293,14 +293,14 @@ mod tests {
             prop_assert!(camera.project(ray.at(-t)).is_none());
         }
 
-        /// A half-pixel shift would show here: the s×s pixels of a finer image have their mean at the coarse pixel's centre.
+        /// A half-pixel shift would show here: the s×s pixels of an HR image have their mean at the LR pixel's centre.
         #[test]
         fn resizing_keeps_pixel_footprints(i in 0u32..37, j in 0u32..23, s in 1u32..6) {
-            let coarse = camera(DVec3::Z, 0.3, DVec3::ONE);
-            let fine = coarse.resized(37 * s, 23 * s);
+            let lr = camera(DVec3::Z, 0.3, DVec3::ONE);
+            let hr = lr.resized(37 * s, 23 * s);
             for (corner_x, corner_y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
                 let (x, y) = (f64::from(i + corner_x), f64::from(j + corner_y));
-                let difference = coarse.ray(x, y).direction - fine.ray(x * f64::from(s), y * f64::from(s)).direction;
+                let difference = lr.ray(x, y).direction - hr.ray(x * f64::from(s), y * f64::from(s)).direction;
                 prop_assert!(difference.length() < 1e-12);
             }
             let offsets: f64 = (0..s).map(|a| (f64::from(i * s + a) + 0.5) / f64::from(s)).sum();

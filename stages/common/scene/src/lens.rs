@@ -17,10 +17,10 @@ pub struct Distortion {
     pub tangential: [f64; 2],
 }
 
-/// How far, in units of the picture, undoing a distortion may cut its border off at most.
+/// How far, in units of the image, undoing a distortion may cut its border off at most.
 const MOST_ZOOM: f64 = 4.0;
 
-/// Places along each side of a picture at which a distortion is looked at.
+/// Places along each side of an image at which a distortion is looked at.
 const BORDER: u32 = 64;
 
 /// A distortion is undone to within so much of the focal length: a hundred-thousandth of a pixel at 10,000 pixels.
@@ -100,7 +100,7 @@ impl Distortion {
 }
 
 impl Intrinsics {
-    /// Where in its picture a camera without the distortion sees what this one sees at a position, in pixels.
+    /// Where in its image a camera without the distortion sees what this one sees at a position, in pixels.
     pub fn undistort(&self, at: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
             return at;
@@ -109,7 +109,7 @@ impl Intrinsics {
         [self.fx.mul_add(x, self.cx), self.fy.mul_add(y, self.cy)]
     }
 
-    /// Where in its picture this camera sees what one without the distortion sees at a position, in pixels.
+    /// Where in its image this camera sees what one without the distortion sees at a position, in pixels.
     pub fn distort(&self, at: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
             return at;
@@ -119,7 +119,7 @@ impl Intrinsics {
     }
 
     /// The pinhole camera of the same size that sees as much as it can and nothing that this one doesn't. `None` where the distortion
-    /// is beyond sense: its picture would have to be cut to a quarter and less.
+    /// is beyond sense: its image would have to be cut to a quarter and less.
     pub fn pinhole(&self) -> Option<Self> {
         let pinhole = Self { distortion: Distortion::default(), ..*self };
         if self.distortion.is_none() {
@@ -142,14 +142,14 @@ impl Intrinsics {
         Some(zoomed(high))
     }
 
-    /// Where in this camera's picture what another, at the same place, sees at a position.
+    /// Where in this camera's image what another, at the same place, sees at a position.
     pub fn source(&self, other: &Self, at: [f64; 2]) -> [f64; 2] {
         let [x, y] = other.undistort(at);
         let along = |v: f64, from: f64, focal: f64, to: f64, to_focal: f64| to_focal.mul_add((v - from) / focal, to);
         self.distort([along(x, other.cx, other.fx, self.cx, self.fx), along(y, other.cy, other.fy, self.cy, self.fy)])
     }
 
-    /// Positions along the picture's border: its corners, and what lies between them where lines may be bent.
+    /// Positions along the image's border: its corners, and what lies between them where lines may be bent.
     pub fn border(&self) -> impl Iterator<Item = [f64; 2]> {
         let steps = if self.distortion.is_none() { 1 } else { BORDER };
         let (width, height) = (f64::from(self.width), f64::from(self.height));
@@ -159,13 +159,13 @@ impl Intrinsics {
         })
     }
 
-    /// Whether each place in the picture belongs to one ray.
+    /// Whether each place in the image belongs to one ray.
     pub(crate) fn has_rays(&self) -> bool {
         let place = |[x, y]: [f64; 2]| [(x - self.cx) / self.fx, (y - self.cy) / self.fy];
         self.distortion.is_none() || self.border().all(|at| self.distortion.can_undo(place(at)))
     }
 
-    /// Whether the whole border of a pinhole picture lies inside this camera's, and in order.
+    /// Whether the whole border of a pinhole image lies inside this camera's, and in order.
     fn sees_all_of(&self, pinhole: &Self) -> bool {
         let (width, height) = (f64::from(self.width), f64::from(self.height));
         let inside = |[x, y]: [f64; 2]| {
@@ -185,7 +185,7 @@ impl Intrinsics {
                 grows
             })
         };
-        // Of a bent picture's border, as many places as of its own.
+        // Of a bent image's border, as many places as of its own.
         Self { distortion: self.distortion, ..*pinhole }.border().all(|at| inside(self.source(pinhole, at)) && in_order(at))
     }
 }
@@ -216,11 +216,11 @@ mod tests {
         assert_eq!(folded.pinhole(), None);
         assert!(!folded.has_rays());
         assert!(!camera([f64::NAN, 0.0, 0.0], [0.0; 2]).has_rays());
-        // Bent a little further than any mild lens below, the picture folds in one corner alone.
+        // Bent a little further than any mild lens below, the image folds in one corner alone.
         assert!(!camera([-0.193, -0.047, -0.0156], [-0.0056, 0.0078]).has_rays());
     }
 
-    /// Lenses that bend, but fold no corner of the picture.
+    /// Lenses that bend, but fold no corner of the image.
     fn mild() -> impl Strategy<Value = Intrinsics> {
         let (tangential, k3) = (-0.01..0.01f64, -0.02..0.02f64);
         (-0.15..0.3f64, -0.05..0.05f64, k3, tangential.clone(), tangential)
@@ -228,7 +228,7 @@ mod tests {
     }
 
     proptest! {
-        /// What the pinhole camera sees lies inside the picture, and a slightly wider one would see past it.
+        /// What the pinhole camera sees lies inside the image, and a slightly wider one would see past it.
         #[test]
         fn a_pinhole_sees_as_much_as_there_is(camera in mild()) {
             let pinhole = camera.pinhole().expect("a mild distortion");

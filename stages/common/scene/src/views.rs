@@ -1,7 +1,7 @@
 use std::collections::BTreeSet;
 
 use artifact::relative_path;
-use pixels::{Mask, Picture, PixelError, read_png, read_premultiplied};
+use pixels::{Image, Mask, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -34,10 +34,10 @@ pub struct Views {
 pub struct View {
     /// Where it was taken from; its intrinsics have the image's size.
     pub camera: Camera,
-    /// The picture: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
+    /// The image: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<String>,
-    /// Which of the picture's pixels count: PNG of its size, white where they do, black where they don't. Without it: all.
+    /// Which of the image's pixels count: PNG of its size, white where they do, black where they don't. Without it: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
     /// Depth: EXR, channel `Z`.
@@ -54,34 +54,34 @@ impl View {
         Self { camera, image: None, mask: None, depth: None, low_resolution: None }
     }
 
-    /// Its picture, premultiplied RGBA, and which of its pixels count; none where it has no picture.
+    /// Its image, premultiplied RGBA, and which of its pixels count; none where it has no image.
     pub fn read_photograph(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.image else { return Ok(None) };
-        let picture = read_premultiplied(&input.path(file))?;
-        let mask = self.read_mask(input, (picture.width, picture.height))?;
-        Ok(Some(Photograph { picture, mask }))
+        let image = read_premultiplied(&input.path(file))?;
+        let mask = self.read_mask(input, (image.width, image.height))?;
+        Ok(Some(Photograph { image, mask }))
     }
 
     /// The same at low resolution; a pixel of it counts where all that lies under it does.
-    pub fn read_low_resolution(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+    pub fn read_lr(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.low_resolution else { return Ok(None) };
-        let picture = read_premultiplied(&input.path(file))?;
+        let image = read_premultiplied(&input.path(file))?;
         let mask = self.mask.as_ref().map(|file| read_png(&input.path(file))).transpose()?;
-        let mask = mask.map(|image| Mask::of(&image).resized((picture.width, picture.height), 0));
-        Ok(Some(Photograph { picture, mask }))
+        let mask = mask.map(|mask| Mask::of(&mask).resized((image.width, image.height), 0));
+        Ok(Some(Photograph { image, mask }))
     }
 
-    /// Which pixels of its picture, of that size, count; none where all do.
+    /// Which pixels of its image, of that size, count; none where all do.
     pub fn read_mask(&self, input: &artifact::GivenInput, size: (usize, usize)) -> Result<Option<Mask>, PixelError> {
         self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
     }
 }
 
-/// What a camera took: a picture, and what of it shows the scene.
+/// What a camera took: an image, and what of it shows the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Photograph {
     /// Premultiplied RGBA, or RGB over a background.
-    pub picture: Picture,
+    pub image: Image,
     /// Which pixels count; without it all do. The others say nothing of the scene.
     pub mask: Option<Mask>,
 }
@@ -90,25 +90,25 @@ impl Photograph {
     /// RGB over a grey level.
     #[must_use]
     pub fn over(self, background: f32) -> Self {
-        Self { picture: self.picture.over(background), ..self }
+        Self { image: self.image.over(background), ..self }
     }
 
-    /// The picture, NaN where it doesn't count.
-    pub fn known(self) -> Picture {
-        let mut picture = self.picture;
+    /// The image, NaN where it doesn't count.
+    pub fn known(self) -> Image {
+        let mut image = self.image;
         let counts = self.mask.iter().flat_map(|mask| &mask.counts);
-        for (pixel, counts) in picture.data.chunks_exact_mut(picture.channels).zip(counts) {
+        for (pixel, counts) in image.data.chunks_exact_mut(image.channels).zip(counts) {
             if !counts {
                 pixel.fill(f32::NAN);
             }
         }
-        picture
+        image
     }
 }
 
-impl From<Picture> for Photograph {
-    fn from(picture: Picture) -> Self {
-        Self { picture, mask: None }
+impl From<Image> for Photograph {
+    fn from(image: Image) -> Self {
+        Self { image, mask: None }
     }
 }
 

@@ -16,7 +16,7 @@ pub struct Surface<'a> {
 /// How one view sees a point of a surface that another sees, too.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Visibility {
-    /// Where in its picture, in pixels from the top left corner.
+    /// Where in its image, in pixels from the top left corner.
     pub place: [f32; 2],
     /// Cosine of the angle between both lines of sight.
     pub cosine: f32,
@@ -83,7 +83,7 @@ impl Surface<'_> {
     }
 
     /// Whether what this view sees at a position is a point that another sees at a place: by the depth of one of the four pixels around,
-    /// which all lie in the picture or at its border.
+    /// which all lie in the image or at its border.
     fn shows(&self, point: DVec3, [x, y]: [f64; 2], (other, place): (&Camera, [f64; 2])) -> bool {
         let (width, height) = (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
         let around = |v: f64, size: usize| {

@@ -87,9 +87,9 @@ mod tests {
             (1 << 8, &["Traceback", "ValueError: bad"], 1, "ValueError: bad", "bad"),
             (101 << 8, &["thread 'main' panicked at x.rs:1:2:", "a name"], 101, "a name", "name"),
             (7 << 8, &[], 7, "ended with exit code 7 and said nothing", "nothing"),
-            (6, &["memory allocation of 99532800 bytes failed"], 1, "out of memory: 99.5 MB more were asked for;", "pictures"),
+            (6, &["memory allocation of 99532800 bytes failed"], 1, "out of memory: 99.5 MB more were asked for;", "images"),
             (6, &["free(): invalid pointer"], 1, "crashed with SIGABRT after it said: free(): invalid", "please report it"),
-            (9, &["LR pictures: 8"], 1, "ended by SIGKILL after it said: LR pictures: 8; maybe the kernel", "pictures"),
+            (9, &["LR images: 8"], 1, "ended by SIGKILL after it said: LR images: 8; maybe the kernel", "images"),
             (11, &[], 1, "crashed with SIGSEGV; please report it", "it"),
             (15, &[], 1, "ended by SIGTERM; run again to go on", "on"),
         ] {

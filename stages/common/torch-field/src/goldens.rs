@@ -106,8 +106,15 @@ fn sampling_and_compositing_in_f64() {
 #[test]
 fn gradients_and_three_steps_in_f64() {
     let (field, batch, draws) = small();
-    let options =
-        MlpTraining { rays: 1, batch: 8, rate: 5e-4, final_rate: 1.0, schedule: Schedule::Exponential, noise: 0.0, seed: 0 };
+    let options = MlpTraining {
+        rays: 1,
+        max_rays_per_step: 8,
+        learning_rate: 5e-4,
+        learning_rate_decay: 1.0,
+        schedule: Schedule::Exponential,
+        density_noise_std: 0.0,
+        seed: 0,
+    };
     let mut trainer = MlpTrainer::new(field, options).unwrap();
     let target = draw(6, &[2, 3]);
     let flat = |tensors: &[Tensor]| Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0);

@@ -353,8 +353,8 @@ mod tests {
         difference / norm(&mut judge.iter().map(|&b| f64::from(b))).max(1e-12)
     }
 
-    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and hashed levels, thin fog and
-    /// walls, and the same field on a GPU where there is one.
+    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and hashed levels, faint density
+    /// and walls, and the same field on a GPU where there is one.
     #[test]
     fn agrees_with_the_hand_written_field() {
         let bounds = Bounds { min: [-1.0, -0.8, -1.0], max: [1.0, 1.0, 0.7], near: 1.0, far: 9.0, ..Default::default() };

@@ -135,9 +135,9 @@ impl GridTrainer {
             let share = f64::from(self.options.distortion) / (step.bundles * step.bundle) as f64;
             towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
         }
-        if self.options.haze > 0.0 {
-            let share = f64::from(self.options.haze) / (step.bundles * step.bundle) as f64;
-            towards = towards.f_add(&haze(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
+        if self.options.floater_loss > 0.0 {
+            let share = f64::from(self.options.floater_loss) / (step.bundles * step.bundle) as f64;
+            towards = towards.f_add(&floater_loss(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
         }
         let gradients = if towards.requires_grad() {
             Tensor::f_run_backward(&[towards], &self.grid.parameters(), false, false)?
@@ -164,14 +164,14 @@ impl GridTrainer {
         for (i, layer) in self.grid.layers.iter().enumerate() {
             let (g, first, second) = moments(i + 1);
             let moments = [first.shallow_clone(), second.shallow_clone()];
-            lazy_adam(t, options.network_rate * schedule, options.network_decay, layer.shallow_clone(), g, moments)?;
+            lazy_adam(t, options.mlp_learning_rate * schedule, options.network_decay, layer.shallow_clone(), g, moments)?;
         }
         if options.averages(&self.tally) {
             let now = self.grid.parameters();
             match &mut self.average {
                 None => self.average = Some(now.iter().map(Tensor::f_detach_copy).collect::<Result<_, _>>()?),
                 Some(average) => {
-                    let new = 1.0 - f64::from(options.averaging);
+                    let new = 1.0 - f64::from(options.ema_decay);
                     for (average, now) in average.iter_mut().zip(&now) {
                         let _ = average.f_lerp_(now, new)?;
                     }
@@ -290,8 +290,9 @@ fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
     pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
 }
 
-/// The haze loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours or the transmittance T.
-fn haze(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
+/// The floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient by the colours or the
+/// transmittance T.
+fn floater_loss(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
     let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
     let squared =
         seen.shaded_colour.f_detach()?.f_sub(&behind)?.f_square()?.f_sum_dim_intlist([1i64].as_slice(), true, None::<Kind>)?;
@@ -320,7 +321,7 @@ mod tests {
 
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, bundle);
-            // White, or like the fog before it.
+            // White, or like the density before it.
             let background = [[1.0; 3], [0.5; 3]][bundle as usize % 2];
             let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
             for ray in rays {
@@ -352,16 +353,16 @@ mod tests {
     fn options() -> TrainingOptions {
         TrainingOptions {
             rays: 36 * 256,
-            batch: 256,
-            samples: 1 << 20,
-            rate: 1e-2,
+            max_rays_per_step: 256,
+            samples_per_step: 1 << 20,
+            learning_rate: 1e-2,
             level_rate: 0.8,
-            network_rate: 1e-2,
-            final_rate: 0.25,
+            mlp_learning_rate: 1e-2,
+            learning_rate_decay: 0.25,
             warm_up: 5,
-            averaging: 0.9,
+            ema_decay: 0.9,
             distortion: 0.02,
-            haze: 0.01,
+            floater_loss: 0.01,
             network_decay: 1e-4,
             seed: 9,
         }

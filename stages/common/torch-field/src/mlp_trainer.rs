@@ -14,16 +14,16 @@ use crate::{Schedule, TorchFieldError};
 pub struct MlpTraining {
     /// Rays in all.
     pub rays: u64,
-    /// Rays in a step, sub-rays counted each.
-    pub batch: usize,
+    /// Most rays in a step, sub-pixel rays counted each.
+    pub max_rays_per_step: usize,
     /// Learning rate at the start.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Learning rate at the end, as a share of that.
-    pub final_rate: f64,
+    pub learning_rate_decay: f64,
     /// How it gets there.
     pub schedule: Schedule,
     /// Standard deviation of what is added to raw densities.
-    pub noise: f64,
+    pub density_noise_std: f64,
     /// Seed of what is drawn.
     pub seed: u64,
 }
@@ -51,7 +51,7 @@ fn shards(rays: usize) -> usize {
 const CHUNK_SAMPLES: usize = 4096;
 /// So many steps in a row in which a network is stuck are a collapse: no gradient leads out of it.
 const STUCK_STEPS: u64 = 200;
-/// Less of the light than this stopped by all samples: the background alone explains the pictures, and ReLU has no gradient there.
+/// Less of the light than this stopped by all samples: the background alone explains the images, and ReLU has no gradient there.
 const CLEAR: f64 = 1e-3;
 /// More of the light than this stopped by the first sample: what is left is of rays whose second happens to be drawn close to it, and
 /// what lies behind gets no gradient.
@@ -122,7 +122,9 @@ impl MlpTrainer {
         let done = self.tally.done(self.options.rays);
         supervision.set_progress(done);
         let bundle = supervision.rays_per_bundle();
-        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, self.options.batch, bundle) else { return Ok(None) };
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, self.options.max_rays_per_step, bundle) else {
+            return Ok(None);
+        };
         let step = Step::new(&self.tally, bundles, bundle);
         let pieces = self.pieces(&*supervision, step)?;
         let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
@@ -160,7 +162,7 @@ impl MlpTrainer {
 
     /// Forward and backward: on the CPU in shards, in parallel; on a GPU in as few pieces as its memory allows.
     fn pieces(&self, supervision: &impl Supervisor, step: Step) -> Result<Vec<MlpPiece>, TorchFieldError> {
-        let plan = StepContext { step, seed: self.options.seed, noise: self.options.noise };
+        let plan = StepContext { step, seed: self.options.seed, noise: self.options.density_noise_std };
         if self.field.device != Device::Cpu {
             return step.in_pieces(|range| plan.run(&self.field, supervision, range));
         }
@@ -174,7 +176,8 @@ impl MlpTrainer {
 
     /// Moves the parameters.
     pub(crate) fn take(&mut self, gradients: &[Tensor], done: f64) -> Result<(), TchError> {
-        let rate = self.tally.rate_scale * self.options.schedule.rate(self.options.rate, self.options.final_rate, done);
+        let rate = self.tally.rate_scale
+            * self.options.schedule.rate(self.options.learning_rate, self.options.learning_rate_decay, done);
         self.adam.step(self.field.parameters(), gradients, rate)
     }
 
@@ -285,11 +288,11 @@ mod tests {
         let bounds = Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let options = MlpTraining {
             rays: 8 * 250,
-            batch: 8,
-            rate: 5e-4,
-            final_rate: 0.1,
+            max_rays_per_step: 8,
+            learning_rate: 5e-4,
+            learning_rate_decay: 0.1,
             schedule: Schedule::Exponential,
-            noise: 0.0,
+            density_noise_std: 0.0,
             seed: 0,
         };
         let raw_density = MlpNetwork::layers(&architecture).iter().position(|(name, ..)| name == "sigma").unwrap();

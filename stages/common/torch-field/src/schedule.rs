@@ -16,7 +16,7 @@ impl Schedule {
     const FALLING: u64 = 10;
 
     /// The rate when a share of the training is done.
-    pub fn rate(self, highest: f64, final_rate: f64, done: f64) -> f64 {
+    pub fn rate(self, highest: f64, decay: f64, done: f64) -> f64 {
         let progress = match self {
             Self::Exponential => done,
             Self::Epochs { epochs } => {
@@ -25,7 +25,7 @@ impl Schedule {
                 (epoch + 1 + Self::FALLING).saturating_sub(epochs) as f64 / (Self::FALLING + 1) as f64
             }
         };
-        highest * final_rate.powf(progress)
+        highest * decay.powf(progress)
     }
 }
 

@@ -1,7 +1,7 @@
 use std::error::Error;
 
 use glam::DVec3;
-use pixels::Picture;
+use pixels::Image;
 use radiance::RayField;
 use scene::Camera;
 
@@ -13,7 +13,7 @@ pub struct Shot<'a> {
     /// Its pixels are the photograph's.
     pub camera: &'a Camera,
     /// RGB over its background; NaN where nothing is known.
-    pub photograph: &'a Picture,
+    pub photograph: &'a Image,
     /// What the photograph's channels are multiplied by to have the field's exposure.
     pub exposure: [f32; 3],
 }
@@ -29,12 +29,12 @@ const SURFACE: f32 = 0.5;
 /// Two distances of one surface differ by at most this share of them.
 const SAME: f64 = 0.02;
 
-/// How far photographs disagree, of the same surfaces: mean robust error (Huber's, of colours) between what one shows and what its neighbours show
-/// there, where the field says that they see it, too. None where it says so nowhere.
+/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of colours) between what one shows
+/// and what its neighbours show there, where the field says that they see it, too. None where it says so nowhere.
 ///
 /// The field only says where surfaces are. So this tells good poses from bad ones even by fields that learnt both photograph by photograph:
 /// such a field renders every photograph well, but its surfaces lie where no two of them see the same.
-pub fn disagreement(
+pub fn photometric_error(
     field: &dyn RayField,
     shots: &[Shot<'_>],
     background: f32,

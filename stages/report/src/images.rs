@@ -6,7 +6,7 @@ use pixels::{
 };
 use scene::{Background, View};
 
-/// A view's picture over its background, for looking at.
+/// A view's image over its background, for looking at.
 pub(crate) fn colour(folder: &Path, file: &str, background: Background) -> anyhow::Result<Rgba8> {
     Ok(read_premultiplied(&folder.join(file))?.over(background.shown()).to_rgba8())
 }
@@ -30,15 +30,15 @@ fn depth_file(folder: &Path, view: &View) -> Option<anyhow::Result<ExrImage>> {
     view.depth.as_ref().map(|file| Ok(read_exr(&folder.join(file))?))
 }
 
-/// A picture as the value of an `<img src>`.
+/// An image as the value of an `<img src>`.
 pub(crate) fn uri_of(image: &Rgba8) -> String {
     format!("data:image/png;base64,{}", base64::engine::general_purpose::STANDARD.encode(encode_png(image)))
 }
 
-/// Pixels across at most, of pictures in a gallery: twice as many as their figures are wide.
+/// Pixels across at most, of images in a gallery: twice as many as their figures are wide.
 const WIDEST: usize = 600;
 
-/// A picture in a gallery. What no screen would show there is left out: views at HR make pages of a hundred megabytes.
+/// An image in a gallery. What no screen would show there is left out: views at HR make pages of a hundred megabytes.
 pub(crate) fn shown_in_gallery(image: &Rgba8) -> String {
     let times = image.width.div_ceil(WIDEST);
     if times < 2 {
@@ -60,7 +60,7 @@ mod tests {
     }
 
     #[test]
-    fn galleries_have_pictures_that_a_screen_can_show() {
+    fn galleries_have_images_that_a_screen_can_show() {
         for ((width, height), expected) in
             [((600, 10), (600, 10)), ((601, 3), (301, 2)), ((1008, 756), (504, 378)), ((4032, 1), (576, 1))]
         {

@@ -1,0 +1,15 @@
+use std::path::Path;
+
+use crate::{Image, PixelError, read_exr, read_png};
+
+/// Reads a view's image as RGBA with premultiplied alpha: a PNG has straight alpha or none, an EXR premultiplied alpha in its
+/// channels R, G, B, A.
+pub fn read_premultiplied(path: &Path) -> Result<Image, PixelError> {
+    if path.extension().is_none_or(|e| e != "exr") {
+        return Ok(Image::premultiplied(&read_png(path)?));
+    }
+    read_exr(path)?.premultiplied().ok_or_else(|| {
+        let reason = "channels R, G, B and A are expected".to_owned();
+        PixelError::Format { path: path.to_path_buf(), reason }
+    })
+}
