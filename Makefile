@@ -15,7 +15,7 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build remote setup test faults lint lego sweep quality table refine-table refine-ablation ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build remote setup test faults lint lego sweep quality table refine-table refine-ablation held-out ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -83,13 +83,20 @@ sweep: build ## All combinations, e.g. make sweep KERNEL="lanczos average" SCALE
 	@$(NERF_SR) run --out out/sweep $(if $(DATASET),-i dataset=$(DATASET),-p demo-scene.size=$(DEMO_SIZE)) \
 	  -p kernel=$(call list,$(KERNEL)) -p prep.scale=$(call list,$(SCALE)) -p lr_width=$(call list,$(LR))
 
-SCENES ?= lego chair
-PROTOCOLS ?= 100x2 100x4 200x2 200x4
-SUPERVISION ?= average kernel
-quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 (or ENLARGED=1) SET="seed=1" OUT=FILE
-	@python3 scripts/quality.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --supervision $(SUPERVISION) \
-	  $(if $(SPLIT),--split $(SPLIT)) $(if $(REFINED),--refined) $(if $(ENLARGED),--enlarged) --set $(if $(RAYS),rays=$(RAYS)) $(SET) \
-	  --out $(or $(OUT),out/quality.json)
+# Experiments are files of experiments/; a variable that is given takes the place of what the file names.
+SCENES ?=
+PROTOCOLS ?=
+SUPERVISION ?=
+# Words of an option for each value: $(call each,-p ,$(SET)) is -p A=1 -p B=2.
+each = $(foreach value,$(2),$(1)$(value))
+chosen = $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--protocol $(call list,$(PROTOCOLS))) --data $(or $(HELD_OUT),$(DATA)) \
+  $(if $(SPLIT),-p split=$(SPLIT)) $(if $(RAYS),-p train-ss.rays=$(RAYS)) $(call each,-p ,$(SET))
+# Runs an experiment alone, so that times mean something, and copies its rows to OUT (JSON): $(call experiment,NAME,TABLE,more words)
+experiment = $(NERF_SR) run $(1) -j 1 --out out/$(1) $(chosen) $(2) && mkdir -p $(dir $(or $(OUT),out/$(1).json)) && \
+  cp out/$(1)/$(1)/rows.json $(or $(OUT),out/$(1).json)
+QUALITY := quality$(if $(ENLARGED),-enlarged,$(if $(REFINED),-refined))
+quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="lego chair" PROTOCOLS="100x2" REFINED=1 SET="seed=1" OUT=FILE
+	@$(call experiment,$(QUALITY),$(if $(SUPERVISION),-p train-ss.supervision=$(call list,$(SUPERVISION))))
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
 table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
@@ -97,25 +104,31 @@ table: build ## The paper's tables with every method: make table SCENES="lego" P
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(RAYS),--rays $(RAYS)) --kernel $(firstword $(KERNEL)) --set $(SET) --out $(or $(OUT),out/table.md)
 
 REFERENCES ?= 1
-# Unless given: photographs, which references are for.
-given = $(if $(filter file,$(origin $(1))),$(2),$($(1)))
+MOST_REFERENCES = $(lastword $(sort $(REFERENCES)))
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
-	@python3 scripts/refine-table.py --data $(DATA) --scenes $(call given,SCENES,fern) --protocols $(call given,PROTOCOLS,252x2 252x4) --references $(REFERENCES) \
-	  $(if $(SPLIT),--split $(SPLIT)) --set $(SET) --out $(or $(OUT),out/refine-table.json)
+	@$(call experiment,refine-table,$(call each,--variant ,$(REFERENCES)) -p prep.hr_references=$(MOST_REFERENCES))
 
+PAPER_STEPS ?= 400
 refine-ablation: build ## What each part of refinement brings, on downscaled views that its training leaves out
-	@python3 scripts/refine-ablation.py --data $(DATA) --scenes $(call given,SCENES,fern) $(if $(SPLIT),--split $(SPLIT)) \
-	  $(if $(VARIANTS),--variants $(VARIANTS)) $(if $(PAPER_STEPS),--paper-steps $(PAPER_STEPS)) --set $(SET) --out $(or $(OUT),out/refine-ablation.json)
+	@$(call experiment,refine-ablation,$(if $(VARIANTS),--first-variants $(VARIANTS)))
+ifneq ($(PAPER_STEPS),0)
+	@$(NERF_SR) run paper-ablation -j 1 --out out/paper-ablation $(chosen) -p train-paper.steps=$(PAPER_STEPS)
+endif
 
-ablation: build ## What each part brings and costs, on withheld training views
-	@python3 scripts/ablation.py ablation --data $(DATA) --scenes $(SCENES) $(if $(RAYS),--rays $(RAYS)) \
-	  $(if $(VARIANTS),--variants $(VARIANTS)) --out $(or $(OUT),out/ablation.json)
+# Training views withheld from scenes, on which choices are made.
+held-out:
+	@for scene in $(or $(SCENES),lego chair); do for folder in nerf_synthetic nerf_llff_data .; do \
+	  if [ -d $(DATA)/$$folder/$$scene ]; then python3 scripts/hold-out.py $(DATA)/$$folder/$$scene out/held-out/$$scene; break; fi; done; done >/dev/null
 
-tradeoff: build ## PSNR against training time, on withheld training views
-	@python3 scripts/ablation.py tradeoff --data $(DATA) --scenes $(SCENES) --out $(or $(OUT),out/tradeoff.json)
+ablation tradeoff: HELD_OUT = out/held-out
+ablation: build held-out ## What each part brings and costs, on withheld training views
+	@$(call experiment,ablation,$(if $(VARIANTS),--first-variants $(VARIANTS)))
+
+tradeoff: build held-out ## PSNR against training time, on withheld training views
+	@$(call experiment,tradeoff)
 
 seeds: build ## Ten seeds on the demo scene: the spread of the PSNR
-	@python3 scripts/ablation.py seeds --rays $(or $(RAYS),6000000) --out $(or $(OUT),out/seeds.json)
+	@$(call experiment,seeds)
 
 BENCH_SCENE := out/bench/scene
 bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)

@@ -256,43 +256,6 @@ fn members_are_fields_of_their_own_and_average() {
     }
 }
 
-/// `make quality` and its like: cells come out as JSON rows, a second call runs nothing, and a mistake is one line.
-#[test]
-fn tables_are_made_of_cells() {
-    let project = Project::tiny();
-    project.replace("default: [eval]", "default: [report]");
-    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
-    project.write("pipeline.yaml", &(text + "  report:\n    inputs: {run: eval}\n"));
-    project.demo_data();
-    let rows =
-        |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
-    let quality = ["--scenes", "demo", "--protocols", "24x2", "12x4", "--out", "out/quality.json", "--set", "rays=60000"];
-    let Finished { code, stdout, stderr } = project.script("quality.py", &quality);
-    assert_eq!(code, 0, "{stderr}");
-    assert!(stdout.contains("| 12x4 | demo | kernel |"), "{stdout}");
-    let made = rows("out/quality.json");
-    assert_eq!(made.len(), 4);
-    for row in &made {
-        for name in ["psnr", "ssim", "train_s", "render_s", "rays_per_s"] {
-            assert!(row[name].as_f64().is_some_and(|v| v > 0.0), "{name}: {row}");
-        }
-        assert!(["scene", "protocol", "supervision"].iter().all(|name| row[name].is_string()), "{row}");
-    }
-    let again = project.script("quality.py", &quality).stdout;
-    assert!(!again.contains("running") && again.contains("| 24x2 | demo | average |"), "{again}");
-    assert_eq!(rows("out/quality.json"), made);
-
-    let tradeoff = ["tradeoff", "--scenes", "demo", "--protocol", "24x2", "--variants", "2", "--out", "out/tradeoff.json"];
-    let Finished { code, stdout, stderr } = project.script("ablation.py", &tradeoff);
-    assert_eq!(code, 0, "{stderr}");
-    assert!(stdout.contains("| 1.5 M rays |"), "{stdout}");
-    assert_eq!(rows("out/tradeoff.json").len(), 2);
-    assert!(std::fs::read_to_string(project.path("out/tradeoff.svg")).unwrap().ends_with("</svg>\n"));
-
-    let missing = project.script("quality.py", &["--scenes", "nowhere"]);
-    assert_eq!((missing.code, missing.stderr.trim()), (1, "no scene nowhere in data: set DATA=DIR to a folder that has it"));
-}
-
 /// A field renders at any size, and images need not be square.
 #[test]
 fn any_size_and_shape() {

@@ -321,61 +321,6 @@ fn bad_references_do_no_harm() {
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
 }
 
-/// `make refine-table` and `make quality REFINED=1`: rows for what is rendered and what is refined, on the same views.
-#[test]
-fn tables_have_rendered_and_refined_rows() {
-    let project = project();
-    project.demo_data();
-    // Where there are weights, scripts hand them to LPIPS.
-    if let Some(data) = data() {
-        std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
-    }
-    let table = ["--scenes", "demo", "--protocols", "24x2", "--references", "1", "2", "--out", "out/table.json"];
-    let more = ["--set", "rays=60000", "downscaled-field.rays=30000"];
-    let made = project.script("refine-table.py", &[&table[..], &more].concat());
-    assert_eq!(made.code, 0, "{}", made.stderr);
-    assert!(made.stdout.contains("| 24x2 | demo | refine | 2 |"), "{}", made.stdout);
-    assert!(made.stdout.contains("finetuned-field.rays=30000"), "half of what is set: {}", made.stdout);
-    let read =
-        |file: &str| -> Vec<serde_json::Value> { serde_json::from_slice(&std::fs::read(project.path(file)).unwrap()).unwrap() };
-    let rows: Vec<(String, u64)> = read("out/table.json")
-        .iter()
-        .map(|r| {
-            assert!(
-                ["psnr", "ssim", "near_psnr", "seconds_per_view"].iter().all(|k| r[k].as_f64().is_some_and(|v| v > 0.0)),
-                "{r}"
-            );
-            assert_eq!(r["least_gain"] == 0.0, r["method"] == "ss", "{r}");
-            (r["method"].as_str().unwrap().to_owned(), r["references"].as_u64().unwrap())
-        })
-        .collect();
-    assert_eq!(rows, [("ss".into(), 0), ("refine".into(), 0), ("refine".into(), 1), ("refine".into(), 2)]);
-
-    let quality =
-        ["--scenes", "demo", "--protocols", "24x2", "--supervision", "kernel", "--enlarged", "--out", "out/quality.json"];
-    let made = project.script("quality.py", &[&quality[..], &more].concat());
-    assert_eq!(made.code, 0, "{}", made.stderr);
-    assert!(made.stdout.contains("| 24x2 | demo | kernel, refined |"), "{}", made.stdout);
-    let rows = read("out/quality.json");
-    let kinds: Vec<(bool, bool)> =
-        rows.iter().map(|r| (r["refined"].as_bool().unwrap(), r["enlarged"].as_bool().unwrap())).collect();
-    assert_eq!(kinds, [(false, false), (true, false), (true, true)]);
-
-    let ours = ["--protocol", "24x2", "--variants", "4", "--steps", "40", "--paper-steps", "0", "--out", "out/ablation.json"];
-    let parts = [&["--scenes", "demo"], &ours[..], &["--set", "downscaled-field.rays=30000"]].concat();
-    let made = project.script("refine-ablation.py", &parts);
-    assert_eq!(made.code, 0, "{}", made.stderr);
-    for part in ["no occlusion test", "aligned"] {
-        assert!(made.stdout.contains(&format!("| one reference, {part} |")), "{}", made.stdout);
-    }
-    let rows = read("out/ablation.json");
-    let refined: Vec<f64> = rows.iter().map(|r| r["refined"].as_f64().unwrap()).collect();
-    assert!(
-        refined.len() == 4 && refined[0] != refined[1] && refined[0] != refined[3] && refined.iter().all(|r| r.is_finite()),
-        "{refined:?}"
-    );
-}
-
 /// HR references that join the training: what they show is learnt.
 #[test]
 fn references_join_a_training() {
@@ -588,21 +533,6 @@ fn the_paper_s_network_refines_by_references() {
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));
     let file: serde_json::Value = serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
     assert_eq!(file["network"]["paper"]["width"], 4);
-
-    // Its parts on and off: `make refine-ablation`.
-    project.demo_data();
-    if let Some(data) = data() {
-        std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();
-    }
-    let parts = ["--scenes", "demo", "--protocol", "36x2", "--variants", "0", "--paper-steps", "2", "--out", "out/paper.json"];
-    let small = ["--set", "rays=60000", "train-paper.features=4", "train-paper.batch=2"];
-    let made = project.script("refine-ablation.py", &[&parts[..], &small].concat());
-    assert_eq!(made.code, 0, "{}", made.stderr);
-    assert!(made.stdout.contains("| patches side by side |"), "{}", made.stdout);
-    let rows: Vec<serde_json::Value> = serde_json::from_slice(&std::fs::read(project.path("out/paper.json")).unwrap()).unwrap();
-    let psnr: Vec<f64> = rows.iter().map(|r| r["psnr"].as_f64().unwrap()).collect();
-    assert!(psnr.len() == 5 && psnr.iter().all(|p| p.is_finite()), "{psnr:?}");
-    assert!(psnr[1] != psnr[3], "fewer reference patches change nothing: {psnr:?}");
 
     // Without references, patches are given themselves.
     let none = project.path("none");

@@ -22,6 +22,7 @@ fn descriptions() -> Vec<Description> {
         render_depth::RenderDepth::describe("", ""),
         eval::Eval::describe("", ""),
         report::Report::describe("", ""),
+        table::Table::describe("", ""),
         camera_path::CameraPath::describe("", ""),
         video::Video::describe("", ""),
         register::Register::describe("", ""),

@@ -86,7 +86,7 @@ fn views_are_enlarged_and_scored() {
 #[test]
 fn the_table_has_every_method_side_by_side() {
     let project = Project::tiny();
-    project.demo_data();
+    project.demo_data("demo");
     let methods = ["nerf", "nerf-epochs", "bicubic", "swinir", "ss", "kernel", "hr"];
     let arguments =
         [&["--scenes", "demo", "--protocols", "24x2", "--rays", "40000", "--out", "out/table.md", "--methods"], &methods[..]];

@@ -100,6 +100,15 @@ impl Project {
         }
     }
 
+    /// Copies a shipped folder of pipeline files beside the pipeline.
+    pub fn copy_folder(&self, folder: &str) {
+        for entry in std::fs::read_dir(root().join(folder)).unwrap() {
+            let path = entry.unwrap().path();
+            let name = path.file_name().unwrap().to_str().unwrap().to_owned();
+            self.write(&format!("{folder}/{name}"), &std::fs::read_to_string(&path).unwrap());
+        }
+    }
+
     pub fn path(&self, file: &str) -> PathBuf {
         self.dir.path().join(file)
     }
@@ -176,12 +185,12 @@ impl Project {
         found.unwrap_or_else(|| panic!("no object {start}"))
     }
 
-    /// The pipeline's own demo scene as `data/demo`, for scripts that are told a data folder.
-    pub fn demo_data(&self) {
+    /// The pipeline's own demo scene as `data/NAME`, for whoever is told a data folder.
+    pub fn demo_data(&self, name: &str) {
         self.ok(&["run", "demo-scene"]);
         let dataset = self.object(&self.output_of("demo-scene", &[])[0]);
         std::fs::create_dir_all(self.path("data")).unwrap();
-        std::os::unix::fs::symlink(&dataset, self.path("data/demo")).unwrap();
+        std::os::unix::fs::symlink(&dataset, self.path("data").join(name)).unwrap();
     }
 
     /// Calls one of the measuring scripts on `data`.

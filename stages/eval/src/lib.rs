@@ -12,6 +12,7 @@
 //! as right, and PSNR is that of the rest.
 
 mod depth;
+mod derived;
 #[cfg(feature = "torch")]
 mod lpips;
 mod perceptual;
@@ -22,6 +23,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
+use derived::{least_gain, near_references};
 use perceptual::{MISSING, Perceptual};
 use pixels::{
     DEGRADATION_FILE, Degradation, Filter, Image, Mask, Palette, Resampling, Rgba8, heat, psnr_of, read_exr, read_premultiplied,
@@ -33,6 +35,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use depth::{DepthError, depth_error};
+pub use derived::NearReferences;
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
 pub use perceptual::LpipsNetwork;
@@ -62,6 +65,12 @@ pub struct Metrics {
     pub conventions: MetricConventions,
     /// Means of the per-view values.
     pub mean: Scores,
+    /// Gain in dB of the view that fares worst over input `baseline`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least_gain: Option<f64>,
+    /// Scores of the views near an HR reference, where input `references` is given.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub near_references: Option<NearReferences>,
     /// Every view.
     pub views: Vec<ViewScores>,
 }
@@ -158,6 +167,8 @@ impl Stage for Eval {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("truth", Input::required(&["scene/truth"], "ground truth, views of the same names")),
+            ("baseline", Input::optional(&["metrics"], "scores of the same views to compare with, for the least gain of a view")),
+            ("references", Input::optional(&["scene/references"], "HR references, for scores of the views near one")),
             (
                 "weights",
                 Input::optional(
@@ -189,8 +200,15 @@ impl Stage for Eval {
             Ok(scores)
         };
         let scored = truth.views.par_iter().map(score).collect::<anyhow::Result<Vec<_>>>()?;
-        let mean = mean_of(&scored);
-        let metrics = Metrics { conventions: conventions(params, &truth, &perceptual, made), mean, views: scored };
+        let baseline = context.optional_input("baseline");
+        let references = context.optional_input("references").map(Views::read).transpose()?;
+        let metrics = Metrics {
+            conventions: conventions(params, &truth, &perceptual, made),
+            mean: mean_of(&scored),
+            least_gain: baseline.map(|baseline| least_gain(&scored, baseline)).transpose()?.flatten(),
+            near_references: references.and_then(|references| near_references(&scored, &truth, &references)),
+            views: scored,
+        };
         context.write_json("metrics.json", &metrics)?;
         context.write_summary(&summary(&metrics))
     }

@@ -33,7 +33,7 @@ pub struct Params {
     pub columns: Vec<String>,
     /// Values to show, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, and all others that `rows.json` has.
     pub values: Vec<String>,
-    /// The row that others are compared with, by its keys: a further column has their PSNR minus its own.
+    /// The row that others are compared with, by its keys. A further column has the first of `values` minus that row's.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
     /// Values whose mean, standard deviation, least and greatest are stated over all results.

@@ -20,7 +20,8 @@ pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) ->
         true => head.extend(columns.iter().map(|column| format!("{} ({})", column.join(", "), titles(&values).join(" / ")))),
         false => head.extend(titles(&values)),
     }
-    let first = reference(params, rows)?;
+    let compared = values.first().map_or("psnr", |name| name.as_str());
+    let first = reference(params, rows, compared)?;
     head.extend(first.is_some().then(|| "against the first".to_owned()));
     head.extend(PLACES.map(str::to_owned));
     let best = |column: &[String], name: &str| {
@@ -40,7 +41,7 @@ pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) ->
             }
         }
         if let Some(first) = first {
-            line.push(mean(&mine, "psnr").map_or("–".to_owned(), |psnr| format!("{:+.2}", psnr - first)));
+            line.push(mean(&mine, compared).map_or("–".to_owned(), |value| format!("{:+.2}", value - first)));
         }
         line.extend(PLACES.map(|name| together(&mine, name)));
         lines.push(line);
@@ -74,14 +75,14 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
     Ok(known.into_iter().filter(is_row).cloned().collect())
 }
 
-/// The PSNR that others are compared with.
-fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, String> {
+/// The value that others are compared with.
+fn reference(params: &Params, rows: &[Row], compared: &str) -> Result<Option<f64>, String> {
     if params.relative_to.is_empty() || rows.is_empty() {
         return Ok(None);
     }
     let (keys, values): (Vec<String>, Vec<String>) = params.relative_to.clone().into_iter().unzip();
-    match mean(&of(rows, &keys, &values), "psnr") {
-        Some(psnr) => Ok(Some(psnr)),
+    match mean(&of(rows, &keys, &values), compared) {
+        Some(value) => Ok(Some(value)),
         None => Err(format!("parameter relative_to: no result has {:?}", params.relative_to)),
     }
 }

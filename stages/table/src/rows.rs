@@ -39,6 +39,8 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
     if node.kind == "refiner" {
         let file = read(&node.folder.join("refiner.json"))?;
         numbers("", &file, &mut found);
+        let gain = file["refined_psnr"].as_f64().zip(file["rendered_psnr"].as_f64()).map(|(after, before)| after - before);
+        found.extend(gain.map(|gain| ("gain".to_owned(), json!(gain))));
         return Ok(found);
     }
     if node.kind != "metrics" {
@@ -46,6 +48,9 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
     }
     let file = read(&node.folder.join("metrics.json"))?;
     numbers("", &file["mean"], &mut found);
+    for name in ["least_gain", "near_references"] {
+        numbers(name, &file[name], &mut found);
+    }
     found.insert("views".to_owned(), json!(file["views"].as_array().map_or(0, Vec::len)));
     Ok(found)
 }
