@@ -201,7 +201,7 @@ fn a_full_disk_leaves_the_old_page() {
 #[test]
 fn any_file_name_may_lie_in_a_data_folder() {
     let project = Project::fast();
-    project.demo_data();
+    project.demo_data("demo");
     let data = project.path("ds");
     assert!(Command::new("cp").arg("-rL").args([project.path("data/demo"), data.clone()]).status().unwrap().success());
     std::fs::remove_file(data.join("artifact.json")).unwrap();
