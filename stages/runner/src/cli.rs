@@ -8,14 +8,14 @@ use garbage::Choice;
 use slurm::Site;
 
 use crate::execute::{Cluster, Executor, JOB_VERB, Local};
-use crate::experiment::Choice as Selection;
 use crate::graph::{ascii, dot, svg};
 use crate::limits::capped;
-use crate::pipeline::Pipeline;
-use crate::plan::{Devices, PlanError, Request};
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::verbs::{self, Style};
+use planning::Choice as Selection;
+use planning::Pipeline;
+use planning::{Devices, PlanError, Request};
 
 /// Where the pipeline is looked for.
 const PIPELINE: &str = "pipeline.yaml";

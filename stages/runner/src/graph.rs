@@ -1,6 +1,6 @@
 //! Drawings of a plan: text, Graphviz, SVG.
 
-use crate::plan::{Origin, Plan, State};
+use planning::{Origin, Plan, State};
 
 /// A node or a sink, as it is drawn.
 struct Drawn<'a> {

@@ -6,7 +6,7 @@ use artifact::{Manifest, Record, Store, label};
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-use crate::changes::{Change, changes};
+use planning::{Change, changes};
 
 /// Metrics of an artifact.
 const METRICS_FILE: &str = "metrics.json";

@@ -8,10 +8,9 @@ use serde::Serialize;
 use serde_json::{Map, Value};
 use slurm::Job;
 
-use crate::changes::Change;
-use crate::key;
-use crate::plan::{Node, Origin, Plan, State};
 use crate::session::Session;
+use planning::Change;
+use planning::{Plan, State};
 
 /// A plan's nodes, each after those that it needs, and its sinks.
 #[derive(Debug, Serialize)]
@@ -127,23 +126,12 @@ impl NodeReport {
             State::WillRun { key_parts } => {
                 let key = hash_json(key_parts);
                 report.has_checkpoint = store.has_checkpoint(&key);
-                report.changes = key::nearest_changes(key_parts, &node.stage, records);
+                report.changes = planning::nearest_changes(key_parts, &node.stage, records);
                 report.key = Some(key);
             }
             State::Waits { on } => report.waits_on.clone_from(on),
         }
         report.by_scene = node.by_scene(&folder);
         report
-    }
-}
-
-impl Node {
-    /// Its inputs as a record names them; `number` gives another node's place in the record.
-    pub(crate) fn run_inputs(&self, number: impl Fn(usize) -> Option<usize>) -> BTreeMap<String, RunInput> {
-        let source = |from: &Origin| match from {
-            Origin::Node { index, subtree } => RunInput { node: number(*index), subtree: subtree.clone(), folder: None },
-            Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
-        };
-        self.inputs.iter().map(|input| (input.name.clone(), source(&input.from))).collect()
     }
 }

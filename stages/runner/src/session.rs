@@ -7,11 +7,10 @@ use artifact::{Store, check_device, report_text};
 use slurm::{Job, Queue, Slurm};
 
 use crate::execute::identities;
-use crate::pipeline::Pipeline;
-use crate::plan::{Devices, Plan, PlanError, Request, State};
-use crate::renames::known_blocks;
-use crate::stages::Asking;
-use crate::targets;
+use planning::Asking;
+use planning::Pipeline;
+use planning::known_blocks;
+use planning::{Devices, Plan, PlanError, Request, State};
 
 /// What every verb works with.
 pub(crate) struct Session {
@@ -44,7 +43,7 @@ impl Session {
     }
 
     fn plan_asking(&self, what: &Request, asking: Asking) -> anyhow::Result<Plan> {
-        let (pipeline, targets) = targets::find(&self.pipeline, &what.targets)?;
+        let (pipeline, targets) = planning::find(&self.pipeline, &what.targets)?;
         let plan = Plan::new(&pipeline, &self.store, &Request { targets, ..what.clone() }, asking)?;
         let plan = Plan { devices: self.devices.clone(), ..plan };
         plan.notes.iter().for_each(|note| report_text(note));

@@ -9,8 +9,8 @@ use artifact::{FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, R
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
 
-use crate::plan::{Plan, Sink};
 use crate::publish;
+use planning::{Plan, Sink};
 
 /// The record of the nodes that a sink shows and all they were made of; none where some of that isn't there, unless the sink shows what there
 /// is.

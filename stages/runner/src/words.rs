@@ -7,10 +7,9 @@ use artifact::{Record, hash_json};
 use serde_json::Value;
 use stage_call::seconds;
 
-use crate::changes::short;
-use crate::key;
-use crate::plan::{Node, Plan, Sink, State};
 use crate::session::Session;
+use planning::short;
+use planning::{Node, Plan, Sink, State};
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
 pub(crate) fn causes(states: &[State], index: usize) -> Vec<usize> {
@@ -34,7 +33,7 @@ pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State,
             format!("waits for {}; if that comes out as before, it stays cached", names.join(", "))
         }
         State::WillRun { .. } if records.is_empty() => "will run".to_owned(),
-        State::WillRun { key_parts } => match key::explain(key_parts, &plan.nodes[index].stage, records) {
+        State::WillRun { key_parts } => match planning::explain(key_parts, &plan.nodes[index].stage, records) {
             None => "will run: it never ran before".to_owned(),
             Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
                 Some(record) => format!("will run: its artifact {} is gone or incomplete", short(&record.output)),

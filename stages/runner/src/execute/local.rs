@@ -12,10 +12,10 @@ use stage_call::{Display, StageFailure};
 
 use super::{Executor, NodeJob, Work};
 use crate::counts;
-use crate::plan::Plan;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::sink::{Showing, Shown, show};
+use planning::Plan;
 
 /// This machine.
 pub(crate) struct Local {

@@ -1,6 +1,5 @@
 //! Who sees to it that a plan's nodes are made: this process, or a cluster's jobs.
 
-mod frozen;
 mod local;
 mod node;
 mod slurm;
@@ -11,10 +10,9 @@ use std::sync::atomic::AtomicBool;
 
 use artifact::RunFile;
 
-use crate::plan::Plan;
 use crate::session::Session;
+use planning::Plan;
 
-pub(crate) use frozen::Frozen;
 pub(crate) use local::Local;
 pub(crate) use node::NodeJob;
 pub(crate) use slurm::{Cluster, JOB_VERB, identities};

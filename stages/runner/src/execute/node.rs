@@ -8,9 +8,8 @@ use std::time::{Duration, Instant};
 use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
 use stage_call::{Call, Display, StageFailure, seconds};
 
-use crate::key;
-use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use crate::waiting::{by, enter, until_held};
+use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 
 /// A node's inputs: where each lies, and the hash of its content.
 struct Inputs {
@@ -37,7 +36,7 @@ impl NodeJob<'_> {
             PlanError::Source(message) => StageFailure { code: 3, message },
             other => fail(other),
         })?;
-        let key_parts = key::parts(self.node, &hashes, self.device());
+        let key_parts = planning::parts(self.node, &hashes, self.device());
         let key = hash_json(&key_parts);
         if let Some(record) = self.find(&key)? {
             return Ok((record, false));

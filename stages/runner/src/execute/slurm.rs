@@ -9,11 +9,12 @@ use artifact::{Failure, Record, Store, counted, hash_json, print_line, report_li
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
 
-use super::{Executor, Frozen, Work};
+use planning::Frozen;
+
+use super::{Executor, Work};
 use crate::counts;
-use crate::key;
-use crate::plan::{Origin, Plan, PlanError, State, source_hash};
 use crate::sink::is_shown;
+use planning::{Origin, Plan, PlanError, State, source_hash};
 
 /// The verb that a job calls.
 pub(crate) const JOB_VERB: &str = "job";
@@ -111,7 +112,7 @@ pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, Plan
             };
             inputs.push((input.name.clone(), from));
         }
-        identities.push(hash_json(&key::parts(node, &inputs, plan.device(&node.stage))));
+        identities.push(hash_json(&planning::parts(node, &inputs, plan.device(&node.stage))));
     }
     Ok(identities)
 }

@@ -2,15 +2,14 @@ use std::process::{Command, ExitCode};
 
 use anyhow::Context as _;
 
-use crate::pipeline::Pipeline;
-use crate::plan::PlanError;
-use crate::renames::known_blocks;
-use crate::stages::executable;
-use crate::targets;
+use planning::Pipeline;
+use planning::PlanError;
+use planning::executable;
+use planning::known_blocks;
 
 /// Prints the help of a stage's program: what it makes, its inputs and its parameters.
 pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {
-    let (pipeline, _) = targets::find(pipeline, &[stage.to_owned()])?;
+    let (pipeline, _) = planning::find(pipeline, &[stage.to_owned()])?;
     if !pipeline.stages.contains_key(stage) {
         let known = known_blocks(stage, pipeline.stages.keys().map(String::as_str));
         return Err(PlanError::Usage(format!("no stage {stage:?}; {known}")).into());

@@ -2,10 +2,10 @@ use std::process::ExitCode;
 
 use artifact::{Failure, print_line, print_lines};
 
-use crate::changes::Change;
 use crate::lineage::{Lineage, StageDifference};
-use crate::plan::{PlanError, Request, State};
 use crate::session::{Session, of_stage};
+use planning::Change;
+use planning::{PlanError, Request, State};
 
 /// More files than these are counted, not listed.
 const MOST_FILES: usize = 4;

@@ -5,9 +5,9 @@ use garbage::{Choice, Root, Verdict, judge};
 use serde_json::json;
 use stage_call::seconds;
 
-use crate::plan::Request;
 use crate::session::Session;
 use crate::waiting::until_held;
+use planning::Request;
 
 /// Removes what nothing needs any more.
 pub(crate) fn gc(session: &Session, what: &Request, choice: Choice, style: Style) -> anyhow::Result<ExitCode> {

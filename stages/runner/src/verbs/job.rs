@@ -10,10 +10,12 @@ use slurm::{Slurm, Submission};
 use stage_call::{Display, StageFailure, ask_all};
 
 use super::run::register;
-use crate::execute::{Frozen, NodeJob};
-use crate::plan::{Node, Plan, Sink, State};
+use planning::Frozen;
+
+use crate::execute::NodeJob;
 use crate::sink::{Showing, Shown, show};
-use crate::stages::StageProgram;
+use planning::StageProgram;
+use planning::{Node, Plan, Sink, State};
 
 /// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a sink.
 pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {

@@ -2,8 +2,8 @@ use std::process::ExitCode;
 
 use artifact::{Locked, print_line};
 
-use crate::plan::{PlanError, Request, State};
 use crate::session::{Session, command_line};
+use planning::{PlanError, Request, State};
 
 /// Keeps what the targets have, until `unpin`.
 pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Result<ExitCode> {

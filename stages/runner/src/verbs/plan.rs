@@ -3,9 +3,9 @@ use std::process::ExitCode;
 use artifact::{print_line, print_lines};
 
 use crate::node_report::PlanReport;
-use crate::plan::Request;
 use crate::session::Session;
 use crate::words::{by_scene, shown, words};
+use planning::Request;
 
 /// Shows what `run` would do.
 pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {

@@ -4,9 +4,9 @@ use artifact::{counted, hash_json, print_line, print_lines, sized};
 use stage_call::seconds;
 
 use crate::node_report::PlanReport;
-use crate::plan::{Request, State};
 use crate::session::Session;
 use crate::words::age;
+use planning::{Request, State};
 
 /// Shows every stage with its artifact, age and time.
 pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {

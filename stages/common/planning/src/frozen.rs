@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use anyhow::{Context as _, anyhow};
 use artifact::Description;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -15,9 +14,9 @@ use crate::stages::StageProgram;
 
 /// A plan without what can be made again from the rest.
 #[derive(Serialize, Deserialize)]
-pub(crate) struct Frozen {
+pub struct Frozen {
     /// Where pages go.
-    pub(crate) out: PathBuf,
+    pub out: PathBuf,
     devices: Devices,
     resources: BTreeMap<String, Resources>,
     programs: BTreeMap<PathBuf, Description>,
@@ -43,8 +42,36 @@ struct FrozenSink {
     program: PathBuf,
 }
 
+/// Why a frozen plan can't be used.
+#[derive(Debug, thiserror::Error)]
+pub enum FrozenError {
+    /// The file can't be read.
+    #[error("{path}: {source}")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It has another form.
+    #[error("{path}: another nerf-sr wrote it ({source}); submit it again")]
+    Form {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// There is no such task.
+    #[error("the submission has no task {0}")]
+    Task(usize),
+    /// A program isn't described as it should be.
+    #[error("{0}")]
+    Program(String),
+}
+
 impl Frozen {
-    pub(crate) fn new(plan: &Plan, out: &Path) -> Self {
+    /// The plan as it is written; pages go to a folder.
+    pub fn new(plan: &Plan, out: &Path) -> Self {
         let programs = plan.nodes.iter().map(|node| &node.program).chain(plan.sinks.iter().map(|sink| &sink.program));
         let nodes = plan.nodes.iter().map(|node| FrozenNode {
             stage: node.stage.clone(),
@@ -70,14 +97,15 @@ impl Frozen {
         }
     }
 
-    pub(crate) fn read(path: &Path) -> anyhow::Result<Self> {
-        let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
-        serde_json::from_slice(&bytes).with_context(|| format!("{}: another nerf-sr wrote it; submit it again", path.display()))
+    /// Reads a file that a submission wrote.
+    pub fn read(path: &Path) -> Result<Self, FrozenError> {
+        let bytes = std::fs::read(path).map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
+        serde_json::from_slice(&bytes).map_err(|source| FrozenError::Form { path: path.to_path_buf(), source })
     }
 
     /// The plan of one task: the nodes that it needs, and itself at the end. Sinks are counted after the nodes.
-    pub(crate) fn part(&self, number: usize) -> anyhow::Result<Plan> {
-        let absent = || anyhow!("the submission has no task {number}");
+    pub fn part(&self, number: usize) -> Result<Plan, FrozenError> {
+        let absent = || FrozenError::Task(number);
         let sink = number.checked_sub(self.nodes.len()).map(|index| self.sinks.get(index).ok_or_else(absent)).transpose()?;
         let mut wanted: BTreeSet<usize> = sink.map_or_else(|| [number].into(), |sink| sink.shows.iter().copied().collect());
         for index in (0..self.nodes.len()).rev() {
@@ -107,12 +135,13 @@ impl Frozen {
         &'a self,
         path: &'a Path,
         known: &mut BTreeMap<&'a Path, Arc<StageProgram>>,
-    ) -> anyhow::Result<Arc<StageProgram>> {
+    ) -> Result<Arc<StageProgram>, FrozenError> {
         if let Some(program) = known.get(path) {
             return Ok(Arc::clone(program));
         }
-        let description = self.programs.get(path).with_context(|| format!("nothing describes {}", path.display()))?;
-        let program = Arc::new(StageProgram::new(path, description.clone()).map_err(anyhow::Error::msg)?);
+        let absent = || FrozenError::Program(format!("nothing describes {}", path.display()));
+        let description = self.programs.get(path).ok_or_else(absent)?;
+        let program = Arc::new(StageProgram::new(path, description.clone()).map_err(FrozenError::Program)?);
         known.insert(path, Arc::clone(&program));
         Ok(program)
     }

@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Description, Record, Store, Waiting, hash_json, label};
+use artifact::{Description, Record, RunInput, Store, Waiting, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
@@ -23,22 +23,22 @@ pub struct Plan {
     /// The nodes.
     pub nodes: Vec<Node>,
     /// Sinks that are wanted: name, program, parameters, and the nodes they show (with what those are made of).
-    pub(crate) sinks: Vec<Sink>,
+    pub sinks: Vec<Sink>,
     /// What to tell of the command line: what is overridden there, and what is given twice.
     pub notes: Vec<String>,
     /// Where stages compute.
-    pub(crate) devices: Devices,
+    pub devices: Devices,
     /// What each stage needs of a machine, where the file says so.
-    pub(crate) resources: BTreeMap<String, Resources>,
+    pub resources: BTreeMap<String, Resources>,
 }
 
 /// Where stages compute.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-pub(crate) struct Devices {
+pub struct Devices {
     /// As the command line says.
-    pub(crate) given: String,
+    pub given: String,
     /// Whether a stage that needs GPUs computes on the first of its own.
-    pub(crate) by_resources: bool,
+    pub by_resources: bool,
 }
 
 /// One action to be: a stage at one point of the sweep.
@@ -49,35 +49,49 @@ pub struct Node {
     /// The sweep's values that reach it, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
     /// The values of the axes that reach it and have a name, by that.
-    pub(crate) values: BTreeMap<String, String>,
+    pub values: BTreeMap<String, String>,
     /// All parameters, defaults filled in.
     pub parameters: Value,
-    pub(crate) inputs: Vec<NodeInput>,
-    pub(crate) program: Arc<StageProgram>,
+    /// Inputs, sorted by name.
+    pub inputs: Vec<NodeInput>,
+    /// The stage's program.
+    pub program: Arc<StageProgram>,
+}
+
+/// An input of a node.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NodeInput {
+    /// Its name.
+    pub name: String,
+    /// Where it comes from.
+    pub from: Origin,
 }
 
 /// Where an input comes from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(crate) struct NodeInput {
-    pub(crate) name: String,
-    pub(crate) from: Origin,
-}
-
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub(crate) enum Origin {
+pub enum Origin {
     /// Another node's artifact, or a folder of it.
-    Node { index: usize, subtree: Option<String> },
+    Node {
+        /// The node.
+        index: usize,
+        /// The folder of its artifact that is meant, where that isn't all.
+        subtree: Option<String>,
+    },
     /// A folder outside the store.
     Folder(PathBuf),
 }
 
 /// A stage that shows a run.
-pub(crate) struct Sink {
-    pub(crate) stage: String,
-    pub(crate) program: Arc<StageProgram>,
-    pub(crate) parameters: Value,
-    pub(crate) shows: Vec<usize>,
+pub struct Sink {
+    /// Name of the stage's block.
+    pub stage: String,
+    /// The stage's program.
+    pub program: Arc<StageProgram>,
+    /// All parameters, defaults filled in.
+    pub parameters: Value,
+    /// The nodes that it shows.
+    pub shows: Vec<usize>,
 }
 
 /// What is asked for on the command line.
@@ -118,13 +132,19 @@ impl From<Interrupted> for PlanError {
 
 /// The state of a node before a run.
 #[derive(Debug, Clone)]
-pub(crate) enum State {
+pub enum State {
     /// Done before, with this record.
     Cached(Box<Record>),
     /// Its inputs are known, its key has no record.
-    WillRun { key_parts: Map<String, Value> },
+    WillRun {
+        /// All parts of its key.
+        key_parts: Map<String, Value>,
+    },
     /// It can't be known before these have run.
-    Waits { on: Vec<usize> },
+    Waits {
+        /// Nodes.
+        on: Vec<usize>,
+    },
 }
 
 impl Node {
@@ -134,7 +154,7 @@ impl Node {
     }
 
     /// What a record of it looks like, while its inputs aren't known.
-    pub(crate) fn waiting(&self) -> Waiting {
+    pub fn waiting(&self) -> Waiting {
         Waiting {
             program: self.program.description.name.clone(),
             parameters: self.parameters.as_object().cloned().unwrap_or_default(),
@@ -142,7 +162,7 @@ impl Node {
     }
 
     /// The parameters that the scene decides, with the values that a finished artifact records; null before that.
-    pub(crate) fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
+    pub fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
         let output = &self.program.description.output;
         if output.resolved.is_none() {
             return Map::new();
@@ -153,14 +173,25 @@ impl Node {
     }
 
     /// The nodes it needs.
-    pub(crate) fn parents(&self) -> impl Iterator<Item = usize> + '_ {
+    pub fn parents(&self) -> impl Iterator<Item = usize> + '_ {
         self.inputs.iter().filter_map(NodeInput::node)
+    }
+}
+
+impl Node {
+    /// Its inputs as a record names them; `number` gives another node's place in the record.
+    pub fn run_inputs(&self, number: impl Fn(usize) -> Option<usize>) -> BTreeMap<String, RunInput> {
+        let source = |from: &Origin| match from {
+            Origin::Node { index, subtree } => RunInput { node: number(*index), subtree: subtree.clone(), folder: None },
+            Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
+        };
+        self.inputs.iter().map(|input| (input.name.clone(), source(&input.from))).collect()
     }
 }
 
 impl NodeInput {
     /// The node that makes it.
-    pub(crate) fn node(&self) -> Option<usize> {
+    pub fn node(&self) -> Option<usize> {
         match self.from {
             Origin::Node { index, .. } => Some(index),
             Origin::Folder(_) => None,
@@ -170,7 +201,7 @@ impl NodeInput {
 
 impl State {
     /// In a word.
-    pub(crate) fn word(&self) -> &'static str {
+    pub fn word(&self) -> &'static str {
         match self {
             Self::Cached(_) => "cached",
             Self::WillRun { .. } => "will run",
@@ -179,7 +210,7 @@ impl State {
     }
 
     /// The record, where it is done.
-    pub(crate) fn record(self) -> Option<Record> {
+    pub fn record(self) -> Option<Record> {
         match self {
             Self::Cached(record) => Some(*record),
             Self::WillRun { .. } | Self::Waits { .. } => None,
@@ -187,7 +218,7 @@ impl State {
     }
 
     /// The key, where it is known.
-    pub(crate) fn key(&self) -> Option<String> {
+    pub fn key(&self) -> Option<String> {
         match self {
             Self::Cached(record) => Some(record.key()),
             Self::WillRun { key_parts } => Some(hash_json(key_parts)),
@@ -198,7 +229,7 @@ impl State {
 
 impl Plan {
     /// Checks the whole file, then expands what is asked for.
-    pub(crate) fn new(pipeline: &Pipeline, store: &Store, request: &Request, asking: Asking) -> Result<Self, PlanError> {
+    pub fn new(pipeline: &Pipeline, store: &Store, request: &Request, asking: Asking) -> Result<Self, PlanError> {
         let goal = Goal::new(pipeline, request)?;
         let programs = Programs::ask(pipeline, store, &goal.needed, asking)?;
         goal.plan(pipeline, &programs, request)
@@ -215,13 +246,13 @@ impl Plan {
     }
 
     /// Where a stage computes.
-    pub(crate) fn device(&self, stage: &str) -> &str {
+    pub fn device(&self, stage: &str) -> &str {
         let has_gpu = self.resources.get(stage).is_some_and(Resources::has_gpu);
         if self.devices.by_resources && has_gpu { "cuda:0" } else { &self.devices.given }
     }
 
     /// What is known of each node before a run.
-    pub(crate) fn states(&self, store: &Store) -> Result<Vec<State>, PlanError> {
+    pub fn states(&self, store: &Store) -> Result<Vec<State>, PlanError> {
         let mut states: Vec<State> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
             let on: BTreeSet<usize> = node.parents().filter(|&p| !matches!(states[p], State::Cached(_))).collect();
@@ -274,11 +305,7 @@ impl<'a> Goal<'a> {
 }
 
 /// Content hashes of a node's inputs, given its parents' outputs.
-pub(crate) fn input_hashes(
-    node: &Node,
-    store: &Store,
-    output_of: impl Fn(usize) -> String,
-) -> Result<Vec<(String, String)>, PlanError> {
+pub fn input_hashes(node: &Node, store: &Store, output_of: impl Fn(usize) -> String) -> Result<Vec<(String, String)>, PlanError> {
     let hash = |input: &NodeInput| match &input.from {
         Origin::Node { index, subtree: None } => Ok(output_of(*index)),
         Origin::Node { index, subtree: Some(folder) } => {
@@ -291,7 +318,7 @@ pub(crate) fn input_hashes(
 }
 
 /// Content hash of a folder outside the store, an input of a node.
-pub(crate) fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path) -> Result<String, PlanError> {
+pub fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path) -> Result<String, PlanError> {
     let problem = |e| PlanError::Source(format!("stage {}: input {input}: {e}", node.stage));
     crate::sources::hash_source(store, folder).map_err(problem)
 }

@@ -18,10 +18,10 @@ use crate::stages::{Programs, StageProgram};
 #[derive(Debug)]
 pub(crate) struct Axis {
     /// By which points are called.
-    pub(crate) name: String,
-    pub(crate) values: Vec<AxisValue>,
+    pub name: String,
+    pub values: Vec<AxisValue>,
     /// Whether points have its value in their name, though it is the only one.
-    pub(crate) is_named: bool,
+    pub is_named: bool,
     /// As it was given, for people.
     given: String,
 }
@@ -29,11 +29,11 @@ pub(crate) struct Axis {
 /// A parameter or an input of a stage, set.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Setting {
-    pub(crate) stage: String,
-    pub(crate) kind: Kind,
-    pub(crate) name: String,
+    pub stage: String,
+    pub kind: Kind,
+    pub name: String,
     /// The parameter's value; of an input, the folder that it leads to.
-    pub(crate) value: Value,
+    pub value: Value,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,8 +46,8 @@ pub(crate) enum Kind {
 /// experiment sets several.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct AxisValue {
-    pub(crate) text: String,
-    pub(crate) settings: Vec<Setting>,
+    pub text: String,
+    pub settings: Vec<Setting>,
 }
 
 impl Kind {
@@ -130,10 +130,10 @@ impl Axis {
 
 /// What names on the command line are looked up in.
 pub(crate) struct Scope<'a> {
-    pub(crate) pipeline: &'a Pipeline,
-    pub(crate) programs: &'a Programs,
+    pub pipeline: &'a Pipeline,
+    pub programs: &'a Programs,
     /// The stages that the targets come to.
-    pub(crate) needed: &'a BTreeSet<String>,
+    pub needed: &'a BTreeSet<String>,
 }
 
 impl Scope<'_> {

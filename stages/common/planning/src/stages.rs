@@ -20,33 +20,37 @@ use crate::pipeline::{Part, Pipeline, PipelineError};
 
 /// A stage's executable and what it says of itself.
 #[derive(Debug)]
-pub(crate) struct StageProgram {
-    pub(crate) path: PathBuf,
-    pub(crate) description: Description,
-    pub(crate) schema: Schema,
+pub struct StageProgram {
+    /// The executable.
+    pub path: PathBuf,
+    /// What it says of itself.
+    pub description: Description,
+    /// Its parameters.
+    pub schema: Schema,
 }
 
 impl StageProgram {
-    pub(crate) fn new(path: &Path, description: Description) -> Result<Self, String> {
+    /// A program by what it says; fails where that can't be used.
+    pub fn new(path: &Path, description: Description) -> Result<Self, String> {
         description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
         let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
     }
 
     /// Whether a block of this program gives a parameter itself.
-    pub(crate) fn is_given(&self, block: &StageBlock, parameter: &str) -> bool {
+    pub fn is_given(&self, block: &StageBlock, parameter: &str) -> bool {
         block.parameter_layers().any(|layer| self.schema.flattened(layer).contains_key(parameter))
     }
 
     /// The parameters that a block gives, laid over those that were given before.
-    pub(crate) fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
+    pub fn lay_over(&self, given: &mut Map<String, Value>, block: &StageBlock) {
         block.parameter_layers().for_each(|layer| self.schema.lay_over(given, layer));
     }
 }
 
 /// Which programs may be started to ask what they are.
 #[derive(Clone, Copy)]
-pub(crate) enum Asking<'a> {
+pub enum Asking<'a> {
     /// The runner's own, and others that are needed; ends when the flag is set.
     Run(&'a AtomicBool),
     /// The runner's own.
@@ -54,26 +58,26 @@ pub(crate) enum Asking<'a> {
 }
 
 /// The stages' programs, or why they aren't known.
-pub(crate) struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);
+pub struct Programs(BTreeMap<String, Result<Arc<StageProgram>, PipelineError>>);
 
 impl Programs {
     /// A stage's program, where it is known.
-    pub(crate) fn get(&self, stage: &str) -> Option<&StageProgram> {
+    pub fn get(&self, stage: &str) -> Option<&StageProgram> {
         self.0.get(stage)?.as_deref().ok()
     }
 
     /// A stage's program, or why it isn't known.
-    pub(crate) fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
+    pub fn require(&self, stage: &str) -> Result<&Arc<StageProgram>, PipelineError> {
         self.0[stage].as_ref().map_err(Clone::clone)
     }
 
     /// The stages whose programs aren't known.
-    pub(crate) fn unknown(&self) -> impl Iterator<Item = &str> {
+    pub fn unknown(&self) -> impl Iterator<Item = &str> {
         self.0.iter().filter(|(_, program)| program.is_err()).map(|(stage, _)| stage.as_str())
     }
 
     /// Programs by what they would answer; nothing is started.
-    pub(crate) fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
+    pub fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
         Self::new(pipeline, |stage| {
             let name = program_name(pipeline, stage);
             let description = descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
@@ -82,12 +86,7 @@ impl Programs {
     }
 
     /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the stages that the targets come to.
-    pub(crate) fn ask(
-        pipeline: &Pipeline,
-        store: &Store,
-        needed: &BTreeSet<String>,
-        asking: Asking,
-    ) -> Result<Self, Interrupted> {
+    pub fn ask(pipeline: &Pipeline, store: &Store, needed: &BTreeSet<String>, asking: Asking) -> Result<Self, Interrupted> {
         let file = store.root().join("cache/describe.json");
         // A cache that can't be read is an empty one.
         let mut cache: DescriptionCache =
@@ -185,7 +184,8 @@ fn origin<'a>(pipeline: &'a Pipeline, stage: &'a str) -> &'a str {
     pipeline.stages[stage].extends.as_deref().unwrap_or(stage)
 }
 
-pub(crate) fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
+/// The executable of a stage.
+pub fn executable(pipeline: &Pipeline, stage: &str) -> PathBuf {
     let name = program_name(pipeline, stage);
     if name.contains('/') {
         let path = pipeline.resolve(origin(pipeline, stage), Part::Field("run"), name);

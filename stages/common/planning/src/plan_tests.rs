@@ -360,7 +360,7 @@ fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
 /// A task's part of a plan, written and read, is what its job works with.
 #[test]
 fn a_frozen_plan_has_all_that_a_task_needs() {
-    use crate::execute::Frozen;
+    use crate::frozen::Frozen;
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "report"]).unwrap();
     let text = serde_json::to_vec(&Frozen::new(&plan, Path::new("/out"))).unwrap();
     let folder = tempfile::tempdir().unwrap();

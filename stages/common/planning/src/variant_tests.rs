@@ -22,7 +22,7 @@ stages:
 ";
 
 fn descriptions() -> BTreeMap<String, Description> {
-    let parameters: Value = serde_json::from_str(include_str!("../../../schemas/parameters/train-ss.json")).unwrap();
+    let parameters: Value = serde_json::from_str(include_str!("../../../../schemas/parameters/train-ss.json")).unwrap();
     let described = [
         json!({"name": "scene", "version": "", "code": "", "summary": "", "parameters": {}, "inputs": {}, "output": {"kind": "scene"}}),
         json!({"name": "train-ss", "version": "", "code": "", "summary": "", "parameters": parameters,

@@ -31,7 +31,7 @@ pub(crate) const SUBTREES: [(&str, &str, &str); 1] = [("prep", "rehearsal", "dow
 pub(crate) const WORDS: [(&str, &str); 1] = [("like", "extends")];
 
 /// What to say after the name of a block that isn't there.
-pub(crate) fn known_blocks<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
+pub fn known_blocks<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
     match BLOCKS.iter().find(|(old, _)| *old == name) {
         Some((_, new)) => format!("it is called {new} now"),
         None => known_names(name, known),

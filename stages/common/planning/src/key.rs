@@ -8,7 +8,7 @@ use crate::changes::{Change, changes};
 use crate::plan::Node;
 
 /// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host, the block's name.
-pub(crate) fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
+pub fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();
     parts.insert(KEY_VERSION_PART.to_owned(), json!(KEY_VERSION));
@@ -34,7 +34,7 @@ pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> O
 }
 
 /// The same, for programs.
-pub(crate) fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
+pub fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
     let of_stage = records.iter().filter(|record| record.stage == stage);
     let compared = of_stage.map(|record| (changes(&record.key_parts, parts), std::cmp::Reverse(record.started_unix)));
     compared.min_by_key(|(changes, newest)| (changes.len(), *newest)).map(|(changes, _)| changes)

@@ -7,24 +7,24 @@ use serde_json::{Map, Value};
 
 /// A named value that differs.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub(crate) struct Change {
+pub struct Change {
     /// Its name, such as `parameter kernel`.
-    pub(crate) name: String,
+    pub name: String,
     /// What it was, if it was there.
-    pub(crate) before: Option<Value>,
+    pub before: Option<Value>,
     /// What it is, if it is there.
-    pub(crate) now: Option<Value>,
+    pub now: Option<Value>,
 }
 
 /// The values that differ, by name.
-pub(crate) fn changes(before: &Map<String, Value>, now: &Map<String, Value>) -> Vec<Change> {
+pub fn changes(before: &Map<String, Value>, now: &Map<String, Value>) -> Vec<Change> {
     let names: BTreeSet<&String> = before.keys().chain(now.keys()).collect();
     let differing = names.into_iter().filter(|name| before.get(*name) != now.get(*name));
     differing.map(|name| Change { name: name.clone(), before: before.get(name).cloned(), now: now.get(name).cloned() }).collect()
 }
 
 /// The beginning of a hash, for people.
-pub(crate) fn short(hash: &str) -> &str {
+pub fn short(hash: &str) -> &str {
     hash.get(..10).unwrap_or(hash)
 }
 

@@ -15,9 +15,9 @@ pub struct Pipeline {
     /// The stages by name.
     pub stages: BTreeMap<String, StageBlock>,
     /// Scenes, protocols and variants.
-    pub(crate) experiment: Experiment,
+    pub experiment: Experiment,
     /// The file that was asked for, and those that it extends, each before what it extends itself.
-    pub(crate) files: Vec<Arc<File>>,
+    pub files: Vec<Arc<File>>,
 }
 
 /// The folders of further pipelines and of experiments, beside pipeline.yaml.
@@ -77,19 +77,19 @@ pub struct PipelineError {
 
 impl Pipeline {
     /// The blocks that a stage's parameters come from, the weightiest last: the one it extends, then its own.
-    pub(crate) fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
+    pub fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
         self.stages[stage].extends.as_deref().into_iter().chain([stage])
     }
 
     /// What a stage needs of a machine: its own words over those of the block it extends.
-    pub(crate) fn resources(&self, stage: &str) -> Resources {
+    pub fn resources(&self, stage: &str) -> Resources {
         let said = self.layers(stage).map(|layer| &self.stages[layer].resources);
         said.fold(Resources::default(), |all, more| all.changed(more))
     }
 
     /// The project's folder, where the store, pages and `pipelines/` are: the file's own. A file of `pipelines/` shares
     /// those of the folder above.
-    pub(crate) fn home(&self) -> PathBuf {
+    pub fn home(&self) -> PathBuf {
         let folder = self.files[0].folder();
         let ends = |folder: &Path| SHELVES.iter().any(|shelf| folder.ends_with(shelf));
         let is_shelf = folder.canonicalize().is_ok_and(|folder| ends(&folder));
@@ -101,12 +101,12 @@ impl Pipeline {
     }
 
     /// Where a path leads that stands in a stage's block.
-    pub(crate) fn resolve(&self, stage: &str, part: Part, path: impl AsRef<Path>) -> PathBuf {
+    pub fn resolve(&self, stage: &str, part: Part, path: impl AsRef<Path>) -> PathBuf {
         self.file_of(stage, part).folder().join(path)
     }
 
     /// Whether another pipeline has the same block, with the same paths.
-    pub(crate) fn has_same(&self, other: &Self, stage: &str) -> bool {
+    pub fn has_same(&self, other: &Self, stage: &str) -> bool {
         self.stages[stage] == other.stages[stage] && self.roots(stage) == other.roots(stage)
     }
 
@@ -126,7 +126,7 @@ impl Pipeline {
     }
 
     /// The first file that has a block.
-    pub(crate) fn file_of_block(&self, stage: &str) -> &File {
+    pub fn file_of_block(&self, stage: &str) -> &File {
         self.files.iter().find(|file| file.says(stage, Part::Block)).unwrap_or(&self.files[0])
     }
 
@@ -143,7 +143,7 @@ impl Pipeline {
     }
 
     /// An error about what stands before the stages.
-    pub(crate) fn error_in_default(&self, problem: String) -> PipelineError {
+    pub fn error_in_default(&self, problem: String) -> PipelineError {
         let file = self.files.iter().find(|file| !file.written.default.is_empty()).unwrap_or(&self.files[0]);
         file.error(&["default"], problem)
     }

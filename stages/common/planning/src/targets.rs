@@ -9,7 +9,7 @@ use crate::renames::known_blocks;
 
 /// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the target NAME: its block of
 /// that name, or its default. A block of such a file is a target, too.
-pub(crate) fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<String>), PlanError> {
+pub fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<String>), PlanError> {
     let (mut all, mut blocks): (Option<Pipeline>, Vec<String>) = (None, Vec::new());
     for target in targets {
         let (found, named) = if pipeline.stages.contains_key(target) {

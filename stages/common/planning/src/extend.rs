@@ -27,7 +27,7 @@ impl Pipeline {
     }
 
     /// Both pipelines as one, where no block of one is another in the other; else what is wrong.
-    pub(crate) fn joined(mut self, other: Self) -> Result<Self, String> {
+    pub fn joined(mut self, other: Self) -> Result<Self, String> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_same(&other, name)) {
             let [one, two] = [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.display());

@@ -69,7 +69,7 @@ const OTHER: &str = "other";
 
 impl Experiment {
     /// Takes what a file that extends this one's says.
-    pub(crate) fn change(&mut self, by: &Self) {
+    pub fn change(&mut self, by: &Self) {
         let take = |mine: &mut Vec<String>, by: &Vec<String>| {
             if !by.is_empty() {
                 mine.clone_from(by);

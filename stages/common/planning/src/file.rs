@@ -73,12 +73,12 @@ pub struct StageBlock {
     pub resources: Resources,
     /// What files that extend this one's say of its parameters, one after the other.
     #[serde(skip)]
-    pub(crate) changes: Vec<Map<String, Value>>,
+    pub changes: Vec<Map<String, Value>>,
 }
 
 impl StageBlock {
     /// Its parameters, those that weigh most last.
-    pub(crate) fn parameter_layers(&self) -> impl Iterator<Item = &Map<String, Value>> {
+    pub fn parameter_layers(&self) -> impl Iterator<Item = &Map<String, Value>> {
         [&self.parameters].into_iter().chain(&self.changes)
     }
 
@@ -94,7 +94,7 @@ impl StageBlock {
     }
 
     /// Takes what a block of the same name says in a file that extends this one's.
-    pub(crate) fn change(&mut self, by: &Self) {
+    pub fn change(&mut self, by: &Self) {
         if by.run.is_some() || by.extends.is_some() {
             (self.run, self.extends) = (by.run.clone(), by.extends.clone());
         }
@@ -106,18 +106,18 @@ impl StageBlock {
 
 /// A file that was read.
 #[derive(Debug)]
-pub(crate) struct File {
+pub struct File {
     /// As it is named in errors.
-    pub(crate) path: PathBuf,
+    pub path: PathBuf,
     /// By what it is known again, however it was named.
-    pub(crate) id: PathBuf,
-    pub(crate) written: PipelineFile,
+    pub id: PathBuf,
+    pub written: PipelineFile,
     text: String,
 }
 
 impl File {
     /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their line.
-    pub(crate) fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
+    pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let fail = |line: Option<usize>, problem: String| PipelineError { place: place(path, line), problem };
         let text = yaml_lines::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
         let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
@@ -148,17 +148,17 @@ impl File {
     }
 
     /// The folder that its relative paths start from.
-    pub(crate) fn folder(&self) -> &Path {
+    pub fn folder(&self) -> &Path {
         self.path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
     }
 
     /// Whether it says that of a stage.
-    pub(crate) fn says(&self, stage: &str, part: Part) -> bool {
+    pub fn says(&self, stage: &str, part: Part) -> bool {
         self.written.stages.get(stage).is_some_and(|block| block.says(part))
     }
 
     /// An error about a key, through nested mappings, with its line.
-    pub(crate) fn error(&self, keys: &[&str], problem: String) -> PipelineError {
+    pub fn error(&self, keys: &[&str], problem: String) -> PipelineError {
         PipelineError { place: place(&self.path, yaml_lines::line_of(&self.text, keys)), problem }
     }
 }
