@@ -35,7 +35,7 @@ fn descriptions() -> Vec<Description> {
 /// The schemas of all files, by their place in `schemas/`.
 fn schemas() -> BTreeMap<String, Value> {
     let files = [
-        ("pipeline", of::<runner::PipelineFile>()),
+        ("pipeline", of::<planning::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<artifact::Record>()),

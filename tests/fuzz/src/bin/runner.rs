@@ -8,7 +8,7 @@ use std::sync::LazyLock;
 
 use artifact::{Description, Record, Schema};
 use libfuzzer_sys::fuzz_target;
-use runner::{Pipeline, Plan, Request};
+use planning::{Pipeline, Plan, Request};
 
 macro_rules! seed {
     ($name:literal) => {
@@ -69,7 +69,7 @@ fn record(data: &[u8]) {
     assert_eq!(record.key().len(), 64);
     let records = [record];
     let parts = serde_json::Map::from_iter([("code".to_owned(), "1".into())]);
-    runner::explain(&parts, &records[0].stage, &records);
+    planning::explain(&parts, &records[0].stage, &records);
 }
 
 fuzz_target!(|data: &[u8]| {
