@@ -236,7 +236,7 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
 fn describe_prints_a_stages_help() {
     let project = Project::tiny();
     let help = project.ok(&["describe", "eval"]);
-    assert!(help.contains("Usage: eval ") && help.contains("Parameters (JSON") && help.contains("Inputs:"), "{help}");
+    assert!(help.contains("Usage: eval ") && help.contains("\nParameters: ") && help.contains("\nInputs, "), "{help}");
     project.run(&["describe", "nobody"]).fails(2, &["no stage \"nobody\"", "known: demo-scene"]);
 }
 

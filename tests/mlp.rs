@@ -87,7 +87,8 @@ fn mistakes_are_one_line() {
     if on_gpu.code != 0 {
         on_gpu.fails(2, &["--device cuda:0", "leave --device away"]);
     }
-    stage("train-ss", r#"{"field": "mlp", "n_levels": 4}"#, &inputs, &out, &[]).fails(2, &["parameter n_levels", "other field"]);
+    stage("train-ss", r#"{"field": "mlp", "n_levels": 4}"#, &inputs, &out, &[])
+        .fails(2, &["parameter n_levels", "belongs to field: grid"]);
     stage("train-ss", r#"{"density_noise_std": 1.0}"#, &inputs, &out, &[])
-        .fails(2, &["parameter density_noise_std", "other field"]);
+        .fails(2, &["parameter density_noise_std", "belongs to field: mlp"]);
 }

@@ -29,23 +29,22 @@ impl Lineage {
     /// Of the actions that have these keys. What garbage collection has taken is left out.
     pub(crate) fn of(store: &Store, keys: impl IntoIterator<Item = String>) -> Self {
         let (mut open, mut seen): (Vec<String>, BTreeSet<String>) = (keys.into_iter().collect(), BTreeSet::new());
-        let mut records = BTreeMap::new();
+        let mut found: Vec<Record> = Vec::new();
         while let Some(key) = open.pop() {
             if !seen.insert(key.clone()) {
                 continue;
             }
             if let Some(record) = store.record(&key) {
                 open.extend(record.made_of.clone());
-                records.insert(label(&record.stage, &record.point), record);
+                found.push(record);
             }
         }
-        Self { records }
-    }
-
-    /// A single result under the name of its stage alone, whatever its point: so two points of a sweep compare.
-    pub(crate) fn without_points(self) -> Self {
-        let bare = self.records.into_values().map(|record| (record.stage.clone(), record));
-        Self { records: bare.collect() }
+        // A point is of the run that made the result first: where a stage has one result, its name is enough.
+        let is_single = |stage: &str| found.iter().filter(|record| record.stage == stage).count() == 1;
+        let name = |record: &Record| {
+            if is_single(&record.stage) { record.stage.clone() } else { label(&record.stage, &record.point) }
+        };
+        Self { records: found.iter().map(|record| (name(record), record.clone())).collect() }
     }
 
     /// What differs from an earlier one, stage by stage. Where what a stage was made of differs, its inputs' hashes aren't told.

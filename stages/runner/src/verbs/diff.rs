@@ -55,7 +55,7 @@ fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
             if found.any(|other| other.output != record.output) {
                 return Err(PlanError::Usage(format!("{text}: more than one artifact begins so; give more of it")).into());
             }
-            return Ok(Lineage::of(store, [record.key()]).without_points());
+            return Ok(Lineage::of(store, [record.key()]));
         }
     }
     stage(session, text)
@@ -79,7 +79,7 @@ fn stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let states = session.states(&plan)?;
     match of_stage(&plan, &stage)?[..] {
         [index] => match &states[index] {
-            State::Cached(record) => Ok(Lineage::of(&session.store, [record.key()]).without_points()),
+            State::Cached(record) => Ok(Lineage::of(&session.store, [record.key()])),
             _ => Err(Failure::BadInput(format!("{text} isn't made yet; run it first")).into()),
         },
         _ => Err(usage("a sweep has several results; give one value for each parameter".to_owned()).into()),
