@@ -100,7 +100,7 @@ quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="le
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
 table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
-	@python3 scripts/table.py --data $(DATA) --scenes $(SCENES) --protocols $(PROTOCOLS) --methods $(METHODS) \
+	@python3 scripts/table.py --data $(DATA) --scenes $(or $(SCENES),lego chair) --protocols $(or $(PROTOCOLS),100x2 100x4 200x2 200x4) --methods $(METHODS) \
 	  $(if $(SPLIT),--split $(SPLIT)) $(if $(RAYS),--rays $(RAYS)) --kernel $(firstword $(KERNEL)) --set $(SET) --out $(or $(OUT),out/table.md)
 
 REFERENCES ?= 1
