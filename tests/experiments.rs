@@ -10,7 +10,7 @@ use serde_json::Value;
 fn project() -> Project {
     let project = Project::new(common::TINY);
     for folder in ["pipelines", "experiments"] {
-        project.copy_folder(folder);
+        project.copy_folder(folder, ".");
     }
     project.demo_data("other");
     if let Some(data) = data() {

@@ -8,7 +8,7 @@ use common::Project;
 /// The fast pipeline with the shipped targets beside it.
 fn project() -> Project {
     let project = Project::fast();
-    project.copy_pipelines(".");
+    project.copy_folder("pipelines", ".");
     project
 }
 

@@ -42,6 +42,12 @@ fn blocks(text: &str, language: &str) -> Vec<String> {
     text.split(&fence).skip(1).map(|rest| rest.split("```").next().unwrap().to_owned()).collect()
 }
 
+/// The words of a command line, without quotes.
+fn words_of(line: &str) -> Vec<&str> {
+    let pieces = line.split('"').enumerate();
+    pieces.flat_map(|(i, piece)| if i % 2 == 1 { vec![piece] } else { piece.split_whitespace().collect() }).collect()
+}
+
 #[test]
 fn every_command_plans() {
     let project = Project::new(&read("pipeline.yaml"));
@@ -52,7 +58,9 @@ fn every_command_plans() {
         std::fs::write(target.join("x"), "").unwrap();
     }
     std::fs::rename(project.path("pipeline.yaml"), project.path("project/pipeline.yaml")).unwrap();
-    project.copy_pipelines("project");
+    for folder in ["pipelines", "experiments"] {
+        project.copy_folder(folder, "project");
+    }
     let mut planned = 0;
     for block in blocks(&documents(), "sh") {
         let joined = block.replace("\\\n", " ");
@@ -68,10 +76,13 @@ fn every_command_plans() {
                 );
                 continue;
             };
-            let mut words: Vec<&str> = rest.split_whitespace().collect();
-            // What isn't made yet can't be pinned.
-            if words[0] == "pin" {
-                words.splice(..2, ["plan"]);
+            let mut words = words_of(rest);
+            // What isn't made yet can't be pinned, found or compared.
+            match words[0] {
+                "pin" => _ = words.splice(..2, ["plan"]),
+                "path" => words = vec!["plan", words[1].split('/').next().unwrap()],
+                "diff" => words = ["plan"].into_iter().chain(words[1].split_whitespace()).collect(),
+                _ => {}
             }
             // `run` would train for minutes; the plan is the same code up to running. It has no use for run's own options.
             if words[0] == "run" {

@@ -84,28 +84,19 @@ impl Project {
     pub fn shipped(targets: &[&str], blocks: &str) -> Self {
         let project = Self { dir: tempfile::tempdir().unwrap() };
         project.write("base/pipeline.yaml", TINY);
-        project.copy_pipelines("base");
+        project.copy_folder("pipelines", "base");
         let files: Vec<String> = targets.iter().map(|target| format!("base/pipelines/{target}.yaml")).collect();
         let stages = if blocks.is_empty() { String::new() } else { format!("stages:\n{blocks}") };
         project.write("pipeline.yaml", &format!("extends: [{}]\ndefault: [eval]\n{stages}", files.join(", ")));
         project
     }
 
-    /// Copies the shipped `pipelines/` into a folder.
-    pub fn copy_pipelines(&self, folder: &str) {
-        for entry in std::fs::read_dir(root().join("pipelines")).unwrap() {
+    /// Copies a shipped folder of pipeline files into a folder.
+    pub fn copy_folder(&self, shipped: &str, folder: &str) {
+        for entry in std::fs::read_dir(root().join(shipped)).unwrap() {
             let path = entry.unwrap().path();
             let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-            self.write(&format!("{folder}/pipelines/{name}"), &std::fs::read_to_string(&path).unwrap());
-        }
-    }
-
-    /// Copies a shipped folder of pipeline files beside the pipeline.
-    pub fn copy_folder(&self, folder: &str) {
-        for entry in std::fs::read_dir(root().join(folder)).unwrap() {
-            let path = entry.unwrap().path();
-            let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-            self.write(&format!("{folder}/{name}"), &std::fs::read_to_string(&path).unwrap());
+            self.write(&format!("{folder}/{shipped}/{name}"), &std::fs::read_to_string(&path).unwrap());
         }
     }
 
