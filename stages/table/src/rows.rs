@@ -12,8 +12,10 @@ pub type Row = Map<String, Value>;
 /// A row for every result of a run, in the order of the run.
 pub(crate) fn rows(run: &RunRecord, methods: &BTreeMap<String, String>) -> anyhow::Result<Vec<Row>> {
     let commit = commit(&run.home);
-    let scored = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown);
-    let rows = scored.map(|(index, node)| {
+    let mut scored: Vec<(usize, &RunNode)> = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
+    // What came through fewer stages stands first: rendered views before refined ones.
+    scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
+    let rows = scored.into_iter().map(|(index, node)| {
         let mut row: Row = node.values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
         row.insert("method".to_owned(), json!(methods.get(&node.stage).unwrap_or(&node.stage)));
         row.extend(scores(node)?);

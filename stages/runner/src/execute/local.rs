@@ -15,7 +15,7 @@ use crate::counts;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::sink::{Showing, Shown, show};
-use planning::Plan;
+use planning::{Plan, Sink};
 
 /// This machine.
 pub(crate) struct Local {
@@ -36,13 +36,16 @@ impl Executor for Local {
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
+        let showing = Showing { plan, store: &session.store, run, out, threads: self.threads, stop };
         if let Some((index, failure)) = outcome.failures.first() {
+            if self.keep_going {
+                show_partly(&showing, &outcome)?;
+            }
             let node = &plan.nodes[*index];
             report_text(&self.remedy.after_failure(&node.label(), &node.stage, outcome.skipped.len()));
             return Ok(ExitCode::from(failure.code));
         }
         say_results(session, plan, &outcome)?;
-        let showing = Showing { plan, store: &session.store, run, out, threads: self.threads, stop };
         show_all(&showing, &outcome).map(|()| ExitCode::SUCCESS)
     }
 }
@@ -140,23 +143,33 @@ fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Res
     Ok(())
 }
 
+/// Calls the sinks that show what there is, where some of it failed.
+fn show_partly(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
+    let mut partial = showing.plan.sinks.iter().filter(|sink| sink.program.description.partial);
+    partial.try_for_each(|sink| show_one(showing, sink, outcome).map(|_| ()))
+}
+
+/// Calls a sink and says where its page is; whether it wrote one.
+fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Result<bool> {
+    let shown = show(showing, sink, &outcome.records);
+    if showing.stop.load(Ordering::Relaxed) {
+        return Err(Failure::Interrupted.into());
+    }
+    let shown = shown.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
+    match &shown {
+        Shown::Written(folder) => print_line!("{}: {}", sink.stage, page(folder).display()),
+        Shown::UpToDate(folder) => print_line!("{}: {} (up to date)", sink.stage, page(folder).display()),
+        Shown::Missing => print_line!("{}: nothing to show", sink.stage),
+    }
+    Ok(matches!(shown, Shown::Written(_)))
+}
+
 /// Calls the sinks and says what the run came to.
 fn show_all(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
     let plan = showing.plan;
     let mut wrote = false;
     for sink in &plan.sinks {
-        let shown = show(showing, sink, &outcome.records);
-        if showing.stop.load(Ordering::Relaxed) {
-            return Err(Failure::Interrupted.into());
-        }
-        match shown.map_err(|e| anyhow!("{}: {e}", sink.stage))? {
-            Shown::Written(folder) => {
-                wrote = true;
-                print_line!("{}: {}", sink.stage, page(&folder).display());
-            }
-            Shown::UpToDate(folder) => print_line!("{}: {} (up to date)", sink.stage, page(&folder).display()),
-            Shown::Missing => print_line!("{}: nothing to show", sink.stage),
-        }
+        wrote |= show_one(showing, sink, outcome)?;
     }
     let (ran, all) = (outcome.ran.len(), plan.nodes.len());
     print_line!("{}", if ran == 0 && !wrote { counts::all_cached(all) } else { counts::ran(ran, all) });
