@@ -26,6 +26,7 @@ mod extend;
 mod file;
 mod graph;
 mod key;
+mod left_out;
 mod limits;
 mod lineage;
 mod node_report;
