@@ -30,6 +30,9 @@ pub struct Experiment {
     pub inputs: BTreeMap<String, String>,
     /// Files in the folder of the data sets without which a block isn't made, by block. `{NAME}` stands for the block's parameter.
     pub needs: BTreeMap<String, String>,
+    /// Inputs of sinks that are shown unless the command line chooses, by their names or by the blocks that they are; a sink that has none of
+    /// them shows all of its own.
+    pub show: Vec<String>,
     /// Variants, in the order of the table; they form no product.
     pub variants: Vec<Variant>,
     /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the place of one.
@@ -85,11 +88,14 @@ impl Experiment {
         take(&mut self.folders, &by.folders);
         take(&mut self.scenes, &by.scenes);
         take(&mut self.protocols, &by.protocols);
+        take(&mut self.show, &by.show);
         if !by.variants.is_empty() {
             self.variants.clone_from(&by.variants);
         }
         self.data = by.data.clone().or_else(|| self.data.take());
-        self.presets.extend(by.presets.clone());
+        for (name, preset) in &by.presets {
+            self.presets.entry(name.clone()).or_default().extend(preset.clone());
+        }
         self.inputs.extend(by.inputs.clone());
         self.needs.extend(by.needs.clone());
         self.sweeps.extend(by.sweeps.clone());

@@ -15,8 +15,12 @@ use crate::renames::known_blocks;
 /// The stages that a sink shows, of those that its block names.
 pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Choice) -> Vec<&'a str> {
     let inputs = pipeline.stages[sink].inputs.iter().filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
-    let is_wanted = |name: &str, stage: &str| choice.show.iter().any(|wanted| wanted == name || wanted == stage);
-    inputs.filter(|(name, stage)| choice.show.is_empty() || is_wanted(name, stage)).map(|(_, stage)| stage).collect()
+    let wanted = if choice.show.is_empty() { &pipeline.experiment.show } else { &choice.show };
+    let is_wanted = |(name, stage): &(&String, &str)| wanted.iter().any(|wanted| wanted == *name || wanted == stage);
+    let chosen: Vec<&str> = inputs.clone().filter(is_wanted).map(|(_, stage)| stage).collect();
+    // A file's own choice needn't be meant for this sink.
+    let shows_all = choice.show.is_empty() && chosen.is_empty();
+    if shows_all { inputs.map(|(_, stage)| stage).collect() } else { chosen }
 }
 
 /// Checks that sinks have the inputs that are wanted of them.
