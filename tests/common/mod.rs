@@ -91,12 +91,24 @@ impl Project {
         project
     }
 
+    /// The tiny pipeline with the shipped `pipelines/` and `experiments/`.
+    pub fn experiments() -> Self {
+        let project = Self::tiny();
+        project.copy_pipelines(".");
+        project.copy_shelf("experiments", ".");
+        project
+    }
+
     /// Copies the shipped `pipelines/` into a folder.
     pub fn copy_pipelines(&self, folder: &str) {
-        for entry in std::fs::read_dir(root().join("pipelines")).unwrap() {
+        self.copy_shelf("pipelines", folder);
+    }
+
+    fn copy_shelf(&self, shelf: &str, folder: &str) {
+        for entry in std::fs::read_dir(root().join(shelf)).unwrap() {
             let path = entry.unwrap().path();
             let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-            self.write(&format!("{folder}/pipelines/{name}"), &std::fs::read_to_string(&path).unwrap());
+            self.write(&format!("{folder}/{shelf}/{name}"), &std::fs::read_to_string(&path).unwrap());
         }
     }
 

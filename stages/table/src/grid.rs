@@ -19,11 +19,12 @@ pub(crate) struct Shape<'a> {
 }
 
 impl Shape<'_> {
-    /// The table of these results.
-    pub(crate) fn table(&self, rows: &[Row]) -> String {
+    /// The table of these results, which may be a part: those with one value of `each`.
+    pub(crate) fn table(&self, rows: &[Row], is_part: bool) -> String {
         let params = self.params;
         let columns = distinct(rows, &params.columns);
-        let further: Vec<Row> = params.further.iter().filter(|row| self.belongs(row, rows)).cloned().collect();
+        let further = params.further.iter().filter(|row| !is_part || row.contains_key(&params.each));
+        let further: Vec<Row> = further.filter(|row| self.belongs(row, rows)).cloned().collect();
         let all = [rows, &further[..]].concat();
         let values: Vec<&String> = params.values.iter().filter(|name| all.iter().any(|row| row.contains_key(*name))).collect();
         let mut lines = vec![self.head(&columns, &values)];

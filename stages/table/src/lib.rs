@@ -58,7 +58,7 @@ pub struct Params {
     /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over: eval-nerf}]`. Methods are blocks, or those of `further`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
-    /// A key; each of its values has a table of its own, too, where there are several.
+    /// A key; each of its values has a table of its own, too, where there are several. Of `further`, it has the rows with this key.
     #[schemars(extend("x-default" = "one table of all"))]
     pub each: String,
     /// Remarks below the table.

@@ -10,12 +10,12 @@ use crate::{Params, Row};
 /// The tables, and the points that failed.
 pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) -> Result<String, String> {
     let shape = Shape { params, keys: row_keys(params, rows)?, first: reference(params, rows)? };
-    let mut text = format!("# {}\n\n{}", params.title, shape.table(rows));
+    let mut text = format!("# {}\n\n{}", params.title, shape.table(rows, false));
     let each = Some(&params.each).filter(|key| !key.is_empty());
     let parts = each.map(|key| distinct(rows, std::slice::from_ref(key)).concat()).filter(|parts| parts.len() > 1);
     for part in parts.into_iter().flatten() {
         let mine = of(rows, std::slice::from_ref(&params.each), std::slice::from_ref(&part));
-        text += &format!("\n## {part}\n\n{}", shape.table(&mine));
+        text += &format!("\n## {part}\n\n{}", shape.table(&mine, true));
     }
     text += &gains(params, rows);
     params.spread.iter().filter_map(|name| spread(rows, name)).for_each(|line| text += &line);
