@@ -218,9 +218,11 @@ impl<'a> Expansion<'a> {
         swept.map(|(axis, text)| format!("{}={text}", axis.name)).collect::<Vec<_>>().join(", ")
     }
 
-    /// The values of what has a name, for tables.
+    /// The values of what has a name, for tables; the only value of an axis is every node's.
     fn values(&self, point: &Point) -> BTreeMap<String, String> {
-        self.named(point).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
+        let only = self.axes.iter().filter(|axis| axis.is_named && axis.values.len() == 1);
+        let only = only.map(|axis| (axis, axis.values[0].text.as_str()));
+        self.named(point).chain(only).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
     }
 
     fn named<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {

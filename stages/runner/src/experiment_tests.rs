@@ -143,6 +143,15 @@ fn the_command_line_chooses_and_wins() {
     assert_eq!((&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]), (&json!(7), &json!(500)));
 }
 
+/// The pipeline's own scene sets nothing, and tables name it nonetheless.
+#[test]
+fn an_only_value_is_every_nodes() {
+    let data = data();
+    let text = EXPERIMENT.replace("  inputs: {score.weights: weights}\n", "");
+    let plan = plan_of(&text, data.path(), |r| r.choice.scenes = vec!["demo".to_owned()]).unwrap();
+    assert!(plan.nodes.iter().all(|node| node.values["scene"] == "demo" && !node.label().contains("demo")));
+}
+
 #[test]
 fn a_sweep_of_the_file_gives_way() {
     let data = data();
