@@ -79,11 +79,11 @@ impl Shape<'_> {
         line
     }
 
-    /// The rows of the same group.
+    /// The rows of the same group that have values.
     fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
         let by = &self.params.grouped_by;
         let group = mine.first().and_then(|row| row.get(by));
-        rows.iter().filter(|row| row.get(by) == group).cloned().collect()
+        rows.iter().filter(|row| row.get(by) == group && !row.contains_key(MISSING)).cloned().collect()
     }
 
     /// The best mean of a value in a column, where there are several.

@@ -2,7 +2,8 @@
 //!
 //! * [`Params`]: what makes a row, what makes a column, and what values are shown.
 //! * `rows`: a row for every result of a run, with its scores, its times, and where it was made.
-//! * `markdown`: these rows as tables for people; `grid`: one of them, means where several results fall into one cell, the best marked.
+//! * `markdown`: these rows as tables for people.
+//! * `grid`: one of them, means where several results fall into one cell, the best marked.
 //! * `values`: values by their names, and how they are shown.
 //!
 //! A sink: it gets the run's record and is never cached. What a failed point would have shown is named; what was left out says why.
@@ -45,17 +46,18 @@ pub struct Params {
     /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
-    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images, methods: [eval]}]`, the methods by the block that was
-    /// scored. A column names the group, and the best is marked in each.
+    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images, methods: [eval]}]`, the
+    /// methods by the block that was scored. A column names the group, and the best is marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Heading of the groups' column, and their key.
     pub grouped_by: String,
-    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr: 29.77}]`. Such a row stands where the results have its keys, and
-    /// is never the best.
+    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr: 29.77}]`. Such a row
+    /// stands where the results have its keys, and is never the best.
     #[schemars(extend("x-default" = "none"))]
     pub further: Vec<Row>,
-    /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over: eval-nerf}]`. Methods are blocks, or those of `further`.
+    /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over: eval-nerf}]`. Methods are
+    /// blocks, or those of `further`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
     /// A key; each of its values has a table of its own, too, where there are several. Of `further`, it has the rows with this key.

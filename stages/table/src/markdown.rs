@@ -10,11 +10,13 @@ use crate::{Params, Row};
 /// The tables, and the points that failed.
 pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) -> Result<String, String> {
     let shape = Shape { params, keys: row_keys(params, rows)?, first: reference(params, rows)? };
-    let mut text = format!("# {}\n\n{}", params.title, shape.table(rows, false));
-    let each = Some(&params.each).filter(|key| !key.is_empty());
-    let parts = each.map(|key| distinct(rows, std::slice::from_ref(key)).concat()).filter(|parts| parts.len() > 1);
-    for part in parts.into_iter().flatten() {
-        let mine = of(rows, std::slice::from_ref(&params.each), std::slice::from_ref(&part));
+    let each = std::slice::from_ref(&params.each);
+    let parts = if params.each.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
+    let parts = if parts.len() > 1 { parts } else { Vec::new() };
+    let mean = if parts.is_empty() { String::new() } else { format!("Means over {}:\n\n", parts.join(", ")) };
+    let mut text = format!("# {}\n\n{mean}{}", params.title, shape.table(rows, false));
+    for part in parts {
+        let mine = of(rows, each, std::slice::from_ref(&part));
         text += &format!("\n## {part}\n\n{}", shape.table(&mine, true));
     }
     text += &gains(params, rows);

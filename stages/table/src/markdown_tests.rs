@@ -91,7 +91,7 @@ fn params(text: serde_json::Value) -> Params {
 /// Rows of two methods in two groups at two protocols, as `rows` makes them.
 fn methods() -> Vec<Row> {
     let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| json!({"method": method, "has seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr, "commit": "abc1234", "machine": "vm"});
-    let missing = json!({"method": "liif", "has seen": "other", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
+    let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
     let rows = [
         row("nerf", "LR", "lego", "100x2", 30.0),
         row("nerf", "LR", "chair", "100x2", 32.0),
@@ -128,11 +128,13 @@ fn groups_further_rows_and_gains() {
     let expected = "\
 # Results
 
+Means over lego, chair:
+
 | method | has seen | 100x2 (PSNR) | 100x4 (PSNR) | commit | machine |
 | --- | --- | --- | --- | --- | --- |
 | nerf | LR | 31.00 | **28.00** | abc1234 | vm |
 | ss | LR | **32.25** | 27.00 | abc1234 | vm |
-| liif | other | no liif | – | – | – |
+| liif | HR | no liif | – | – | – |
 | hr | HR | 35.00 | – | abc1234 | vm |
 | paper: NeRF |  | 27.50 | – | – | – |
 | paper: SS |  | 29.75 | – | – | – |
@@ -143,7 +145,7 @@ fn groups_further_rows_and_gains() {
 | --- | --- | --- | --- | --- | --- |
 | nerf | LR | 30.00 | **28.00** | abc1234 | vm |
 | ss | LR | **31.00** | 27.00 | abc1234 | vm |
-| liif | other | no liif | – | – | – |
+| liif | HR | no liif | – | – | – |
 | hr | HR | 35.00 | – | abc1234 | vm |
 
 ## chair

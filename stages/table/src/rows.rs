@@ -113,7 +113,7 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         parents.any(|parent| run.nodes[parent].kind == "field")
     };
     let refining: Vec<usize> = rendering.iter().copied().filter(|i| !by_field(i)).collect();
-    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>();
+    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0; // of nothing it is -0
     let mut row = Row::new();
     for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)] {
         row.insert(name.to_owned(), json!(seconds(nodes)));
