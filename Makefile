@@ -99,9 +99,16 @@ quality: build ## The protocols on real scenes: make quality DATA=DIR SCENES="le
 	@$(call experiment,$(QUALITY),$(if $(SUPERVISION),-p train-ss.supervision=$(call list,$(SUPERVISION))))
 
 METHODS ?= nerf nerf-epochs bicubic imdn liif swinir ss kernel refine hr
+TABLES := paper-table paper-metrics paper-times
+TABLE = $(or $(OUT),out/table.md)
+# A quarter where a pixel has one ray instead of four, and where an image has a quarter of the pixels.
+fewer_rays = -p train-ss.rays=$(1) $(foreach field,field-nerf-epochs downscaled-field,-p $(field).rays=$$(($(1) / 4)))
 table: build ## The paper's tables with every method: make table SCENES="lego" PROTOCOLS="100x2" METHODS="nerf bicubic imdn ss" OUT=FILE.md
-	@python3 scripts/table.py --data $(DATA) --scenes $(or $(SCENES),lego chair) --protocols $(or $(PROTOCOLS),100x2 100x4 200x2 200x4) --methods $(METHODS) \
-	  $(if $(SPLIT),--split $(SPLIT)) $(if $(RAYS),--rays $(RAYS)) --kernel $(firstword $(KERNEL)) --set $(SET) --out $(or $(OUT),out/table.md)
+	@$(NERF_SR) run $(TABLES) -j 1 --data $(DATA) $(if $(SCENES),--scene $(call list,$(SCENES))) $(if $(PROTOCOLS),--protocol $(call list,$(PROTOCOLS))) \
+	  --show $(call list,$(METHODS)) $(if $(SPLIT),-p prep.split=$(SPLIT)) $(if $(RAYS),$(call fewer_rays,$(RAYS))) \
+	  $(if $(filter file,$(origin KERNEL)),,-p prep.kernel=$(firstword $(KERNEL))) $(call each,-p ,$(SET))
+	@mkdir -p $(dir $(TABLE)) && cat $(TABLES:%=out/%/table.md) > $(TABLE)
+	@for kind in json csv; do cp out/paper-table/rows.$$kind $(basename $(TABLE)).$$kind; done
 
 REFERENCES ?= 1
 MOST_REFERENCES = $(lastword $(sort $(REFERENCES)))

@@ -8,10 +8,7 @@ use serde_json::Value;
 
 /// The tiny pipeline with the shipped pipelines and experiments, and its scene once more as a data set, `data/other`.
 fn project() -> Project {
-    let project = Project::new(common::TINY);
-    for folder in ["pipelines", "experiments"] {
-        project.copy_folder(folder, ".");
-    }
+    let project = Project::experiments();
     project.demo_data("other");
     if let Some(data) = data() {
         std::os::unix::fs::symlink(data.join("weights"), project.path("data/weights")).unwrap();

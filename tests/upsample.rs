@@ -85,36 +85,36 @@ fn views_are_enlarged_and_scored() {
 
 #[test]
 fn the_table_has_every_method_side_by_side() {
-    let project = Project::tiny();
-    project.demo_data("demo");
+    let project = Project::experiments();
     let methods = ["nerf", "nerf-epochs", "bicubic", "swinir", "ss", "kernel", "hr"];
-    let arguments =
-        [&["--scenes", "demo", "--protocols", "24x2", "--rays", "40000", "--out", "out/table.md", "--methods"], &methods[..]];
-    let done = project.script("table.py", &arguments.concat());
-    assert_eq!(done.code, 0, "{}", done.stderr);
-    let table = std::fs::read_to_string(project.path("out/table.md")).unwrap();
+    let shown = methods.join(",");
+    let rays = ["-p", "train-ss.rays=40000", "-p", "field-nerf-epochs.rays=10000"];
+    let of = ["--scene", "demo", "--protocol", "24x2", "--data", "data", "--show", &shown];
+    let arguments = [&["run", "paper-table", "paper-times", "paper-page"], &of[..], &rays].concat();
+    project.ok(&arguments);
+    let read = |file: &str| std::fs::read_to_string(project.path(file)).unwrap();
+    let table = read("out/paper-table/table.md");
     for words in [
-        "By other metrics: ssim_valid",
-        "| NeRF-Swin | other images | weights not given: swinir_x2.safetensors |",
-        "equal epochs",
-        "conventions",
-        "GiB",
+        "| method | has seen | 24x2 (PSNR / SSIM) | commit | machine |",
+        "\n| ours, SS | LR |",
+        "| NeRF-Swin | other images | no weights/swinir_x2.safetensors |",
+        "ours, SS over NeRF at equal epochs |",
     ] {
-        let there = table.contains(words) || words == "conventions" && table.contains("* psnr: -10 log10");
-        assert!(there, "no {words:?} in:\n{table}");
+        assert!(table.contains(words), "no {words:?} in:\n{table}");
     }
-    let rows: Vec<serde_json::Value> = serde_json::from_slice(&std::fs::read(project.path("out/table.json")).unwrap()).unwrap();
+    let rows: Vec<serde_json::Value> = serde_json::from_str(&read("out/paper-table/rows.json")).unwrap();
     assert_eq!(rows.len(), methods.len());
     let psnr = |method: &str| rows.iter().find(|r| r["method"] == method).unwrap()["psnr"].as_f64();
-    assert!(psnr("swinir").is_none());
-    assert!(psnr("hr").unwrap() > psnr("bicubic").unwrap(), "{rows:?}");
-    assert_ne!(psnr("ss"), psnr("nerf"));
-    let lines = std::fs::read_to_string(project.path("out/table.csv")).unwrap();
-    assert_eq!(lines.lines().count(), 1 + methods.len());
-    let page = std::fs::read_to_string(project.path("out/table/demo-24x2/table/index.html")).unwrap();
-    assert!(page.contains("Side by side") && page.contains("alt=\"bicubic"), "the page compares nothing");
-    assert!(std::fs::read_to_string(project.path("out/table.html")).unwrap().contains("table/demo-24x2/table/index.html"));
+    assert!(psnr("NeRF-Swin").is_none());
+    assert!(psnr("trained at HR").unwrap() > psnr("NeRF-Bi").unwrap(), "{rows:?}");
+    assert_ne!(psnr("ours, SS"), psnr("NeRF, equal rays"));
+    assert_eq!(read("out/paper-table/rows.csv").lines().count(), 1 + methods.len());
+    assert!(read("out/paper-times/table.md").contains("(training / rendering)"));
+    let page = read("out/paper-page/index.html");
+    assert!(page.contains("Side by side") && page.contains("eval-bicubic"), "the page compares nothing");
     // Again: all is there.
-    let again = project.script("table.py", &arguments.concat());
-    assert!(again.stdout.contains("nothing to run"), "{}", again.stdout);
+    let again = project.ok(&arguments);
+    assert!(again.contains("paper-table (up to date)") && again.contains("\n0 of "), "{again}");
+    let unknown = project.run(&["plan", "paper-table", "--scene", "demo", "--show", "nerf,bicubik"]);
+    unknown.fails(2, &["--show bicubik", "did you mean bicubic?"]);
 }

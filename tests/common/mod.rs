@@ -91,6 +91,13 @@ impl Project {
         project
     }
 
+    /// The tiny pipeline with the shipped `pipelines/` and `experiments/`.
+    pub fn experiments() -> Self {
+        let project = Self::tiny();
+        ["pipelines", "experiments"].into_iter().for_each(|folder| project.copy_folder(folder, "."));
+        project
+    }
+
     /// Copies a shipped folder of pipeline files into a folder.
     pub fn copy_folder(&self, shipped: &str, folder: &str) {
         for entry in std::fs::read_dir(root().join(shipped)).unwrap() {

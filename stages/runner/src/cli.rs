@@ -82,6 +82,9 @@ struct OfExperiment {
     /// Only so many variants of an experiment, the first
     #[arg(long, value_name = "N")]
     first_variants: Option<usize>,
+    /// Of what a sink shows only these: names of its inputs, or blocks [default: all]
+    #[arg(long = "show", value_name = "NAME[,NAME…]", value_delimiter = ',')]
+    show: Vec<String>,
     /// Folder of an experiment's data sets [default: the file's]
     #[arg(long, value_name = "DIR", env = "NERF_SR_DATA")]
     data: Option<PathBuf>,
@@ -258,8 +261,8 @@ pub fn main() -> ExitCode {
 
 impl From<What> for Request {
     fn from(what: What) -> Self {
-        let OfExperiment { scenes, protocols, variants, first_variants, data } = what.experiment;
-        let choice = Selection { data, scenes, protocols, variants, first: first_variants };
+        let OfExperiment { scenes, protocols, variants, first_variants, show, data } = what.experiment;
+        let choice = Selection { data, scenes, protocols, variants, first: first_variants, show };
         Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, choice }
     }
 }
@@ -346,7 +349,14 @@ fn given(what: &What, pipeline: &Path, store: Option<&Path>, device: &str) -> Ve
     words.extend(what.parameters.iter().flat_map(|value| ["-p".to_owned(), value.clone()]));
     words.extend(what.inputs.iter().flat_map(|value| ["-i".to_owned(), value.clone()]));
     let file = |path: &Path| path.to_string_lossy().into_owned();
+    let OfExperiment { scenes, protocols, variants, first_variants, show, data } = &what.experiment;
+    let lists = [("--scene", scenes), ("--protocol", protocols), ("--show", show)];
+    let lists = lists.into_iter().filter(|(_, names)| !names.is_empty());
+    words.extend(lists.flat_map(|(option, names)| [option.to_owned(), names.join(",")]));
+    words.extend(variants.iter().flat_map(|name| ["--variant".to_owned(), name.clone()]));
     let options = [
+        ("--first-variants", first_variants.map(|count| count.to_string())),
+        ("--data", data.as_deref().map(file)),
         ("--pipeline", (pipeline != Path::new(PIPELINE)).then(|| file(pipeline))),
         ("--store", store.map(file)),
         ("--device", (device != DEVICE).then(|| device.to_owned())),

@@ -53,7 +53,15 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
     });
     let nodes = nodes.collect();
     let failed = missing.into_iter().map(|index| &plan.nodes[index]);
-    let failed = failed.map(|node| FailedPoint { stage: node.stage.clone(), point: node.point.clone() }).collect();
+    let failed = failed.map(|node| FailedPoint {
+        stage: node.stage.clone(),
+        point: node.point.clone(),
+        values: node.values.clone(),
+        reason: None,
+    });
+    // Other sinks don't know of results that aren't there.
+    let left_out = sink.left_out.iter().filter(|_| sink.program.description.partial).cloned();
+    let failed = failed.chain(left_out).collect();
     let home = std::path::absolute(out).unwrap_or_else(|_| out.to_path_buf());
     let home = home.ancestors().find(|folder| folder.is_dir()).map(Path::to_path_buf).unwrap_or_default();
     Some(RunRecord { home, nodes, failed })

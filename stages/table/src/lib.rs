@@ -2,12 +2,16 @@
 //!
 //! * [`Params`]: what makes a row, what makes a column, and what values are shown.
 //! * `rows`: a row for every result of a run, with its scores, its times, and where it was made.
-//! * `markdown`: these rows as a table for people, means where several results fall into one cell, the best marked.
+//! * `markdown`: these rows as tables for people.
+//! * `grid`: one of them, means where several results fall into one cell, the best marked.
+//! * `values`: values by their names, and how they are shown.
 //!
-//! A sink: it gets the run's record and is never cached. What a failed point would have shown is named.
+//! A sink: it gets the run's record and is never cached. What a failed point would have shown is named; what was left out says why.
 
+mod grid;
 mod markdown;
 mod rows;
+mod values;
 
 use std::collections::BTreeMap;
 
@@ -42,6 +46,55 @@ pub struct Params {
     /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
+    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images, methods: [eval]}]`, the
+    /// methods by the block that was scored. A column names the group, and the best is marked in each.
+    #[schemars(extend("x-default" = "one group of all"))]
+    pub groups: Vec<Group>,
+    /// Heading of the groups' column, and their key.
+    pub grouped_by: String,
+    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr: 29.77}]`. Such a row
+    /// stands where the results have its keys, and is never the best.
+    #[schemars(extend("x-default" = "none"))]
+    pub further: Vec<Row>,
+    /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over: eval-nerf}]`. Methods are
+    /// blocks, or those of `further`.
+    #[schemars(extend("x-default" = "none"))]
+    pub gains: Vec<Gain>,
+    /// A key; each of its values has a table of its own, too, where there are several. Of `further`, it has the rows with this key.
+    #[schemars(extend("x-default" = "one table of all"))]
+    pub each: String,
+    /// Remarks below the table.
+    #[schemars(extend("x-default" = "none"))]
+    pub notes: Vec<String>,
+}
+
+/// Methods that may be compared.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Group {
+    /// What they have in common.
+    pub name: String,
+    /// The blocks that were scored.
+    pub methods: Vec<String>,
+}
+
+/// A difference in PSNR between two methods.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Gain {
+    /// Its name.
+    pub name: String,
+    /// The method that gains.
+    pub of: String,
+    /// The method that it is compared with.
+    pub over: String,
+}
+
+impl Params {
+    /// The value by which rows are compared: the first that is shown.
+    fn compared(&self) -> &str {
+        self.values.first().map_or("psnr", String::as_str)
+    }
 }
 
 impl Default for Params {
@@ -55,6 +108,12 @@ impl Default for Params {
             relative_to: BTreeMap::new(),
             spread: Vec::new(),
             methods: BTreeMap::new(),
+            groups: Vec::new(),
+            grouped_by: "group".to_owned(),
+            further: Vec::new(),
+            gains: Vec::new(),
+            each: String::new(),
+            notes: Vec::new(),
         }
     }
 }
@@ -80,7 +139,7 @@ impl Stage for Table {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
         run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
-        let rows = rows::rows(&run, &params.methods)?;
+        let rows = rows::rows(&run, params)?;
         if rows.is_empty() && run.failed.is_empty() {
             return Err(Failure::BadInput("run.json: nothing in it was scored".to_owned()).into());
         }
@@ -107,7 +166,7 @@ fn write_csv(context: &Context, rows: &[Row]) -> anyhow::Result<()> {
     let mut writer = csv::Writer::from_path(&path).with_context(place)?;
     writer.write_record(&names).with_context(place)?;
     for row in rows {
-        let cells = names.iter().map(|name| row.get(*name).map(markdown::plain).unwrap_or_default());
+        let cells = names.iter().map(|name| row.get(*name).map(values::plain).unwrap_or_default());
         writer.write_record(cells).with_context(place)?;
     }
     writer.flush().with_context(place)

@@ -6,25 +6,54 @@ use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
 use serde_json::{Map, Value, json};
 
+use crate::Params;
+
+/// Why a row has no values.
+pub(crate) const MISSING: &str = "missing";
+
 /// A result: its keys (axes of the run, `method`), then its values, by name.
 pub type Row = Map<String, Value>;
 
-/// A row for every result of a run, in the order of the run.
-pub(crate) fn rows(run: &RunRecord, methods: &BTreeMap<String, String>) -> anyhow::Result<Vec<Row>> {
+/// A row for every result of a run, and for what was left out of it: in the order of the groups, and otherwise of the run.
+pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>> {
     let commit = commit(&run.home);
     let mut scored: Vec<(usize, &RunNode)> = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
     // What came through fewer stages stands first: rendered views before refined ones.
     scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
-    let rows = scored.into_iter().map(|(index, node)| {
-        let mut row: Row = node.values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
-        row.insert("method".to_owned(), json!(methods.get(&node.stage).unwrap_or(&node.stage)));
+    let mut rows: Vec<(usize, Row)> = Vec::new();
+    for (index, node) in scored {
+        let mut row = keys(params, &node.stage, &node.values);
         row.extend(scores(node)?);
         row.extend(times(run, index)?);
         row.insert("commit".to_owned(), json!(commit));
         row.insert("machine".to_owned(), json!(node.host));
-        Ok(row)
-    });
-    rows.collect()
+        rows.push((place(params, &node.stage), row));
+    }
+    for point in &run.failed {
+        let Some(reason) = &point.reason else { continue };
+        let mut row = keys(params, &point.stage, &point.values);
+        row.insert(MISSING.to_owned(), json!(reason));
+        rows.push((place(params, &point.stage), row));
+    }
+    rows.sort_by_key(|(place, _)| *place);
+    Ok(rows.into_iter().map(|(_, row)| row).collect())
+}
+
+/// What a result is of: values of axes, method and its group.
+fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> Row {
+    let mut row: Row = values.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
+    row.insert("method".to_owned(), json!(params.methods.get(stage).unwrap_or(stage)));
+    if !params.groups.is_empty() {
+        let group = params.groups.iter().find(|group| group.methods.contains(stage));
+        row.insert(params.grouped_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
+    }
+    row
+}
+
+/// The place of a method in the table; those of no group come last.
+fn place(params: &Params, stage: &String) -> usize {
+    let mut all = params.groups.iter().flat_map(|group| &group.methods);
+    all.position(|method| method == stage).unwrap_or(usize::MAX)
 }
 
 /// The commit of the pipeline's folder, `-dirty` where it differs; nothing where it isn't under git.
@@ -92,7 +121,7 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         parents.any(|parent| run.nodes[parent].kind == "field")
     };
     let refining: Vec<usize> = rendering.iter().copied().filter(|i| !by_field(i)).collect();
-    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>();
+    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0; // of nothing it is -0
     let mut row = Row::new();
     for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)] {
         row.insert(name.to_owned(), json!(seconds(nodes)));

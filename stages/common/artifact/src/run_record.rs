@@ -14,19 +14,25 @@ pub struct RunRecord {
     pub home: PathBuf,
     /// Every node that what is shown was made of; parents come before their children.
     pub nodes: Vec<RunNode>,
-    /// What should be shown and wasn't made, where the sink shows what there is.
+    /// What should be shown and isn't there, where the sink shows what there is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub failed: Vec<FailedPoint>,
 }
 
-/// A node that failed, or that waits for one that did.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// A node that failed, that waits for one that did, or that was left out.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FailedPoint {
     /// Name of the stage's block.
     pub stage: String,
     /// The sweep's point.
     pub point: String,
+    /// The values of the sweep's or experiment's axes that reach it, by the axes' names.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub values: BTreeMap<String, String>,
+    /// Why it was left out; nothing where it failed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
 }
 
 /// One finished node of a run.

@@ -61,7 +61,8 @@ pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), Pip
                 .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
         }
         for (input, port) in &program.description.inputs {
-            if !port.optional && !block.inputs.contains_key(input) {
+            let is_given = block.inputs.contains_key(input) || (program.description.sink && !block.inputs.is_empty());
+            if !port.optional && !is_given {
                 return Err(pipeline.error(name, Part::Block, format!("input {input} is missing ({})", port.summary)));
             }
         }

@@ -3,11 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use artifact::GivenInputs;
+use artifact::{FailedPoint, GivenInputs};
 use serde_json::{Map, Value};
 
 use crate::axes::{Axis, Kind, Setting};
-use crate::check::{closure, needs};
+use crate::check::closure;
+use crate::experiment::Choice;
+use crate::left_out::{Files, check_shown, shown};
 use crate::pipeline::{Part, Pipeline, Source};
 use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
 use crate::stages::{Programs, StageProgram};
@@ -23,35 +25,64 @@ pub(crate) struct Expansion<'a> {
     pipeline: &'a Pipeline,
     programs: &'a Programs,
     axes: &'a [Axis],
+    choice: &'a Choice,
+    files: Files,
     nodes: Vec<Node>,
     /// The nodes of each stage, with the value (by number) of every axis that reaches them.
     of_stage: BTreeMap<String, Vec<(Point, usize)>>,
+    /// The points of each stage that aren't made, with the reason.
+    left_out: BTreeMap<String, Vec<(Point, String)>>,
+    notes: Vec<String>,
 }
 
 impl<'a> Expansion<'a> {
-    pub(crate) fn new(pipeline: &'a Pipeline, programs: &'a Programs, axes: &'a [Axis]) -> Self {
-        Self { pipeline, programs, axes, nodes: Vec::new(), of_stage: BTreeMap::new() }
+    pub(crate) fn new(
+        pipeline: &'a Pipeline,
+        programs: &'a Programs,
+        axes: &'a [Axis],
+        choice: &'a Choice,
+    ) -> Result<Self, PlanError> {
+        let files = Files::new(pipeline, choice)?;
+        let (nodes, of_stage, left_out, notes) = (Vec::new(), BTreeMap::new(), BTreeMap::new(), Vec::new());
+        Ok(Self { pipeline, programs, axes, choice, files, nodes, of_stage, left_out, notes })
     }
 
     /// Makes the nodes of what the targets need, in an order in which each comes after those that it needs.
     pub(crate) fn expand(mut self, order: &[String], targets: &[String]) -> Result<Plan, PlanError> {
-        // An input replaced from the command line needs nothing.
-        let sources =
-            |stage: &str| self.block_inputs(stage).filter_map(|(_, source)| source.stage()).map(str::to_owned).collect();
+        let is_sink = |stage: &str| self.programs.get(stage).is_some_and(|program| program.description.sink);
+        let sources = |stage: &str| match is_sink(stage) {
+            true => shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect(),
+            // An input replaced from the command line needs nothing.
+            false => self.block_inputs(stage).filter_map(|(_, source)| source.stage()).map(str::to_owned).collect(),
+        };
         let wanted = closure(targets, sources);
+        let of_targets: Vec<&str> = wanted.iter().map(String::as_str).filter(|stage| is_sink(stage)).collect();
+        check_shown(self.pipeline, &of_targets, self.choice)?;
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
             let program = Arc::clone(self.programs.require(stage)?);
-            if program.description.sink {
-                let nodes = needs(self.pipeline, stage).flat_map(|shown| self.of_stage.get(shown).into_iter().flatten());
-                let shows: BTreeSet<usize> = nodes.map(|(_, node)| *node).collect();
-                let parameters = self.resolve(stage, &program, &Point::new())?;
-                sinks.push(Sink { stage: stage.clone(), program, parameters, shows: shows.into_iter().collect() });
-            } else {
-                self.add_stage(stage, &program)?;
+            match program.description.sink {
+                true => sinks.push(self.sink(stage, program)?),
+                false => self.add_stage(stage, &program)?,
             }
         }
-        Ok(Plan { nodes: self.nodes, sinks, ..Plan::default() })
+        Ok(Plan { nodes: self.nodes, sinks, notes: self.notes, ..Plan::default() })
+    }
+
+    /// A sink, with all points of what it shows.
+    fn sink(&self, stage: &str, program: Arc<StageProgram>) -> Result<Sink, PlanError> {
+        let parameters = self.resolve(stage, &program, &Point::new())?;
+        let (mut shows, mut left_out) = (BTreeSet::new(), Vec::new());
+        for of in shown(self.pipeline, stage, self.choice) {
+            shows.extend(self.of_stage.get(of).into_iter().flatten().map(|(_, node)| *node));
+            left_out.extend(self.left_out.get(of).into_iter().flatten().map(|(point, reason)| FailedPoint {
+                stage: of.to_owned(),
+                point: self.label(point),
+                values: self.values(point),
+                reason: Some(reason.clone()),
+            }));
+        }
+        Ok(Sink { stage: stage.to_owned(), program, parameters, shows: shows.into_iter().collect(), left_out })
     }
 
     /// A block's inputs less those that the command line or an experiment replaces at every point.
@@ -83,8 +114,12 @@ impl<'a> Expansion<'a> {
 
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
         for point in self.points(stage)? {
-            let inputs = self.node_inputs(stage, &point);
             let parameters = self.resolve(stage, program, &point)?;
+            if let Some(reason) = self.missing(stage, &point, &parameters) {
+                self.left_out.entry(stage.to_owned()).or_default().push((point, reason));
+                continue;
+            }
+            let inputs = self.node_inputs(stage, &point);
             // Points that come to one result have one node.
             let is_it = |node: &&usize| self.nodes[**node].parameters == parameters && self.nodes[**node].inputs == inputs;
             if let Some(node) = self.of_stage.get(stage).into_iter().flatten().map(|(_, node)| node).find(is_it).copied() {
@@ -109,13 +144,29 @@ impl<'a> Expansion<'a> {
         Ok(())
     }
 
+    /// Why a stage isn't made at a point: its own file isn't there, or a parent isn't made.
+    fn missing(&mut self, stage: &str, point: &Point, parameters: &Value) -> Option<String> {
+        if let Some(reason) = self.files.missing(stage, parameters) {
+            let note = format!("{stage}: left out: {reason} in {}", self.files.data.display());
+            if !self.notes.contains(&note) {
+                self.notes.push(note);
+            }
+            return Some(reason);
+        }
+        let parents = self.block_inputs(stage).filter_map(|(_, source)| source.stage());
+        let left_out = parents.flat_map(|parent| self.left_out.get(parent).into_iter().flatten());
+        left_out.filter(|(values, _)| is_inside(values, point)).map(|(_, reason)| reason.clone()).next()
+    }
+
     /// All combinations of the values that reach a stage: those of its own axes and of its parents'.
     fn points(&self, stage: &str) -> Result<Vec<Point>, PlanError> {
         let is_set = |axis: &&usize| self.axes[**axis].settings().any(|set| self.sets(set, stage));
         let all: Vec<usize> = (0..self.axes.len()).collect();
         let mut reach: BTreeSet<usize> = all.iter().filter(is_set).copied().collect();
         for parent in self.block_inputs(stage).filter_map(|(_, source)| source.stage()) {
-            reach.extend(self.of_stage[parent].iter().flat_map(|(values, _)| values.keys().copied()));
+            let made = self.of_stage.get(parent).into_iter().flatten().map(|(values, _)| values);
+            let left_out = self.left_out.get(parent).into_iter().flatten().map(|(values, _)| values);
+            reach.extend(made.chain(left_out).flat_map(|values| values.keys().copied()));
         }
         let mut points: Vec<Point> = vec![Point::new()];
         for axis in reach {
@@ -149,8 +200,7 @@ impl<'a> Expansion<'a> {
 
     /// A parent's node at a point of its child.
     fn parent(&self, stage: &str, point: &Point) -> usize {
-        let fits = |values: &Point| values.iter().all(|(axis, v)| point.get(axis) == Some(v));
-        let found = self.of_stage[stage].iter().find(|(values, _)| fits(values));
+        let found = self.of_stage[stage].iter().find(|(values, _)| is_inside(values, point));
         found.expect("a parent's axes reach its children").1
     }
 
@@ -168,9 +218,11 @@ impl<'a> Expansion<'a> {
         swept.map(|(axis, text)| format!("{}={text}", axis.name)).collect::<Vec<_>>().join(", ")
     }
 
-    /// The values of what has a name, for tables.
+    /// The values of what has a name, for tables; the only value of an axis is every node's.
     fn values(&self, point: &Point) -> BTreeMap<String, String> {
-        self.named(point).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
+        let only = self.axes.iter().filter(|axis| axis.is_named && axis.values.len() == 1);
+        let only = only.map(|axis| (axis, axis.values[0].text.as_str()));
+        self.named(point).chain(only).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
     }
 
     fn named<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {
@@ -189,4 +241,9 @@ impl<'a> Expansion<'a> {
         }
         program.schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
     }
+}
+
+/// Whether a point has all values of another one.
+fn is_inside(values: &Point, point: &Point) -> bool {
+    values.iter().all(|(axis, value)| point.get(axis) == Some(value))
 }

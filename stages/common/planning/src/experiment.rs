@@ -23,10 +23,16 @@ pub struct Experiment {
     pub scenes: Vec<String>,
     /// Protocols: names of `presets`. An unknown one of the form WIDTHxSCALE has the settings of preset `other`.
     pub protocols: Vec<String>,
-    /// Parameters that go together, by name and then by `[STAGE.]NAME`.
+    /// Parameters that go together, by name and then by `[STAGE.]NAME`. Preset `every` holds what all of them have, where they don't say
+    /// otherwise. In words, `{width}`, `{scale}` and `{hr_width}` stand for a protocol's own.
     pub presets: BTreeMap<String, Map<String, Value>>,
     /// Inputs that come from the folder of the data sets, by `[STAGE.]NAME`; left out where the folder isn't there.
     pub inputs: BTreeMap<String, String>,
+    /// Files in the folder of the data sets without which a block isn't made, by block. `{NAME}` stands for the block's parameter.
+    pub needs: BTreeMap<String, String>,
+    /// Inputs of sinks that are shown unless the command line chooses, by their names or by the blocks that they are; a sink that has none of
+    /// them shows all of its own.
+    pub show: Vec<String>,
     /// Variants, in the order of the table; they form no product.
     pub variants: Vec<Variant>,
     /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the place of one.
@@ -60,12 +66,16 @@ pub struct Choice {
     pub variants: Vec<String>,
     /// Only so many variants, the first.
     pub first: Option<usize>,
+    /// Only these inputs of sinks, by their names or by the blocks that they are.
+    pub show: Vec<String>,
 }
 
 /// The scene that is the pipeline's own.
 const DEMO: &str = "demo";
 /// The preset of protocols that have none.
 const OTHER: &str = "other";
+/// The preset of what all protocols have.
+const EVERY: &str = "every";
 
 impl Experiment {
     /// Takes what a file that extends this one's says.
@@ -78,17 +88,27 @@ impl Experiment {
         take(&mut self.folders, &by.folders);
         take(&mut self.scenes, &by.scenes);
         take(&mut self.protocols, &by.protocols);
+        take(&mut self.show, &by.show);
         if !by.variants.is_empty() {
             self.variants.clone_from(&by.variants);
         }
         self.data = by.data.clone().or_else(|| self.data.take());
-        self.presets.extend(by.presets.clone());
+        for (name, preset) in &by.presets {
+            self.presets.entry(name.clone()).or_default().extend(preset.clone());
+        }
         self.inputs.extend(by.inputs.clone());
+        self.needs.extend(by.needs.clone());
         self.sweeps.extend(by.sweeps.clone());
     }
 
     fn is_none(&self) -> bool {
         *self == Self::default()
+    }
+
+    /// The folder of the data sets.
+    pub(crate) fn data(&self, choice: &Choice) -> PathBuf {
+        let stated = self.data.as_ref().map(PathBuf::from);
+        choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
     }
 }
 
@@ -115,27 +135,32 @@ struct Asked<'a> {
 }
 
 impl Asked<'_> {
-    fn data(&self) -> PathBuf {
-        let stated = self.experiment.data.as_ref().map(PathBuf::from);
-        self.choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
-    }
-
     fn scenes(&self) -> Result<Vec<AxisValue>, PlanError> {
         let names = if self.choice.scenes.is_empty() { &self.experiment.scenes } else { &self.choice.scenes };
         let common = self.inputs(&self.experiment.inputs)?;
         let scene = |name: &String| {
             let mut settings = common.clone();
             if name != DEMO {
-                settings.push(self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?);
+                let own = self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?;
+                settings.extend(self.alike(&own));
             }
             Ok(AxisValue { text: name.clone(), settings })
         };
         names.iter().map(scene).collect()
     }
 
+    /// That input of a block, and those of other blocks that come from the same source.
+    fn alike(&self, own: &Setting) -> Vec<Setting> {
+        let stages = &self.scope.pipeline.stages;
+        let Some(source) = stages[&own.stage].inputs.get(&own.name) else { return vec![own.clone()] };
+        let inputs = stages.iter().flat_map(|(stage, block)| block.inputs.iter().map(move |(name, from)| (stage, name, from)));
+        let same = inputs.filter(|(.., from)| *from == source);
+        same.map(|(stage, name, _)| Setting { stage: stage.clone(), name: name.clone(), ..own.clone() }).collect()
+    }
+
     /// The folder of a scene.
     fn scene_folder(&self, name: &str) -> Result<Value, PlanError> {
-        let data = self.data();
+        let data = self.experiment.data(self.choice);
         let place = |inside: &String| data.join(inside).join(name);
         let here = ".".to_owned();
         let found = self.experiment.folders.iter().chain([&here]).map(place).find(|path| path.is_dir());
@@ -150,7 +175,7 @@ impl Asked<'_> {
 
     /// Inputs from the data sets' folder, those that are there.
     fn inputs(&self, inputs: &BTreeMap<String, String>) -> Result<Vec<Setting>, PlanError> {
-        let data = self.data();
+        let data = self.experiment.data(self.choice);
         let there = inputs.iter().map(|(name, inside)| (name, data.join(inside))).filter(|(_, path)| path.is_dir());
         there.map(|(name, path)| self.scope.setting(Kind::Input, name, &folder(&path.to_string_lossy()))).collect()
     }
@@ -161,21 +186,27 @@ impl Asked<'_> {
         names.iter().map(protocol).collect()
     }
 
-    /// A preset's parameters; those of `other` with the width and the scale for one that isn't named.
+    /// A preset's parameters over those of `every`; those of `other` with the width and the scale for one that isn't named.
     fn preset(&self, name: &str) -> Result<Map<String, Value>, PlanError> {
         let presets = &self.experiment.presets;
-        if let Some(preset) = presets.get(name).filter(|_| name != OTHER) {
-            return Ok(preset.clone());
+        let is_protocol = |name: &str| ![OTHER, EVERY].contains(&name);
+        let sizes = sizes(name);
+        let mut preset = presets.get(EVERY).cloned().unwrap_or_default();
+        match (presets.get(name).filter(|_| is_protocol(name)), sizes) {
+            (Some(own), _) => preset.extend(own.clone()),
+            (None, Some((width, scale))) => {
+                preset.extend(presets.get(OTHER).cloned().unwrap_or_default());
+                preset.insert("lr_width".to_owned(), Value::from(width));
+                preset.insert("prep.scale".to_owned(), Value::from(scale));
+            }
+            (None, None) => {
+                let known = known_names(name, presets.keys().map(String::as_str).filter(|known| is_protocol(known)));
+                return Err(PlanError::Usage(format!("no protocol {name:?}, and not of the form WIDTHxSCALE; {known}")));
+            }
         }
-        let sizes =
-            name.split_once('x').and_then(|(width, scale)| Some((width.parse::<u32>().ok()?, scale.parse::<f64>().ok()?)));
-        let Some((width, scale)) = sizes else {
-            let known = known_names(name, presets.keys().map(String::as_str).filter(|known| *known != OTHER));
-            return Err(PlanError::Usage(format!("no protocol {name:?}, and not of the form WIDTHxSCALE; {known}")));
-        };
-        let mut preset = presets.get(OTHER).cloned().unwrap_or_default();
-        preset.insert("lr_width".to_owned(), Value::from(width));
-        preset.insert("prep.scale".to_owned(), Value::from(scale));
+        if let Some(sizes) = sizes {
+            preset.values_mut().for_each(|value| fill(value, sizes));
+        }
         Ok(preset)
     }
 
@@ -208,4 +239,18 @@ impl Asked<'_> {
     fn parameters(&self, parameters: &Map<String, Value>) -> Result<Vec<Setting>, PlanError> {
         parameters.iter().map(|(name, value)| self.scope.setting(Kind::Parameter, name, value)).collect()
     }
+}
+
+/// LR width and scale of a protocol's name, WIDTHxSCALE.
+fn sizes(name: &str) -> Option<(u32, f64)> {
+    let (width, scale) = name.split_once('x')?;
+    Some((width.parse().ok()?, scale.parse().ok()?))
+}
+
+/// Puts a protocol's sizes into a word that names them; what is a number then, is meant as one.
+fn fill(value: &mut Value, (width, scale): (u32, f64)) {
+    let Some(word) = value.as_str().filter(|word| word.contains('{')) else { return };
+    let sizes = [("{width}", f64::from(width)), ("{scale}", scale), ("{hr_width}", (f64::from(width) * scale).round())];
+    let filled = sizes.iter().fold(word.to_owned(), |word, (name, size)| word.replace(name, &size.to_string()));
+    *value = filled.parse().map_or_else(|_| Value::from(filled.as_str()), Value::Number);
 }

@@ -143,6 +143,15 @@ fn the_command_line_chooses_and_wins() {
     assert_eq!((&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]), (&json!(7), &json!(500)));
 }
 
+/// The pipeline's own scene sets nothing, and tables name it nonetheless.
+#[test]
+fn an_only_value_is_every_nodes() {
+    let data = data();
+    let text = EXPERIMENT.replace("  inputs: {score.weights: weights}\n", "");
+    let plan = plan_of(&text, data.path(), |r| r.choice.scenes = vec!["demo".to_owned()]).unwrap();
+    assert!(plan.nodes.iter().all(|node| node.values["scene"] == "demo" && !node.label().contains("demo")));
+}
+
 #[test]
 fn a_sweep_of_the_file_gives_way() {
     let data = data();
@@ -155,6 +164,83 @@ fn a_sweep_of_the_file_gives_way() {
         r.parameters = vec!["rays=9".to_owned()];
     });
     assert_eq!(labels(&plan.unwrap())[1..2], ["train"]);
+}
+
+/// An experiment whose sink shows two fields' scores; one of them is of a scene of its own and needs a file.
+const SHOWN: &str = "
+  prep-large:
+    extends: prep
+    inputs: {dataset: ./own}
+  train-large:
+    extends: train
+    inputs: {scene: prep-large}
+  score-large:
+    extends: score
+    inputs: {field: train-large}
+  table:
+    inputs: {small: score, large: score-large}
+";
+
+fn shown() -> String {
+    let text = EXPERIMENT.replace("\n  table:\n    inputs: {run: score}\n", SHOWN);
+    let text = text.replace(
+        "  variants:\n",
+        "    every: {prep-large.lr_width: '{hr_width}', score-large.samples: '{scale}'}\n  variants:\n",
+    );
+    text.replace("  variants:\n", "  needs: {train-large: 'weights/x{rays}'}\n  variants:\n")
+}
+
+#[test]
+fn only_what_is_to_be_shown_is_made() {
+    let data = data();
+    std::fs::write(data.path().join("weights/x500"), "").unwrap();
+    let plan = |show: &[&str]| {
+        plan_of(&shown(), data.path(), |r| {
+            (r.choice.scenes, r.choice.protocols, r.choice.first) = (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
+            r.choice.show = show.iter().map(|name| (*name).to_owned()).collect();
+        })
+    };
+    for (show, expected) in [
+        (&[][..], &["prep", "prep-large", "train", "score", "train-large", "score-large"][..]),
+        (&["large", "score"], &["prep", "prep-large", "train", "score", "train-large", "score-large"]),
+        (&["small"], &["prep", "train", "score"]),
+        (&["score-large"], &["prep-large", "train-large", "score-large"]),
+    ] {
+        let mut made = labels(&plan(show).unwrap());
+        let mut expected: Vec<&str> = expected.to_vec();
+        made.sort_unstable();
+        expected.sort_unstable();
+        assert_eq!(made, expected, "{show:?}");
+    }
+    // The scene is every block's that has the pipeline's own otherwise; sizes follow from the protocol.
+    let large = &plan(&["large"]).unwrap().nodes;
+    let folder =
+        NodeInput { name: "dataset".to_owned(), from: Origin::Folder(data.path().join("second/lego").canonicalize().unwrap()) };
+    assert_eq!((&large[0].inputs[..], &large[0].parameters["lr_width"]), (&[folder][..], &json!(150)));
+    assert_eq!(large[2].parameters["samples"], json!(3));
+    let problem = |show: &[&str]| plan(show).map(|plan| labels(&plan)).unwrap_err().to_string();
+    assert_eq!(
+        problem(&["larg"]),
+        "--show larg: table has no such input; did you mean large? known: large, score, score-large, small"
+    );
+}
+
+#[test]
+fn what_lacks_a_file_is_left_out() {
+    let data = data();
+    std::fs::write(data.path().join("weights/x500"), "").unwrap();
+    let plan = plan_of(&shown(), data.path(), |r| {
+        r.choice.protocols = vec!["50x3".to_owned(), "100x2".to_owned()];
+        (r.choice.scenes, r.choice.first) = (vec!["chair".to_owned()], Some(1));
+    });
+    let plan = plan.unwrap();
+    let scores: Vec<String> = labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect();
+    assert_eq!(scores, ["score [protocol=50x3]", "score [protocol=100x2]", "score-large [protocol=50x3]"]);
+    assert_eq!(plan.sinks[0].shows.len(), 3);
+    let [left_out] = &plan.sinks[0].left_out[..] else { panic!("{:?}", plan.sinks[0].left_out) };
+    assert_eq!((left_out.stage.as_str(), left_out.values["protocol"].as_str()), ("score-large", "100x2"));
+    assert_eq!(left_out.reason.as_deref(), Some("no weights/x1000"));
+    assert!(plan.notes[0].starts_with("train-large: left out: no weights/x1000 in "), "{:?}", plan.notes);
 }
 
 #[test]
@@ -176,6 +262,16 @@ fn what_there_is_not_is_refused() {
             EXPERIMENT.to_owned(),
             &|c| c.variants = vec!["no warmup".to_owned()],
             "no variant \"no warmup\"; did you mean no warm-up?",
+        ),
+        (
+            EXPERIMENT.split("  table:").next().unwrap().replace("[table]", "[score]"),
+            &|c| c.show = vec!["score".to_owned()],
+            "--show chooses what a sink shows, and no target is one",
+        ),
+        (
+            EXPERIMENT.replace("  variants:", "  needs: {scor: x}\n  variants:"),
+            &|_| (),
+            "needs scor: no such stage; did you mean score?",
         ),
         (EXPERIMENT.replace("warmup: 0", "warmap: 0"), &|_| (), "-p warmap: no stage has such a parameter; did you mean warmup?"),
         (EXPERIMENT.replace("score.samples: 1", "scor.samples: 1"), &|_| (), "no stage \"scor\""),

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::Description;
+use artifact::{Description, FailedPoint};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use slurm::Resources;
@@ -39,6 +39,7 @@ struct FrozenSink {
     stage: String,
     parameters: Value,
     shows: Vec<usize>,
+    left_out: Vec<FailedPoint>,
     program: PathBuf,
 }
 
@@ -85,6 +86,7 @@ impl Frozen {
             stage: sink.stage.clone(),
             parameters: sink.parameters.clone(),
             shows: sink.shows.clone(),
+            left_out: sink.left_out.clone(),
             program: sink.program.path.clone(),
         });
         Self {
@@ -123,10 +125,10 @@ impl Frozen {
             nodes.push(Node { stage, point, values, parameters, inputs, program: self.program(program, &mut programs)? });
         }
         let mut sinks = Vec::new();
-        if let Some(FrozenSink { stage, parameters, shows, program }) = sink {
-            let (stage, parameters) = (stage.clone(), parameters.clone());
+        if let Some(FrozenSink { stage, parameters, shows, left_out, program }) = sink {
+            let (stage, parameters, left_out) = (stage.clone(), parameters.clone(), left_out.clone());
             let shows = shows.iter().map(|index| position[index]).collect();
-            sinks.push(Sink { stage, parameters, shows, program: self.program(program, &mut programs)? });
+            sinks.push(Sink { stage, parameters, shows, left_out, program: self.program(program, &mut programs)? });
         }
         Ok(Plan { nodes, sinks, notes: Vec::new(), devices: self.devices.clone(), resources: self.resources.clone() })
     }

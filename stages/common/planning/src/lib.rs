@@ -27,6 +27,7 @@ mod extend;
 mod file;
 mod frozen;
 mod key;
+mod left_out;
 mod pipeline;
 mod plan;
 mod renames;

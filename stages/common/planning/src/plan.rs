@@ -2,7 +2,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Description, Record, RunInput, Store, Waiting, hash_json, label};
+use artifact::{Description, FailedPoint, Record, RunInput, Store, Waiting, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
@@ -92,6 +92,8 @@ pub struct Sink {
     pub parameters: Value,
     /// The nodes that it shows.
     pub shows: Vec<usize>,
+    /// What it would show, if that had been there to make it of.
+    pub left_out: Vec<FailedPoint>,
 }
 
 /// What is asked for on the command line.
@@ -297,8 +299,9 @@ impl<'a> Goal<'a> {
     fn plan(&self, pipeline: &Pipeline, programs: &Programs, request: &Request) -> Result<Plan, PlanError> {
         check::blocks(pipeline, programs)?;
         let order = check::order(pipeline)?;
-        let (axes, notes) = Scope { pipeline, programs, needed: &self.needed }.axes(request)?;
-        let plan = Expansion::new(pipeline, programs, &axes).expand(&order, self.targets)?;
+        let (axes, mut notes) = Scope { pipeline, programs, needed: &self.needed }.axes(request)?;
+        let plan = Expansion::new(pipeline, programs, &axes, &request.choice)?.expand(&order, self.targets)?;
+        notes.extend(plan.notes);
         let resources = self.needed.iter().map(|stage| (stage.clone(), pipeline.resources(stage)));
         Ok(Plan { notes, resources: resources.filter(|(_, needs)| !needs.is_empty()).collect(), ..plan })
     }

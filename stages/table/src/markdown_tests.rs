@@ -1,0 +1,193 @@
+//! Rows to Markdown.
+
+use super::*;
+use crate::{Gain, Group};
+use serde_json::json;
+use std::collections::BTreeMap;
+
+fn rows() -> Vec<Row> {
+    let row = |scene: &str, variant: &str, protocol: &str, psnr: f64, lpips: Option<f64>, train_s: f64| {
+        let mut row = json!({"scene": scene, "variant": variant, "protocol": protocol, "method": "eval", "psnr": psnr, "train_s": train_s,
+            "commit": "abc1234", "machine": "2 cores"});
+        lpips.iter().for_each(|value| row["lpips"] = json!(value));
+        row.as_object().cloned().unwrap()
+    };
+    vec![
+        row("lego", "as it is", "100x2", 30.0, Some(0.05), 100.0),
+        row("chair", "as it is", "100x2", 32.0, Some(0.04), 140.0),
+        row("lego", "no warm-up", "100x2", 29.5, None, 90.0),
+        row("chair", "no warm-up", "100x2", 32.25, None, 310.0),
+    ]
+}
+
+#[test]
+fn results_of_one_row_are_averaged_and_the_best_is_marked() {
+    let relative_to = BTreeMap::from([("variant".to_owned(), "as it is".to_owned())]);
+    let params = Params { title: "Ablation".to_owned(), relative_to, ..Params::default() };
+    let expected = "\
+# Ablation
+
+| variant | PSNR | LPIPS | training | against the first | commit | machine |
+| --- | --- | --- | --- | --- | --- | --- |
+| as it is | **31.00** | **0.0450** | **2.0 min** | +0.00 | abc1234 | 2 cores |
+| no warm-up | 30.88 | – | 3.3 min | -0.12 | abc1234 | 2 cores |
+";
+    assert_eq!(markdown(&params, &rows(), &[]).unwrap(), expected);
+}
+
+#[test]
+fn columns_hold_all_values_of_a_key() {
+    let params = Params {
+        rows: vec!["variant".to_owned()],
+        columns: vec!["scene".to_owned()],
+        values: vec!["psnr".to_owned(), "lpips".to_owned()],
+        ..Params::default()
+    };
+    let failed = [FailedPoint { stage: "eval".to_owned(), point: "scene=ship".to_owned(), ..FailedPoint::default() }];
+    let expected = "\
+# Results
+
+| variant | lego (PSNR / LPIPS) | chair (PSNR / LPIPS) | commit | machine |
+| --- | --- | --- | --- | --- |
+| as it is | **30.00** / **0.0500** | 32.00 / **0.0400** | abc1234 | 2 cores |
+| no warm-up | 29.50 / – | **32.25** / – | abc1234 | 2 cores |
+
+Failed, or waiting for what failed:
+
+* eval [scene=ship]
+";
+    assert_eq!(markdown(&params, &rows(), &failed).unwrap(), expected);
+}
+
+#[test]
+fn keys_that_no_result_has_are_refused() {
+    for (rows_by, relative_to, words) in [
+        (
+            vec!["varant"],
+            vec![],
+            "parameter rows: no result has a key \"varant\"; did you mean variant? known: method, protocol, scene, variant",
+        ),
+        (vec![], vec![("variant", "nothing")], "parameter relative_to: no result has {\"variant\": \"nothing\"}"),
+    ] {
+        let params = Params {
+            rows: rows_by.into_iter().map(str::to_owned).collect(),
+            relative_to: relative_to.into_iter().map(|(k, v)| (k.to_owned(), v.to_owned())).collect(),
+            ..Params::default()
+        };
+        assert_eq!(markdown(&params, &rows(), &[]).unwrap_err(), words);
+    }
+    let spread = Params { spread: vec!["psnr".to_owned()], ..Params::default() };
+    let text = markdown(&spread, &rows(), &[]).unwrap();
+    assert!(text.ends_with("\nPSNR over 4 results: 30.94 ± 1.39, from 29.50 to 32.25\n"), "{text}");
+    let nothing =
+        markdown(&Params::default(), &[], &[FailedPoint { stage: "eval".to_owned(), ..FailedPoint::default() }]).unwrap();
+    assert!(nothing.contains("* eval\n"), "{nothing}");
+}
+
+fn params(text: serde_json::Value) -> Params {
+    serde_json::from_value(text).unwrap()
+}
+
+/// Rows of two methods in two groups at two protocols, as `rows` makes them.
+fn methods() -> Vec<Row> {
+    let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| json!({"method": method, "has seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr, "commit": "abc1234", "machine": "vm"});
+    let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
+    let rows = [
+        row("nerf", "LR", "lego", "100x2", 30.0),
+        row("nerf", "LR", "chair", "100x2", 32.0),
+        row("nerf", "LR", "lego", "100x4", 28.0),
+        row("ss", "LR", "lego", "100x2", 31.0),
+        row("ss", "LR", "chair", "100x2", 33.5),
+        row("ss", "LR", "lego", "100x4", 27.0),
+        missing,
+        row("hr", "HR", "lego", "100x2", 35.0),
+    ];
+    rows.map(|row| row.as_object().cloned().unwrap()).into()
+}
+
+/// The best is marked among those that have seen the same; what is known from elsewhere competes with none.
+#[test]
+fn groups_further_rows_and_gains() {
+    let params = Params {
+        groups: vec![Group { name: "LR".to_owned(), methods: vec!["nerf".to_owned(), "ss".to_owned()] }],
+        gains: vec![
+            Gain { name: "ours".to_owned(), of: "ss".to_owned(), over: "nerf".to_owned() },
+            Gain { name: "theirs".to_owned(), of: "paper: SS".to_owned(), over: "paper: NeRF".to_owned() },
+            Gain { name: "unknown".to_owned(), of: "ss".to_owned(), over: "liif".to_owned() },
+        ],
+        ..params(json!({
+            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has seen", "each": "scene", "notes": ["One."],
+            "further": [
+                {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},
+                {"method": "paper: SS", "protocol": "100x2", "psnr": 29.75},
+                {"method": "paper: SS", "protocol": "200x2", "psnr": 40},
+                {"method": "paper: SS, this scene", "scene": "chair", "protocol": "100x2", "psnr": 40},
+            ],
+        }))
+    };
+    let expected = "\
+# Results
+
+Means over lego, chair:
+
+| method | has seen | 100x2 (PSNR) | 100x4 (PSNR) | commit | machine |
+| --- | --- | --- | --- | --- | --- |
+| nerf | LR | 31.00 | **28.00** | abc1234 | vm |
+| ss | LR | **32.25** | 27.00 | abc1234 | vm |
+| liif | HR | no liif | – | – | – |
+| hr | HR | 35.00 | – | abc1234 | vm |
+| paper: NeRF |  | 27.50 | – | – | – |
+| paper: SS |  | 29.75 | – | – | – |
+
+## lego
+
+| method | has seen | 100x2 (PSNR) | 100x4 (PSNR) | commit | machine |
+| --- | --- | --- | --- | --- | --- |
+| nerf | LR | 30.00 | **28.00** | abc1234 | vm |
+| ss | LR | **31.00** | 27.00 | abc1234 | vm |
+| liif | HR | no liif | – | – | – |
+| hr | HR | 35.00 | – | abc1234 | vm |
+
+## chair
+
+| method | has seen | 100x2 (PSNR) | commit | machine |
+| --- | --- | --- | --- | --- |
+| nerf | LR | 32.00 | abc1234 | vm |
+| ss | LR | **33.50** | abc1234 | vm |
+| paper: SS, this scene |  | 40.00 | – | – |
+
+## Gain, PSNR in dB
+
+| gain | 100x2 | 100x4 |
+| --- | --- | --- |
+| ours | +1.25 | -1.00 |
+| theirs | +2.25 | – |
+
+* One.
+";
+    assert_eq!(markdown(&params, &methods(), &[]).unwrap(), expected);
+    let unknown = Params { each: "scena".to_owned(), ..Params::default() };
+    let problem = markdown(&unknown, &methods(), &[]).unwrap_err();
+    assert!(problem.starts_with("parameter each: no result has a key \"scena\"; did you mean scene?"), "{problem}");
+}
+
+/// Methods stand in the order of their groups, and what was left out in its place.
+#[test]
+fn rows_follow_the_groups() {
+    let node = |stage: &str| {
+        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true, "kind": "other", "key": "", "output": "",
+            "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 1.0, "threads": 1, "host": "vm"})
+    };
+    let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"}, "reason": "no liif"});
+    let failed = json!({"stage": "eval-nerf", "point": ""});
+    let nodes = ["eval", "eval-hr", "eval-ss"].map(node);
+    let run = json!({"nodes": nodes, "failed": [failed, left_out]});
+    let params = params(json!({"methods": {"eval-ss": "ours"}, "grouped_by": "seen",
+        "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]}, {"name": "HR", "methods": ["eval-hr"]}]}));
+    let rows = crate::rows::rows(&serde_json::from_value(run).unwrap(), &params).unwrap();
+    let told: Vec<[&str; 3]> = rows
+        .iter()
+        .map(|row| ["method", "seen", "missing"].map(|key| row.get(key).map_or("", |v| v.as_str().unwrap())))
+        .collect();
+    assert_eq!(told, [["ours", "LR", ""], ["eval-liif", "LR", "no liif"], ["eval-hr", "HR", ""], ["eval", "", ""]]);
+}

@@ -1,0 +1,71 @@
+//! Values of rows by their names: means, combinations, and how they are shown.
+
+use serde_json::Value;
+
+use crate::Row;
+
+/// Combinations of values that keys have, in the order of the rows; a single empty one without keys.
+pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
+    let mut found: Vec<Vec<String>> = Vec::new();
+    for row in rows {
+        let values = keys.iter().map(|key| row.get(key).map(plain).unwrap_or_default()).collect();
+        if !found.contains(&values) {
+            found.push(values);
+        }
+    }
+    if found.is_empty() && keys.is_empty() { vec![Vec::new()] } else { found }
+}
+
+/// The rows whose keys have these values.
+pub(crate) fn of(rows: &[Row], keys: &[String], values: &[String]) -> Vec<Row> {
+    let fits = |row: &&Row| keys.iter().zip(values).all(|(key, value)| row.get(key).map(plain).unwrap_or_default() == *value);
+    rows.iter().filter(fits).cloned().collect()
+}
+
+/// The mean of a value over the rows that have it.
+pub(crate) fn mean(rows: &[Row], name: &str) -> Option<f64> {
+    let values: Vec<f64> = rows.iter().filter_map(|row| row.get(name)?.as_f64()).collect();
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// What rows have in common, or all that they have.
+pub(crate) fn together(rows: &[Row], name: &str) -> String {
+    let with: Vec<Row> = rows.iter().filter(|row| row.contains_key(name)).cloned().collect();
+    distinct(&with, &[name.to_owned()]).concat().join(", ")
+}
+
+/// A value as text, without quotes.
+pub(crate) fn plain(value: &Value) -> String {
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
+}
+
+/// Whether less of it is better.
+pub(crate) fn is_less_better(name: &str) -> bool {
+    name.starts_with("lpips") || name.ends_with("_s") || name.starts_with("depth")
+}
+
+/// A value as people read it.
+pub(crate) fn shown(name: &str, value: f64) -> String {
+    match name {
+        "rays_per_s" => format!("{:.0} k", value / 1e3),
+        "samples_per_ray" => format!("{value:.1}"),
+        name if name.ends_with("_s") && value >= 120.0 => format!("{:.1} min", value / 60.0),
+        name if name.ends_with("_s") => format!("{value:.1} s"),
+        name if name.contains("psnr") || name.contains("gain") => format!("{value:.2}"),
+        _ if value.fract() == 0.0 => format!("{value:.0}"),
+        _ => format!("{value:.4}"),
+    }
+}
+
+/// Column titles of values.
+pub(crate) fn titles(values: &[&String]) -> Vec<String> {
+    let title = |name: &str| match name {
+        "psnr" | "ssim" | "lpips" => name.to_uppercase(),
+        "train_s" => "training".to_owned(),
+        "render_s" => "rendering".to_owned(),
+        "refine_s" => "refining".to_owned(),
+        "rays_per_s" => "rays/s".to_owned(),
+        name => name.replace('_', " "),
+    };
+    values.iter().map(|name| title(name)).collect()
+}
