@@ -14,8 +14,6 @@ import pathlib
 import numpy
 from PIL import Image
 
-import cells
-
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--data", type=pathlib.Path, required=True)
 parser.add_argument("--scenes", nargs="+", default=["lego", "chair"])
@@ -48,7 +46,7 @@ for protocol in options.protocols:
     lr, scale = protocol.split("x")
     values = []
     for scene in options.scenes:
-        folder = cells.dataset(options.data, scene)
+        folder = next(folder for folder in (options.data / "nerf_synthetic" / scene, options.data / scene) if folder.is_dir())
         frames = json.loads((folder / "transforms_test.json").read_text())["frames"]
         views = [folder / (frame["file_path"] + ".png") for frame in frames]
         values.append(sum(ideal(view, int(lr), float(scale)) for view in views) / len(views))

@@ -184,7 +184,7 @@ fn the_store_lies_beside_the_pipeline() {
 
 /// The repository's pipelines.
 fn shipped() -> (Pipeline, Vec<String>) {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");
     let files = std::fs::read_dir(root.join("pipelines")).unwrap().map(|entry| entry.unwrap().path());
     let mut names: Vec<String> = files.map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned()).collect();
     names.sort();
