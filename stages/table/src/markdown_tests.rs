@@ -90,7 +90,12 @@ fn params(text: serde_json::Value) -> Params {
 
 /// Rows of two methods in two groups at two protocols, as `rows` makes them.
 fn methods() -> Vec<Row> {
-    let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| json!({"method": method, "has seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr, "commit": "abc1234", "machine": "vm"});
+    let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| {
+        let places = json!({"commit": "abc1234", "machine": "vm"});
+        let mut row = json!({"method": method, "has seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr});
+        row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
+        row
+    };
     let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
     let rows = [
         row("nerf", "LR", "lego", "100x2", 30.0),
@@ -116,7 +121,8 @@ fn groups_further_rows_and_gains() {
             Gain { name: "unknown".to_owned(), of: "ss".to_owned(), over: "liif".to_owned() },
         ],
         ..params(json!({
-            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has seen", "each": "scene", "notes": ["One."],
+            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has seen", "each": "scene",
+            "notes": ["One."],
             "further": [
                 {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},
                 {"method": "paper: SS", "protocol": "100x2", "psnr": 29.75},
@@ -175,8 +181,8 @@ Means over lego, chair:
 #[test]
 fn rows_follow_the_groups() {
     let node = |stage: &str| {
-        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true, "kind": "other", "key": "", "output": "",
-            "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 1.0, "threads": 1, "host": "vm"})
+        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true, "kind": "other", "key": "",
+            "output": "", "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 1.0, "threads": 1, "host": "vm"})
     };
     let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"}, "reason": "no liif"});
     let failed = json!({"stage": "eval-nerf", "point": ""});
