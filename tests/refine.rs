@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::SystemTime;
 
-use common::{Finished, Project, data, kill_again_and_again, manifest, signal, stage, stage_command, wait_until};
+use common::{Finished, Project, kill_again_and_again, manifest, signal, stage, stage_command, wait_until};
 
 /// The shipped targets at tiny sizes.
 const REFINED: &str = "
