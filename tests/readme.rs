@@ -70,6 +70,7 @@ fn every_command_plans() {
                     line.is_empty()
                         || line.starts_with("make ")
                         || line.starts_with("export ")
+                        || line.starts_with("nerf-sr-remote ")
                         || line.contains("--help")
                         || line.contains("describe"),
                     "{line}"

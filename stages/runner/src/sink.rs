@@ -63,7 +63,6 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
     let left_out = sink.left_out.iter().filter(|_| sink.program.description.partial).cloned();
     let failed = failed.chain(left_out).collect();
     let home = std::path::absolute(out).unwrap_or_else(|_| out.to_path_buf());
-    let home = home.ancestors().find(|folder| folder.is_dir()).map(Path::to_path_buf).unwrap_or_default();
     Some(RunRecord { home, nodes, failed })
 }
 

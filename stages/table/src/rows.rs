@@ -18,8 +18,12 @@ pub type Row = Map<String, Value>;
 pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>> {
     let commit = commit(&run.home);
     let mut scored: Vec<(usize, &RunNode)> = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
-    // What came through fewer stages stands first: rendered views before refined ones.
-    scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
+    // Blocks that come through fewer stages stand first: rendered views before refined ones.
+    let depth_of = |stage: &str| {
+        let of_stage = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
+        of_stage.map(|(index, _)| run.ancestors(index).len()).max()
+    };
+    scored.sort_by_key(|(_, node)| depth_of(&node.stage));
     let mut rows: Vec<(usize, Row)> = Vec::new();
     for (index, node) in scored {
         let mut row = keys(params, &node.stage, &node.values);
@@ -56,10 +60,11 @@ fn place(params: &Params, stage: &String) -> usize {
     all.position(|method| method == stage).unwrap_or(usize::MAX)
 }
 
-/// The commit of the pipeline's folder, `-dirty` where it differs; nothing where it isn't under git.
+/// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where it isn't under git.
 fn commit(home: &Path) -> String {
-    let git =
-        Command::new("git").arg("-C").arg(home).args(["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]).output();
+    let Some(folder) = home.ancestors().find(|folder| folder.is_dir()) else { return String::new() };
+    let describe = ["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"];
+    let git = Command::new("git").arg("-C").arg(folder).args(describe).output();
     let said = git.ok().filter(|output| output.status.success()).map(|output| output.stdout).unwrap_or_default();
     String::from_utf8_lossy(&said).trim().to_owned()
 }

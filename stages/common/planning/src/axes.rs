@@ -149,8 +149,11 @@ impl Scope<'_> {
                 notes.push(format!("{}: overridden by {}", axes.remove(earlier).given, axis.given));
             }
             // A sweep of the file gives way; what sets several things at once stays, and the command line wins over a part of it.
+            let before = experiment.len();
             experiment.retain(|earlier| !earlier.is_single() || !earlier.is_of(&axis));
-            axes.push(axis);
+            // What takes the place of an axis with a name is in tables, too.
+            let is_named = axis.is_named || experiment.len() < before;
+            axes.push(Axis { is_named, ..axis });
         }
         // What is said on the command line comes later, and so wins.
         Ok((experiment.into_iter().chain(axes).collect(), notes))
