@@ -52,7 +52,14 @@ fn words_of(line: &str) -> Vec<&str> {
 fn every_command_plans() {
     let project = Project::new(&read("pipeline.yaml"));
     // Folders that the examples name.
-    for folder in ["my-scene", "my-photographs", "weights", "../shared/data/nerf_synthetic/lego", "../shared/data/weights"] {
+    for folder in [
+        "my-scene",
+        "my-photographs",
+        "weights",
+        "../shared/data/nerf_synthetic/lego",
+        "../shared/data/nerf_synthetic/chair",
+        "../shared/data/weights",
+    ] {
         let target = project.path("project").join(folder);
         std::fs::create_dir_all(&target).unwrap();
         std::fs::write(target.join("x"), "").unwrap();

@@ -62,7 +62,8 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
     // Other sinks don't know of results that aren't there.
     let left_out = sink.left_out.iter().filter(|_| sink.program.description.partial).cloned();
     let failed = failed.chain(left_out).collect();
-    let home = std::path::absolute(out).unwrap_or_else(|_| out.to_path_buf());
+    // A name that isn't UTF-8 has no place in JSON; without it a table has no commit.
+    let home = std::path::absolute(out).ok().filter(|home| home.to_str().is_some()).unwrap_or_default();
     Some(RunRecord { home, nodes, failed })
 }
 
