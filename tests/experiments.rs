@@ -125,14 +125,16 @@ fn refinement_stands_beside_rendering() {
     let numbers = ["--scene", "other", "--variant", "1", "--variant", "2", "-p", "prep.hr_references=2"];
     project.ok(&[&["run", "refine-table"][..], &numbers, &SMALL, &short].concat());
     let made = rows(&project, "refine-table");
-    let methods = ["rendered", "refined", "refined with references", "refined with references"];
-    assert_eq!(column(&made, "method"), methods);
+    assert_eq!(column(&made, "method"), ["ss", "refine", "refine", "refine"]);
+    let references: Vec<u64> = made.iter().map(|row| row["references"].as_u64().unwrap()).collect();
+    assert_eq!(references, [0, 0, 1, 2]);
     for row in &made {
-        assert!(row["near_references.psnr"].as_f64().is_some_and(|v| v > 0.0), "{row}");
-        assert_eq!(row["least_gain"].is_null(), row["method"] == "rendered", "{row}");
+        assert!(["near_psnr", "seconds_per_view"].iter().all(|name| row[*name].as_f64().is_some_and(|v| v > 0.0)), "{row}");
+        assert_eq!(row["least_gain"].is_null(), row["method"] == "ss", "{row}");
     }
     project.ok(&[&["run", "quality-refined", "--scene", "other", "-p", "supervision=kernel"][..], &SMALL, &short].concat());
     assert_eq!(column(&rows(&project, "quality-refined"), "method"), ["rendered", "refined"]);
+    assert!(rows(&project, "quality-refined").iter().all(|row| row["refined"] == (row["method"] == "refined")));
     let parts =
         ["--scene", "other", "--first-variants", "4", "--data", "data", "--protocol", "24x2", "-p", "train-refine.steps=20"];
     project.ok(&[&["run", "refine-ablation", "-p", "downscaled-field.rays=30000"][..], &parts].concat());

@@ -19,6 +19,7 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 
 pub use rows::Row;
 
@@ -46,6 +47,10 @@ pub struct Params {
     /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
+    /// Further entries of rows for programs, by the block that was scored: `{eval: {refined: false}}`. `"{variant}"` is the
+    /// value of that key.
+    #[schemars(extend("x-default" = "none"))]
+    pub fields: BTreeMap<String, Map<String, Value>>,
     /// Groups of methods that may be compared, in the order of the table: `[{name: LR images, methods: [eval]}]`, the
     /// methods by the block that was scored. A column names the group, and the best is marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
@@ -108,6 +113,7 @@ impl Default for Params {
             relative_to: BTreeMap::new(),
             spread: Vec::new(),
             methods: BTreeMap::new(),
+            fields: BTreeMap::new(),
             groups: Vec::new(),
             grouped_by: "group".to_owned(),
             further: Vec::new(),

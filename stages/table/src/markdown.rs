@@ -46,7 +46,7 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
     let asked = [("rows", &params.rows), ("columns", &params.columns)];
     let asked = asked.into_iter().flat_map(|(parameter, names)| names.iter().map(move |name| (parameter, name)));
     let mut asked = asked.chain(each.map(|name| ("each", name)));
-    if let Some((parameter, name)) = asked.find(|(_, name)| !known.contains(name) && !rows.is_empty()) {
+    if let Some((parameter, name)) = asked.find(|(_, name)| !rows.is_empty() && !rows.iter().any(|row| row.contains_key(*name))) {
         let known = artifact::known_names(name, known.into_iter().map(String::as_str));
         return Err(format!("parameter {parameter}: no result has a key {name:?}; {known}"));
     }

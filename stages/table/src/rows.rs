@@ -29,6 +29,7 @@ pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>>
         let mut row = keys(params, &node.stage, &node.values);
         row.extend(scores(node)?);
         row.extend(times(run, index)?);
+        row.extend(seconds_per_view(&row));
         row.insert("commit".to_owned(), json!(commit));
         row.insert("machine".to_owned(), json!(node.host));
         rows.push((place(params, &node.stage), row));
@@ -51,13 +52,31 @@ fn keys(params: &Params, stage: &String, values: &BTreeMap<String, String>) -> R
         let group = params.groups.iter().find(|group| group.methods.contains(stage));
         row.insert(params.grouped_by.clone(), json!(group.map_or("", |group| group.name.as_str())));
     }
+    for (name, value) in params.fields.get(stage).into_iter().flatten() {
+        let value = of_key(&row, value);
+        row.insert(name.clone(), value);
+    }
     row
+}
+
+/// A value, or that of the key which it names in braces: a number where it is one.
+fn of_key(row: &Row, value: &Value) -> Value {
+    let named = value.as_str().and_then(|text| text.strip_prefix('{')?.strip_suffix('}'));
+    let Some(text) = named.and_then(|name| row.get(name)?.as_str()) else { return value.clone() };
+    text.parse::<u64>().map_or_else(|_| json!(text), |number| json!(number))
 }
 
 /// The place of a method in the table; those of no group come last.
 fn place(params: &Params, stage: &String) -> usize {
     let mut all = params.groups.iter().flat_map(|group| &group.methods);
     all.position(|method| method == stage).unwrap_or(usize::MAX)
+}
+
+/// What a view took to render, or where it was refined, to refine.
+fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
+    let [views, rendering, refining] = ["views", "render_s", "refine_s"].map(|name| row.get(name).and_then(Value::as_f64));
+    let seconds = refining.filter(|seconds| *seconds > 0.0).or(rendering)?;
+    Some(("seconds_per_view".to_owned(), json!(seconds / views.filter(|views| *views > 0.0)?)))
 }
 
 /// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where it isn't under git.
@@ -84,8 +103,9 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
     }
     let file = read(&node.folder.join("metrics.json"))?;
     numbers("", &file["mean"], &mut found);
-    for name in ["least_gain", "near_references"] {
-        numbers(name, &file[name], &mut found);
+    let near = &file["near_references"];
+    for (name, value) in [("least_gain", &file["least_gain"]), ("near_psnr", &near["psnr"]), ("near_views", &near["views"])] {
+        numbers(name, value, &mut found);
     }
     found.insert("views".to_owned(), json!(file["views"].as_array().map_or(0, Vec::len)));
     Ok(found)
