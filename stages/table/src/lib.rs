@@ -154,7 +154,6 @@ impl Stage for Table {
         let text = markdown::markdown(params, &rows, &run.failed).map_err(Failure::Usage)?;
         let path = context.output_path("table.md")?;
         std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
-        context.say(&text);
         context.write_summary(&format!("{} results", rows.len()))
     }
 }
