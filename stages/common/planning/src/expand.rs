@@ -30,6 +30,8 @@ pub(crate) struct Expansion<'a> {
     nodes: Vec<Node>,
     /// The nodes of each stage, with the value (by number) of every axis that reaches them.
     of_stage: BTreeMap<String, Vec<(Point, usize)>>,
+    /// The node of each result, by its stage, parameters and inputs.
+    of_result: BTreeMap<String, usize>,
     /// The points of each stage that aren't made, with the reason.
     left_out: BTreeMap<String, Vec<(Point, String)>>,
     notes: Vec<String>,
@@ -43,8 +45,9 @@ impl<'a> Expansion<'a> {
         choice: &'a Choice,
     ) -> Result<Self, PlanError> {
         let files = Files::new(pipeline, choice)?;
-        let (nodes, of_stage, left_out, notes) = (Vec::new(), BTreeMap::new(), BTreeMap::new(), Vec::new());
-        Ok(Self { pipeline, programs, axes, choice, files, nodes, of_stage, left_out, notes })
+        let (nodes, notes) = (Vec::new(), Vec::new());
+        let (of_stage, of_result, left_out) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
+        Ok(Self { pipeline, programs, axes, choice, files, nodes, of_stage, of_result, left_out, notes })
     }
 
     /// Makes the nodes of what the targets need, in an order in which each comes after those that it needs.
@@ -121,8 +124,8 @@ impl<'a> Expansion<'a> {
             }
             let inputs = self.node_inputs(stage, &point);
             // Points that come to one result have one node.
-            let is_it = |node: &&usize| self.nodes[**node].parameters == parameters && self.nodes[**node].inputs == inputs;
-            if let Some(node) = self.of_stage.get(stage).into_iter().flatten().map(|(_, node)| node).find(is_it).copied() {
+            let result = format!("{stage} {parameters} {inputs:?}");
+            if let Some(&node) = self.of_result.get(&result) {
                 self.of_stage.entry(stage.to_owned()).or_default().push((point, node));
                 continue;
             }
@@ -138,8 +141,9 @@ impl<'a> Expansion<'a> {
             if let Some(problem) = program.description.broken_rule(&node.parameters, &given) {
                 return Err(PlanError::Usage(format!("stage {}: {problem}", node.label())));
             }
+            self.of_result.insert(result, self.nodes.len());
+            self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len()));
             self.nodes.push(node);
-            self.of_stage.entry(stage.to_owned()).or_default().push((point, self.nodes.len() - 1));
         }
         Ok(())
     }
