@@ -161,7 +161,14 @@ impl Scope<'_> {
 
     /// What a name and a value of an experiment's file set.
     pub(crate) fn setting(&self, kind: Kind, name: &str, value: &Value) -> Result<Setting, PlanError> {
-        let (stage, name) = self.owner(kind, name, &value.to_string())?;
+        let in_file = |error: PlanError| match error {
+            PlanError::Usage(problem) => {
+                let problem = problem.trim_start_matches(kind.flag()).trim_start();
+                PlanError::Pipeline(self.pipeline.error_in_experiment(name, problem))
+            }
+            other => other,
+        };
+        let (stage, name) = self.owner(kind, name, &value.to_string()).map_err(in_file)?;
         let program = self.programs.require(&stage)?;
         let value = if kind == Kind::Parameter { program.schema.canonical_value(&name, value) } else { value.clone() };
         Ok(Setting { stage, kind, name, value })

@@ -101,6 +101,15 @@ impl Experiment {
         self.sweeps.extend(by.sweeps.clone());
     }
 
+    /// Whether it sets something of that name, itself.
+    pub(crate) fn names(&self, name: &str) -> bool {
+        let parameters = self.presets.values().chain(self.variants.iter().map(|variant| &variant.parameters));
+        let inputs = [&self.inputs].into_iter().chain(self.variants.iter().map(|variant| &variant.inputs));
+        parameters.into_iter().any(|parameters| parameters.contains_key(name))
+            || inputs.into_iter().any(|inputs| inputs.contains_key(name))
+            || self.sweeps.contains_key(name)
+    }
+
     fn is_none(&self) -> bool {
         *self == Self::default()
     }

@@ -273,7 +273,11 @@ fn what_there_is_not_is_refused() {
             &|_| (),
             "needs scor: no such stage; did you mean score?",
         ),
-        (EXPERIMENT.replace("warmup: 0", "warmap: 0"), &|_| (), "-p warmap: no stage has such a parameter; did you mean warmup?"),
+        (
+            EXPERIMENT.replace("warmup: 0", "warmap: 0"),
+            &|_| (),
+            "experiment: warmap: no stage has such a parameter; did you mean warmup?",
+        ),
         (EXPERIMENT.replace("score.samples: 1", "scor.samples: 1"), &|_| (), "no stage \"scor\""),
         (
             EXPERIMENT.split("experiment:").next().unwrap().to_owned(),

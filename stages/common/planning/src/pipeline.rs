@@ -142,6 +142,12 @@ impl Pipeline {
         self.file_of(stage, part).error(&keys, format!("stage {stage}: {}", problem.into()))
     }
 
+    /// An error about something that an experiment names, with the file that names it.
+    pub(crate) fn error_in_experiment(&self, name: &str, problem: &str) -> PipelineError {
+        let file = self.files.iter().find(|file| file.written.experiment.names(name)).unwrap_or(&self.files[0]);
+        file.error(&["experiment"], format!("experiment: {problem}"))
+    }
+
     /// An error about what stands before the stages.
     pub fn error_in_default(&self, problem: String) -> PipelineError {
         let file = self.files.iter().find(|file| !file.written.default.is_empty()).unwrap_or(&self.files[0]);
