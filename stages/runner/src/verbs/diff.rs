@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, print_line, print_lines};
+use artifact::{Failure, print_line};
 
 use crate::lineage::{Lineage, StageDifference};
 use crate::session::{Session, of_stage};
@@ -17,8 +17,7 @@ pub(crate) fn diff(session: &Session, before: &str, now: &str, json: bool) -> an
     let (before, now) = (side(session, before)?, side(session, now)?);
     let differences = now.differences(&before, &session.store);
     if json {
-        print_lines(&serde_json::to_string_pretty(&differences)?);
-        return Ok(ExitCode::SUCCESS);
+        return super::print_json(&differences);
     }
     differences.iter().flat_map(lines).for_each(|line| print_line!("{line}"));
     if differences.is_empty() {

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{Failure, print_line, print_lines, report_line, stop_on_signals};
+use artifact::{Failure, print_line, report_line, stop_on_signals};
 use garbage::{Choice, Root, Verdict, judge};
 use serde_json::json;
 use stage_call::seconds;
@@ -46,8 +46,7 @@ impl Style {
         let (goes, stays) = verdict.bytes();
         if self.json {
             let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays, "items": verdict.fates()});
-            print_lines(&serde_json::to_string_pretty(&told)?);
-            return Ok(ExitCode::SUCCESS);
+            return super::print_json(&told);
         }
         verdict.fates().iter().for_each(|fate| print_line!("{fate}"));
         let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };

@@ -1,5 +1,9 @@
 //! What the command line can ask for, a file each.
 
+use std::process::ExitCode;
+
+use serde::Serialize;
+
 mod cancel;
 mod describe;
 mod diff;
@@ -27,3 +31,9 @@ pub(crate) use run::run;
 pub(crate) use status::status;
 pub(crate) use verify::verify;
 pub(crate) use why::why;
+
+/// Prints something for programs.
+fn print_json(told: &impl Serialize) -> anyhow::Result<ExitCode> {
+    artifact::print_lines(&serde_json::to_string_pretty(told)?);
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{print_line, print_lines};
+use artifact::print_line;
 
 use crate::node_report::PlanReport;
 use crate::session::Session;
@@ -12,8 +12,7 @@ pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Res
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     if json {
-        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &[]))?);
-        return Ok(ExitCode::SUCCESS);
+        return super::print_json(&PlanReport::new(session, &plan, &states, &[]));
     }
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{counted, hash_json, print_line, print_lines, sized};
+use artifact::{counted, hash_json, print_line, sized};
 use stage_call::seconds;
 
 use crate::node_report::PlanReport;
@@ -16,8 +16,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
     if json {
         let mut report = PlanReport::new(session, &plan, &states, &[]);
         report.nodes.iter_mut().zip(jobs).for_each(|(node, job)| node.job = job);
-        print_lines(&serde_json::to_string_pretty(&report)?);
-        return Ok(ExitCode::SUCCESS);
+        return super::print_json(&report);
     }
     let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(states) {

@@ -1,6 +1,6 @@
 use std::process::ExitCode;
 
-use artifact::{print_line, print_lines};
+use artifact::print_line;
 
 use crate::node_report::PlanReport;
 use crate::session::{Session, of_stage};
@@ -13,8 +13,7 @@ pub(crate) fn why(session: &Session, stage: &str, what: &Request, json: bool) ->
     let states = session.states(&plan)?;
     let records = session.store.records()?;
     if json {
-        print_lines(&serde_json::to_string_pretty(&PlanReport::new(session, &plan, &states, &records).only(stage))?);
-        return Ok(ExitCode::SUCCESS);
+        return super::print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
     }
     let say = |index: usize, indent: &str| {
         print_line!("{indent}{}: {}", plan.nodes[index].label(), words(session, &plan, index, &states[index], &records));
