@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunRecord {
-    /// The folder in which pages are written, or the nearest above it.
+    /// The folder in which pages are written; it may have yet to be made.
     #[serde(default)]
     pub home: PathBuf,
     /// Every node that what is shown was made of; parents come before their children.
