@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Choice;
+use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::Site;
 
 use crate::execute::{Cluster, Executor, JOB_VERB, Local};
@@ -13,9 +14,6 @@ use crate::limits::capped;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::verbs::{self, Style};
-use planning::Choice as Selection;
-use planning::Pipeline;
-use planning::{Devices, PlanError, Request};
 
 /// Where the pipeline is looked for.
 const PIPELINE: &str = "pipeline.yaml";

@@ -3,10 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use artifact::{Manifest, Record, Store, label};
+use planning::{Change, changes};
 use serde::Serialize;
 use serde_json::{Map, Value};
-
-use planning::{Change, changes};
 
 /// Metrics of an artifact.
 const METRICS_FILE: &str = "metrics.json";

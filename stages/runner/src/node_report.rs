@@ -4,13 +4,12 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use artifact::{Record, RunInput, hash_json};
+use planning::{Change, Plan, State};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use slurm::Job;
 
 use crate::session::Session;
-use planning::Change;
-use planning::{Plan, State};
 
 /// A plan's nodes, each after those that it needs, and its sinks.
 #[derive(Debug, Serialize)]

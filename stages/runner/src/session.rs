@@ -4,13 +4,10 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Store, check_device, report_text};
+use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State, known_blocks};
 use slurm::{Job, Queue, Slurm};
 
 use crate::execute::identities;
-use planning::Asking;
-use planning::Pipeline;
-use planning::known_blocks;
-use planning::{Devices, Plan, PlanError, Request, State};
 
 /// What every verb works with.
 pub(crate) struct Session {

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use artifact::{FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
+use planning::{Plan, Sink};
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
 
 use crate::publish;
-use planning::{Plan, Sink};
 
 /// The record of the nodes that a sink shows and all they were made of; none where some of that isn't there, unless the sink shows what there
 /// is.

@@ -4,12 +4,11 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use artifact::{Record, hash_json};
+use planning::{Node, Plan, Sink, State, short};
 use serde_json::Value;
 use stage_call::seconds;
 
 use crate::session::Session;
-use planning::short;
-use planning::{Node, Plan, Sink, State};
 
 /// The nodes that will run for sure and on which a waiting node depends, directly or not.
 pub(crate) fn causes(states: &[State], index: usize) -> Vec<usize> {

@@ -8,7 +8,7 @@ use serde_json::{Map, Value};
 
 use crate::axes::{Axis, Kind, Setting};
 use crate::check::closure;
-use crate::experiment::Choice;
+use crate::experiment::Selection;
 use crate::left_out::{Files, check_shown, shown};
 use crate::pipeline::{Part, Pipeline, Source};
 use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
@@ -25,7 +25,7 @@ pub(crate) struct Expansion<'a> {
     pipeline: &'a Pipeline,
     programs: &'a Programs,
     axes: &'a [Axis],
-    choice: &'a Choice,
+    choice: &'a Selection,
     files: Files,
     nodes: Vec<Node>,
     /// The nodes of each stage, with the value (by number) of every axis that reaches them.
@@ -42,7 +42,7 @@ impl<'a> Expansion<'a> {
         pipeline: &'a Pipeline,
         programs: &'a Programs,
         axes: &'a [Axis],
-        choice: &'a Choice,
+        choice: &'a Selection,
     ) -> Result<Self, PlanError> {
         let files = Files::new(pipeline, choice)?;
         let (nodes, notes) = (Vec::new(), Vec::new());

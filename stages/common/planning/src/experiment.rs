@@ -55,7 +55,7 @@ pub struct Variant {
 
 /// What of an experiment the command line wants; nothing means all that the file names.
 #[derive(Clone, Debug, Default)]
-pub struct Choice {
+pub struct Selection {
     /// Folder of the data sets.
     pub data: Option<PathBuf>,
     /// Scenes.
@@ -115,7 +115,7 @@ impl Experiment {
     }
 
     /// The folder of the data sets.
-    pub(crate) fn data(&self, choice: &Choice) -> PathBuf {
+    pub(crate) fn data(&self, choice: &Selection) -> PathBuf {
         let stated = self.data.as_ref().map(PathBuf::from);
         choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
     }
@@ -140,7 +140,7 @@ pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, Pl
 struct Asked<'a> {
     scope: &'a Scope<'a>,
     experiment: &'a Experiment,
-    choice: &'a Choice,
+    choice: &'a Selection,
 }
 
 impl Asked<'_> {

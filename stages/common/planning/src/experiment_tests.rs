@@ -63,7 +63,8 @@ fn descriptions() -> BTreeMap<String, Description> {
 
 /// The plan of an experiment, whose data sets lie in a folder of their own.
 fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
-    let mut request = Request { choice: Choice { data: Some(data.to_path_buf()), ..Choice::default() }, ..Request::default() };
+    let mut request =
+        Request { choice: Selection { data: Some(data.to_path_buf()), ..Selection::default() }, ..Request::default() };
     change(&mut request);
     Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
 }
@@ -249,7 +250,7 @@ fn what_there_is_not_is_refused() {
     for (text, change, words) in [
         (
             EXPERIMENT.to_owned(),
-            &(|c: &mut Choice| c.scenes = vec!["ship".to_owned()]) as &dyn Fn(&mut Choice),
+            &(|c: &mut Selection| c.scenes = vec!["ship".to_owned()]) as &dyn Fn(&mut Selection),
             "no scene ship in ",
         ),
         (

@@ -7,13 +7,13 @@ use artifact::known_names;
 use serde_json::Value;
 
 use crate::check::needs;
-use crate::experiment::Choice;
+use crate::experiment::Selection;
 use crate::pipeline::{Pipeline, Source};
 use crate::plan::PlanError;
 use crate::renames::known_blocks;
 
 /// The stages that a sink shows, of those that its block names.
-pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Choice) -> Vec<&'a str> {
+pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) -> Vec<&'a str> {
     let inputs = pipeline.stages[sink].inputs.iter().filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
     let wanted = if choice.show.is_empty() { &pipeline.experiment.show } else { &choice.show };
     let is_wanted = |(name, stage): &(&String, &str)| wanted.iter().any(|wanted| wanted == *name || wanted == stage);
@@ -24,7 +24,7 @@ pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Choice) -> 
 }
 
 /// Checks that sinks have the inputs that are wanted of them.
-pub(crate) fn check_shown(pipeline: &Pipeline, sinks: &[&str], choice: &Choice) -> Result<(), PlanError> {
+pub(crate) fn check_shown(pipeline: &Pipeline, sinks: &[&str], choice: &Selection) -> Result<(), PlanError> {
     if choice.show.is_empty() {
         return Ok(());
     }
@@ -54,7 +54,7 @@ pub(crate) struct Files {
 }
 
 impl Files {
-    pub(crate) fn new(pipeline: &Pipeline, choice: &Choice) -> Result<Self, PlanError> {
+    pub(crate) fn new(pipeline: &Pipeline, choice: &Selection) -> Result<Self, PlanError> {
         let of = pipeline.experiment.needs.clone();
         if let Some(name) = of.keys().find(|name| !pipeline.stages.contains_key(*name)) {
             let known = known_blocks(name, pipeline.stages.keys().map(String::as_str));

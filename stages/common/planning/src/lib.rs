@@ -36,7 +36,7 @@ mod stages;
 mod targets;
 
 pub use changes::{Change, changes, short};
-pub use experiment::{Choice, Experiment, Variant};
+pub use experiment::{Experiment, Selection, Variant};
 pub use file::{PipelineFile, StageBlock};
 pub use frozen::{Frozen, FrozenError};
 pub use key::{explain, nearest_changes, parts};

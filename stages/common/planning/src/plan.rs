@@ -11,7 +11,7 @@ use stage_call::Interrupted;
 use crate::axes::Scope;
 use crate::check::{self, closure, needs};
 use crate::expand::Expansion;
-use crate::experiment::Choice;
+use crate::experiment::Selection;
 use crate::key;
 use crate::pipeline::{Pipeline, PipelineError};
 use crate::renames::known_blocks;
@@ -106,7 +106,7 @@ pub struct Request {
     /// `input=DIR[,DIR…]`, likewise.
     pub inputs: Vec<String>,
     /// What of an experiment is wanted.
-    pub choice: Choice,
+    pub choice: Selection,
 }
 
 /// Why there is no plan.

@@ -8,6 +8,7 @@ use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
 use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_text};
+use planning::{Plan, Sink};
 use stage_call::{Display, StageFailure};
 
 use super::{Executor, NodeJob, Work};
@@ -15,7 +16,6 @@ use crate::counts;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::sink::{Showing, Shown, show};
-use planning::{Plan, Sink};
 
 /// This machine.
 pub(crate) struct Local {

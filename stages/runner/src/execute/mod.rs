@@ -9,9 +9,9 @@ use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
 use artifact::RunFile;
+use planning::Plan;
 
 use crate::session::Session;
-use planning::Plan;
 
 pub(crate) use local::Local;
 pub(crate) use node::NodeJob;

@@ -6,10 +6,10 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
+use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use stage_call::{Call, Display, StageFailure, seconds};
 
 use crate::waiting::{by, enter, until_held};
-use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 
 /// A node's inputs: where each lies, and the hash of its content.
 struct Inputs {

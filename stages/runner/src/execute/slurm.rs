@@ -6,15 +6,13 @@ use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
 use artifact::{Failure, Record, Store, counted, hash_json, print_line, report_line};
+use planning::{Frozen, Origin, Plan, PlanError, State, source_hash};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
-
-use planning::Frozen;
 
 use super::{Executor, Work};
 use crate::counts;
 use crate::sink::is_shown;
-use planning::{Origin, Plan, PlanError, State, source_hash};
 
 /// The verb that a job calls.
 pub(crate) const JOB_VERB: &str = "job";

@@ -1,11 +1,7 @@
 use std::process::{Command, ExitCode};
 
 use anyhow::Context as _;
-
-use planning::Pipeline;
-use planning::PlanError;
-use planning::executable;
-use planning::known_blocks;
+use planning::{Pipeline, PlanError, executable, known_blocks};
 
 /// Prints the help of a stage's program: what it makes, its inputs and its parameters.
 pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitCode> {

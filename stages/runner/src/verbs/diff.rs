@@ -1,11 +1,10 @@
 use std::process::ExitCode;
 
 use artifact::{Failure, print_line};
+use planning::{Change, PlanError, Request, State};
 
 use crate::lineage::{Lineage, StageDifference};
 use crate::session::{Session, of_stage};
-use planning::Change;
-use planning::{PlanError, Request, State};
 
 /// More files than these are counted, not listed.
 const MOST_FILES: usize = 4;

@@ -2,12 +2,12 @@ use std::process::ExitCode;
 
 use artifact::{Failure, print_line, report_line, stop_on_signals};
 use garbage::{Choice, Root, Verdict, judge};
+use planning::Request;
 use serde_json::json;
 use stage_call::seconds;
 
 use crate::session::Session;
 use crate::waiting::until_held;
-use planning::Request;
 
 /// Removes what nothing needs any more.
 pub(crate) fn gc(session: &Session, what: &Request, choice: Choice, style: Style) -> anyhow::Result<ExitCode> {

@@ -5,17 +5,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
 use artifact::{Record, RunFile, Store, print_line, report_line, report_text, stop_on_signals};
+use planning::{Frozen, Node, Plan, Sink, StageProgram, State};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
 use stage_call::{Display, StageFailure, ask_all};
 
 use super::run::register;
-use planning::Frozen;
-
 use crate::execute::NodeJob;
 use crate::sink::{Showing, Shown, show};
-use planning::StageProgram;
-use planning::{Node, Plan, Sink, State};
 
 /// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a sink.
 pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {

@@ -3,11 +3,11 @@ use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
 use artifact::{Store, StoreError, label, print_line, print_lines};
+use planning::{Plan, Request, State};
 use stage_call::utc;
 
 use crate::execute::identities;
 use crate::session::{Session, of_stage};
-use planning::{Plan, Request, State};
 
 /// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
 pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {

@@ -1,9 +1,9 @@
 use std::process::ExitCode;
 
 use artifact::{Failure, print_line};
+use planning::{PlanError, Request, State};
 
 use crate::session::{Session, of_stage};
-use planning::{PlanError, Request, State};
 
 /// Prints the folder of a stage's artifact, or a folder or file inside it; a line for each point of a sweep.
 pub(crate) fn path(session: &Session, wanted: &str, what: &Request) -> anyhow::Result<ExitCode> {

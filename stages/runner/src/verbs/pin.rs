@@ -1,9 +1,9 @@
 use std::process::ExitCode;
 
 use artifact::{Locked, print_line};
+use planning::{PlanError, Request, State};
 
 use crate::session::{Session, command_line};
-use planning::{PlanError, Request, State};
 
 /// Keeps what the targets have, until `unpin`.
 pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Result<ExitCode> {

@@ -1,11 +1,11 @@
 use std::process::ExitCode;
 
 use artifact::print_line;
+use planning::Request;
 
 use crate::node_report::PlanReport;
 use crate::session::Session;
 use crate::words::{by_scene, shown, words};
-use planning::Request;
 
 /// Shows what `run` would do.
 pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {

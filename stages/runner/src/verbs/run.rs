@@ -3,12 +3,12 @@ use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use artifact::{Failure, RunFile, Store, report_line, stop_on_signals};
+use planning::{Plan, Request, State};
 use stage_call::StageFailure;
 
 use crate::execute::{Executor, Work};
 use crate::session::{Session, command_line};
 use crate::waiting::enter;
-use planning::{Plan, Request, State};
 
 /// Makes what the targets need and shows it.
 pub(crate) fn run(session: &Session, what: &Request, out: &Path, executor: &dyn Executor) -> anyhow::Result<ExitCode> {

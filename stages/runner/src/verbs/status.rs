@@ -1,12 +1,12 @@
 use std::process::ExitCode;
 
 use artifact::{counted, hash_json, print_line, sized};
+use planning::{Request, State};
 use stage_call::seconds;
 
 use crate::node_report::PlanReport;
 use crate::session::Session;
 use crate::words::age;
-use planning::{Request, State};
 
 /// Shows every stage with its artifact, age and time.
 pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::Result<ExitCode> {

@@ -1,11 +1,11 @@
 use std::process::ExitCode;
 
 use artifact::print_line;
+use planning::Request;
 
 use crate::node_report::PlanReport;
 use crate::session::{Session, of_stage};
 use crate::words::{by_scene, causes, shown, words};
-use planning::Request;
 
 /// Says why a stage is cached, would run, or waits; of a sink, what it shows.
 pub(crate) fn why(session: &Session, stage: &str, what: &Request, json: bool) -> anyhow::Result<ExitCode> {
