@@ -4,9 +4,10 @@
 mod common;
 
 use std::collections::BTreeMap;
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::Instant;
 
 use common::{Finished, Project, root, wait_until};
@@ -93,6 +94,15 @@ fn project(pipeline: &str) -> Project {
     project
 }
 
+/// The first of two ports that nobody listens on, below those that the kernel hands out to clients.
+fn free_ports() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = (std::process::id() % 600) as u16 * 20;
+    let ports = std::iter::repeat_with(|| 20_000 + (first + NEXT.fetch_add(2, Ordering::Relaxed)) % 12_000);
+    let is_free = |port: u16| TcpListener::bind(("127.0.0.1", port)).is_ok();
+    ports.take(6_000).find(|&port| is_free(port) && is_free(port + 1)).expect("two free ports")
+}
+
 /// A cluster of one node; it ends with this.
 struct Cluster {
     dir: tempfile::TempDir,
@@ -101,7 +111,6 @@ struct Cluster {
 impl Cluster {
     /// A new one; without Slurm's programs it says so and is none.
     fn start() -> Option<Self> {
-        static STARTED: AtomicU32 = AtomicU32::new(0);
         let path = std::env::var("PATH").unwrap_or_default() + ":/usr/sbin";
         let has = |name: &str| path.split(':').any(|folder| Path::new(folder).join(name).exists());
         if let Some(missing) = ["slurmctld", "slurmd", "munged"].into_iter().find(|name| !has(name)) {
@@ -109,13 +118,17 @@ impl Cluster {
             return None;
         }
         // Socket paths are short: not in a test's own deep folder.
-        let cluster = Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
-        let port = 20_000 + (std::process::id() % 1000) * 20 + STARTED.fetch_add(1, Ordering::Relaxed) * 2;
-        let mut script = cluster.script("start");
-        script.env("MINI_SLURM_PORT", port.to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
-        // The daemons would hold a pipe open.
-        assert!(script.stdout(Stdio::null()).status().unwrap().success(), "the cluster doesn't start");
-        Some(cluster)
+        // Somebody else may take a port between the look and the start.
+        let start = || {
+            let cluster = Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
+            let mut script = cluster.script("start");
+            script.env("MINI_SLURM_PORT", free_ports().to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
+            // The daemons would hold a pipe open.
+            script.stdout(Stdio::null()).status().unwrap().success().then_some(cluster)
+        };
+        let cluster = (0..3).find_map(|_| start());
+        assert!(cluster.is_some(), "the cluster doesn't start");
+        cluster
     }
 
     fn script(&self, verb: &str) -> Command {
