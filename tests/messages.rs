@@ -19,9 +19,7 @@ fn talking(run: &str) -> Project {
          while [ $# -gt 0 ]; do case $1 in --output) out=$2;; --params) params=$2;; --threads) threads=$2;; esac; shift; done\n\
          {run}\n"
     );
-    // Written by another process: a child of another test can't hold it open then.
-    let write = ["-c", "printf %s \"$1\" > talk && chmod +x talk", "sh", &script];
-    assert!(Command::new("sh").args(write).current_dir(project.path(".")).status().unwrap().success());
+    project.program("talk", &script);
     project
 }
 

@@ -8,11 +8,13 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use common::{Finished, Project, root, wait_until};
+use counter_rng::CounterRng;
 
-/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a checkpoint when it is asked to end. While a file
+/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a checkpoint when it is asked to end, or where it
+/// `keeps` them at every step. While a file
 /// is there that `hold` names, it waits at the step that stands in it.
 const STEP: &str = r#"#!/usr/bin/env python3
 import hashlib, json, os, pathlib, signal, sys, time
@@ -23,7 +25,7 @@ if sys.argv[1] == "describe":
     text = {"kinds": ["text"], "summary": "a text", "optional": True}
     print(json.dumps({"name": "step", "version": "1", "code": "1", "summary": "Steps.", "inputs": {"a": text, "b": text},
         "parameters": {"type": "object", "additionalProperties": False, "properties": {
-            "steps": number(1), "pause": number(0), "seed": number(0), "fails": number(0), "hold": word()}},
+            "steps": number(1), "pause": number(0), "keeps": number(0), "seed": number(0), "fails": number(0), "hold": word()}},
         "output": {"kind": "text"}}))
     sys.exit()
 given = {"input": []}
@@ -37,6 +39,10 @@ if params["fails"]:
 asked = []
 signal.signal(signal.SIGTERM, lambda *_: asked.append(1))
 checkpoint = pathlib.Path(given["--work"]) / "checkpoint"
+def keep():
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    checkpoint.with_suffix(".new").write_text(json.dumps([done, state]))
+    checkpoint.with_suffix(".new").rename(checkpoint)
 def is_held():
     try: return params["hold"] and done >= int((here / params["hold"]).read_text() or 0)
     except FileNotFoundError: return False
@@ -47,12 +53,12 @@ if checkpoint.exists(): done, state = json.loads(checkpoint.read_text())
 while done < params["steps"]:
     while is_held() and not asked: time.sleep(0.05)
     if asked:
-        checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        checkpoint.write_text(json.dumps([done, state]))
+        keep()
         print("stopped at", done, file=sys.stderr)
         sys.exit(130)
     time.sleep(params["pause"])
     done, state = done + 1, hashlib.sha256(state.encode()).hexdigest()
+    if params["keeps"]: keep()
 os.makedirs(given["--output"])
 pathlib.Path(given["--output"], "text").write_text(state)
 "#;
@@ -79,18 +85,10 @@ stages:
   page: {run: ./page, inputs: {run: eval}}
 ";
 
-/// A program, written by another process: one that this one has open can't be started.
-fn program(project: &Project, file: &str, text: &str) {
-    project.write(".source", text);
-    let to = project.path(file);
-    std::fs::create_dir_all(to.parent().unwrap()).unwrap();
-    assert!(Command::new("install").args(["-m", "755"]).arg(project.path(".source")).arg(to).status().unwrap().success());
-}
-
 fn project(pipeline: &str) -> Project {
     let project = Project::new(pipeline);
-    program(&project, "step", STEP);
-    program(&project, "page", PAGE);
+    project.program("step", STEP);
+    project.program("page", PAGE);
     project
 }
 
@@ -344,7 +342,7 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
         wait_until(|| ran(&shared).len() == round);
         assert_eq!(ran(&shared).len(), round, "{} {}", state(), log());
         if round > 1 {
-            std::thread::sleep(std::time::Duration::from_millis(300));
+            std::thread::sleep(Duration::from_millis(300));
             cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
         }
         wait_until(|| log().matches("goes on from the checkpoint later").count() == round && state().starts_with("PENDING"));
@@ -363,6 +361,50 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     );
     local.ok(&["run"]);
     assert_eq!(outputs(&shared, "first", &[]), outputs(&local, "first", &[]));
+    assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
+}
+
+/// Processes whose command line names a project: its jobs' runners and stages.
+fn processes(project: &Project) -> Vec<String> {
+    let folder = project.path("").into_os_string().into_encoded_bytes();
+    let entries = std::fs::read_dir("/proc").unwrap().map(|entry| entry.unwrap());
+    let names_it = |entry: &std::fs::DirEntry| {
+        let words = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
+        words.windows(folder.len()).any(|window| window == folder)
+    };
+    let mut found: Vec<String> = entries.filter(names_it).map(|entry| entry.file_name().into_string().unwrap()).collect();
+    found.sort();
+    found
+}
+
+/// Ten times one of the jobs' processes ends at once, whichever it is, and the sweep is submitted again.
+#[test]
+fn kills_at_random_moments_lose_nothing() {
+    let Some(cluster) = Cluster::start() else { return };
+    let step = "run: ./step, parameters: {steps: 60, pause: 0.02, keeps: 1, hold: hold}";
+    let pipeline = format!("default: [second]\nstages:\n  first: {{{step}}}\n  second: {{{step}, inputs: {{a: first}}}}\n");
+    let (shared, local) = (project(&pipeline), project(&pipeline));
+    let sweep = ["-p", "first.seed=1,2"];
+    let seed = std::env::var("NERF_SR_SEED").map_or(1, |text| text.parse().unwrap());
+    let mut draws = CounterRng::new(seed, 0, 0);
+    for kill in 0..10 {
+        // No node is done before the last kill; each has a few steps to go before every kill.
+        shared.write("hold", &(5 * (kill + 1)).to_string());
+        cluster.submit(&shared, &sweep);
+        wait_until(|| !processes(&shared).is_empty());
+        std::thread::sleep(Duration::from_millis(draws.below(500)));
+        let running = processes(&shared);
+        let chosen = &running[draws.below(running.len() as u64) as usize];
+        assert!(Command::new("kill").args(["-KILL", chosen]).status().unwrap().success(), "seed {seed}, kill {kill}");
+    }
+    std::fs::remove_file(shared.path("hold")).unwrap();
+    cluster.drain();
+    cluster.submit(&shared, &sweep);
+    cluster.drain();
+    local.ok(&[&["run"][..], &sweep].concat());
+    for stage in ["first", "second"] {
+        assert_eq!(outputs(&shared, stage, &sweep), outputs(&local, stage, &sweep), "{stage}, seed {seed}");
+    }
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
 }
 
@@ -407,7 +449,7 @@ fn a_stage_with_a_gpu_computes_on_it() {
 /// A program of Slurm's that writes down how it was called.
 fn fake(project: &Project, name: &str, more: &str) {
     let here = project.path(".").display().to_string();
-    program(project, &format!("bin/{name}"), &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"));
+    project.program(&format!("bin/{name}"), &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"));
 }
 
 #[test]
@@ -467,7 +509,7 @@ fn what_slurm_is_told() {
     fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
     run(&["run"]).fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
-    run(&["run", "-j", "2"]).fails(2, &["--jobs, --threads and --keep-going are for --executor local"]);
+    run(&["run", "-j", "2"]).fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");
     run(&["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();

@@ -117,6 +117,14 @@ impl Project {
         std::fs::write(path, text).unwrap();
     }
 
+    /// Writes a program. Another process does: what this one has open for writing can't be started.
+    pub fn program(&self, file: &str, text: &str) {
+        self.write(".source", text);
+        let to = self.path(file);
+        std::fs::create_dir_all(to.parent().unwrap()).unwrap();
+        assert!(Command::new("install").args(["-m", "755"]).arg(self.path(".source")).arg(to).status().unwrap().success());
+    }
+
     /// Changes the text of the pipeline, and of the tiny one that it extends.
     #[track_caller]
     pub fn replace(&self, from: &str, to: &str) {

@@ -2,13 +2,13 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use artifact::{print_lines, report_line};
+use artifact::{machine_memory, print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Choice;
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
-use slurm::Site;
+use slurm::{Memory, Site};
 
-use crate::execute::{Cluster, Executor, JOB_VERB, Local};
+use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
 use crate::graph::{ascii, dot, svg};
 use crate::limits::capped;
 use crate::remedy::Remedy;
@@ -97,9 +97,12 @@ enum Verb {
         /// Stages at once [default: the number of cores, at most 4]
         #[arg(short, long, value_name = "N")]
         jobs: Option<usize>,
-        /// Threads of all stages together; results don't depend on it [default: all cores]
+        /// Threads of each stage, and cores of all together; results don't depend on it [default: all cores]
         #[arg(long, value_name = "N")]
         threads: Option<usize>,
+        /// Memory of all stages together, such as 8G, by what each took when it last ran [default: all there is]
+        #[arg(long, value_name = "AMOUNT")]
+        memory: Option<Memory>,
         /// Go on with what doesn't need a failed stage
         #[arg(short, long)]
         keep_going: bool,
@@ -275,15 +278,15 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     let devices = Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
-        Verb::Run { what, jobs, threads, keep_going, out, site } => {
+        Verb::Run { what, jobs, threads, memory, keep_going, out, site } => {
             let executor: Box<dyn Executor> = match cli.executor {
                 Choose::Local => {
                     let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
-                    let (jobs, threads) = at_once(jobs, threads)?;
-                    Box::new(Local { jobs, threads, keep_going, remedy })
+                    Box::new(Local { budget: budget(jobs, threads, memory)?, keep_going, remedy })
                 }
-                Choose::Slurm if jobs.is_some() || threads.is_some() || keep_going => {
-                    let problem = "--jobs, --threads and --keep-going are for --executor local; say `resources` in the pipeline";
+                Choose::Slurm if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going => {
+                    let problem =
+                        "--jobs, --threads, --memory and --keep-going are for --executor local; say `resources` in the pipeline";
                     return Err(PlanError::Usage(problem.to_owned()).into());
                 }
                 Choose::Slurm => {
@@ -329,16 +332,16 @@ fn completions(shell: clap_complete::Shell) -> ExitCode {
     ExitCode::SUCCESS
 }
 
-/// Stages at once and threads of all of them, as far as the machine can use them.
-fn at_once(jobs: Option<usize>, threads: Option<usize>) -> Result<(usize, usize), PlanError> {
+/// What a run may take, as far as the machine can use it.
+fn budget(jobs: Option<usize>, threads: Option<usize>, memory: Option<Memory>) -> Result<Budget, PlanError> {
     if jobs == Some(0) || threads == Some(0) {
         return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
     }
     let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
-    let (jobs, less_jobs) = capped("--jobs", jobs.unwrap_or(cores.min(4)), cores);
+    let (stages, less_jobs) = capped("--jobs", jobs.unwrap_or(cores.min(4)), cores);
     let (threads, less_threads) = capped("--threads", threads.unwrap_or(cores), cores);
     less_jobs.into_iter().chain(less_threads).for_each(|said| report_line!("{said}"));
-    Ok((jobs, threads))
+    Ok(Budget { stages, threads, memory: memory.map(Memory::bytes).or_else(machine_memory).unwrap_or(u64::MAX) })
 }
 
 /// The words with which another verb is asked for the same.

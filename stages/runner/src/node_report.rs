@@ -71,6 +71,10 @@ pub(crate) struct ArtifactReport {
     pub(crate) started_unix: u64,
     pub(crate) seconds: f64,
     pub(crate) threads: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) peak_memory: Option<u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) processor_seconds: Option<f64>,
 }
 
 impl PlanReport {
@@ -120,6 +124,8 @@ impl NodeReport {
                     started_unix: record.started_unix,
                     seconds: record.seconds,
                     threads: record.threads,
+                    peak_memory: record.peak_memory,
+                    processor_seconds: record.processor_seconds,
                 });
             }
             State::WillRun { key_parts } => {

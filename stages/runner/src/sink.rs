@@ -48,6 +48,8 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
             started_unix: record.started_unix,
             seconds: record.seconds,
             threads: record.threads,
+            peak_memory: record.peak_memory,
+            processor_seconds: record.processor_seconds,
             host: record.host.clone(),
         })
     });

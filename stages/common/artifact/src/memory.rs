@@ -1,3 +1,5 @@
+use sysinfo::{MemoryRefreshKind, System};
+
 use crate::amounts::sized;
 
 /// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
@@ -13,6 +15,13 @@ const MARKS: [&str; 4] = ["memory allocation of ", "tried to allocate ", "Tried 
 pub fn out_of_memory(text: &str) -> Option<String> {
     let amount = MARKS.iter().find_map(|mark| amount(text.split_once(mark)?.1))?;
     Some(format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}"))
+}
+
+/// Memory of this machine in bytes, or of its container where that has less; none where the system doesn't tell.
+pub fn machine_memory() -> Option<u64> {
+    let mut system = System::new().ok()?;
+    system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
+    Some(system.cgroup_limits().map_or(system.total_memory(), |limits| limits.total_memory))
 }
 
 /// What helps where memory is short.
@@ -33,6 +42,11 @@ fn amount(text: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_machine_has_some_memory() {
+        assert!(machine_memory().is_some_and(|bytes| (1 << 28..1 << 50).contains(&bytes)), "{:?}", machine_memory());
+    }
 
     #[test]
     fn allocators_are_understood() {

@@ -70,6 +70,12 @@ pub struct RunNode {
     pub seconds: f64,
     /// Threads it had.
     pub threads: usize,
+    /// Peak resident memory of its process, in bytes, where the record has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_memory: Option<u64>,
+    /// Processor time of all its threads, in seconds, where the record has it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub processor_seconds: Option<f64>,
     /// Where it ran.
     #[serde(default)]
     pub host: String,

@@ -31,9 +31,8 @@ pub struct Store {
     root: PathBuf,
 }
 
-/// `actions/KEY.json`: the whole key and what came of it.
+/// `actions/KEY.json`: the whole key and what came of it. A field of a later version is passed over.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
 pub struct Record {
     /// Name of the stage's block in pipeline.yaml.
     pub stage: String,
@@ -52,6 +51,12 @@ pub struct Record {
     pub seconds: f64,
     /// Threads it had.
     pub threads: usize,
+    /// Peak resident memory of its process, in bytes; records of earlier versions have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub peak_memory: Option<u64>,
+    /// Processor time of all its threads, in seconds; records of earlier versions have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub processor_seconds: Option<f64>,
     /// Where it ran.
     pub host: String,
 }

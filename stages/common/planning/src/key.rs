@@ -1,6 +1,8 @@
 //! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are what `why` says. So an
 //! explanation can't drift from the key.
 
+use std::cmp::Reverse;
+
 use artifact::{KEY_VERSION, KEY_VERSION_PART, Record};
 use serde_json::{Map, Value, json};
 
@@ -35,9 +37,13 @@ pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> O
 
 /// The same, for programs.
 pub fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
-    let of_stage = records.iter().filter(|record| record.stage == stage);
-    let compared = of_stage.map(|record| (changes(&record.key_parts, parts), std::cmp::Reverse(record.started_unix)));
-    compared.min_by_key(|(changes, newest)| (changes.len(), *newest)).map(|(changes, _)| changes)
+    let record = nearest(parts, records.iter().filter(|record| record.stage == stage))?;
+    Some(changes(&record.key_parts, parts))
+}
+
+/// The record whose key differs in the fewest parts; of several the newest.
+pub fn nearest<'a>(parts: &Map<String, Value>, records: impl Iterator<Item = &'a Record>) -> Option<&'a Record> {
+    records.min_by_key(|record| (changes(&record.key_parts, parts).len(), Reverse(record.started_unix)))
 }
 
 #[cfg(test)]

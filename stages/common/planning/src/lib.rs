@@ -39,7 +39,7 @@ pub use changes::{Change, changes, short};
 pub use experiment::{Experiment, Selection, Variant};
 pub use file::{PipelineFile, StageBlock};
 pub use frozen::{Frozen, FrozenError};
-pub use key::{explain, nearest_changes, parts};
+pub use key::{explain, nearest, nearest_changes, parts};
 pub use pipeline::{Part, Pipeline, PipelineError};
 pub use plan::{Devices, Node, NodeInput, Origin, Plan, PlanError, Request, Sink, State, input_hashes, source_hash};
 pub use renames::known_blocks;

@@ -18,6 +18,13 @@ pub struct Period {
     pub(crate) seconds: u64,
 }
 
+impl Memory {
+    /// In bytes.
+    pub fn bytes(self) -> u64 {
+        self.mib.saturating_mul(1 << 20)
+    }
+}
+
 impl Period {
     /// In minutes, a begun one counted: Slurm's unit.
     pub(crate) fn minutes(self) -> u64 {

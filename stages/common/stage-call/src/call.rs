@@ -4,12 +4,13 @@ use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Description, Event, KeyLock, SUMMARY_FILE, counted, printable};
-use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use artifact::{Description, Event, KeyLock, SUMMARY_FILE, counted, printable, sized};
+use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid};
+use wait4::{ResUse, Wait4 as _};
 
 use crate::clock::seconds;
 use crate::log::{StageLog, Tenths};
@@ -74,6 +75,15 @@ impl StageFailure {
     }
 }
 
+/// What a call took of the machine.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Usage {
+    /// Peak resident memory in bytes, of the stage or, where it is larger, of a program that it called.
+    pub peak_memory: u64,
+    /// Processor time of all its threads, and of the programs that it called, in seconds.
+    pub processor_seconds: f64,
+}
+
 /// What to do with a stage's output while it runs. Control characters in it are spelled out.
 pub trait Watcher: Sync {
     /// How far it is.
@@ -85,15 +95,16 @@ pub trait Watcher: Sync {
 impl Call<'_> {
     /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When `stop` is set the stage is asked to
     /// end, so that it leaves a checkpoint.
-    pub fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
+    pub fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<Usage, StageFailure> {
         let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
         self.log_start(&log);
         let started = Instant::now();
         let result = self.carry_out(&log, watcher, stop);
         let time = seconds(started.elapsed().as_secs_f64());
         match &result {
-            Ok(()) => {
-                log.line(format_args!("done in {time}"));
+            Ok(usage) => {
+                let (memory, processor) = (sized(usage.peak_memory), seconds(usage.processor_seconds));
+                log.line(format_args!("done in {time}; {processor} of processor time, {memory} of memory at most"));
                 let summary = std::fs::read_to_string(self.output.join(SUMMARY_FILE)).unwrap_or_default();
                 summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
             }
@@ -119,7 +130,7 @@ impl Call<'_> {
         }
     }
 
-    fn carry_out(&self, log: &StageLog, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<(), StageFailure> {
+    fn carry_out(&self, log: &StageLog, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<Usage, StageFailure> {
         let fail = |e: std::io::Error| StageFailure::at(self.program, &e);
         let stdin = match self.lock {
             Some(lock) => Stdio::from(lock.share().map_err(fail)?),
@@ -128,16 +139,17 @@ impl Call<'_> {
         let mut child = self.command().stdin(stdin).spawn().map_err(fail)?;
         let ear = Ear { log, watcher };
         let (stdout, stderr) = (child.stdout.take(), child.stderr.take());
-        let (status, stated, tail) = std::thread::scope(|scope| {
+        let (end, stated, tail) = std::thread::scope(|scope| {
             let events = scope.spawn(|| ear.hear_events(stdout));
             let words = scope.spawn(|| ear.hear_words(stderr));
-            let status = wait(&mut child, stop);
-            (status, events.join().ok().flatten(), words.join().unwrap_or_default())
+            let end = wait(&mut child, stop);
+            (end, events.join().ok().flatten(), words.join().unwrap_or_default())
         });
-        let status = status.map_err(fail)?;
+        let ResUse { status, rusage } = end.map_err(fail)?;
         let last = tail.last().cloned();
         let result = if status.success() {
-            Ok(())
+            let processor_seconds = (rusage.utime + rusage.stime).as_secs_f64();
+            Ok(Usage { peak_memory: rusage.maxrss, processor_seconds })
         } else {
             let end = End { status, stated, tail, asked: stop.load(Ordering::Relaxed) };
             Err(end.failure(&self.description.name))
@@ -219,22 +231,21 @@ impl Ear<'_> {
 }
 
 /// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open and write unseen.
-fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ExitStatus> {
-    let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
+fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ResUse> {
+    let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw).ok_or(std::io::ErrorKind::InvalidInput)?;
     let mut asked = false;
-    loop {
-        if let Some(status) = child.try_wait()? {
-            // Mostly there is nothing left of its group.
-            pid.map(|group| kill_process_group(group, Signal::KILL).ok());
-            return Ok(status);
-        }
+    // It is looked at and not taken yet, so that its number remains its own until its group is ended.
+    while waitid(WaitId::Pid(pid), WaitIdOptions::EXITED | WaitIdOptions::NOWAIT | WaitIdOptions::NOHANG)?.is_none() {
         if stop.load(Ordering::Relaxed) && !asked {
             // It may just have ended by itself.
-            pid.map(|pid| kill_process(pid, Signal::TERM).ok());
+            kill_process(pid, Signal::TERM).ok();
             asked = true;
         }
         std::thread::sleep(Duration::from_millis(10));
     }
+    // Mostly there is nothing left of its group.
+    kill_process_group(pid, Signal::KILL).ok();
+    child.try_wait4()?.ok_or_else(|| std::io::Error::other("a process that has ended is still there"))
 }
 
 /// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control characters spelled out. Of what was

@@ -1,7 +1,7 @@
 //! Calls of stages by their contract: what a runner does of which a stage knows the other half.
 //!
 //! * [`ask_all`]: what programs say of themselves.
-//! * [`Call`]: one run of a stage, with its log. Who stops it asks the stage to end, so that it leaves a checkpoint.
+//! * [`Call`]: one run of a stage, with its log and its [`Usage`]. Who stops it asks the stage to end, so that it leaves a checkpoint.
 //! * [`StageFailure`]: why a stage failed, by what it says, by its allocator, by the signal that ended it.
 //! * [`Display`]: what a person sees meanwhile; any [`Watcher`] may watch.
 
@@ -14,7 +14,7 @@ mod display;
 mod log;
 mod verdict;
 
-pub use call::{Call, StageFailure, Watcher};
+pub use call::{Call, StageFailure, Usage, Watcher};
 pub use clock::{seconds, utc};
 pub use describing::{Answers, Interrupted, ask_all};
 pub use display::{Display, StageView};

@@ -1,6 +1,7 @@
 //! The local executor: runs a plan's nodes whose parents are done, some at once, and then its sinks.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::cell::OnceCell;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
@@ -11,6 +12,8 @@ use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_te
 use planning::{Plan, Sink};
 use stage_call::{Display, StageFailure};
 
+use super::node::{Action, Found};
+use super::places::{Budget, Need, Place, Places};
 use super::{Executor, NodeJob, Work};
 use crate::counts;
 use crate::remedy::Remedy;
@@ -19,10 +22,8 @@ use crate::sink::{Showing, Shown, show};
 
 /// This machine.
 pub(crate) struct Local {
-    /// Stages at once.
-    pub(crate) jobs: usize,
-    /// Threads of all stages together.
-    pub(crate) threads: usize,
+    /// What stages may take of it together.
+    pub(crate) budget: Budget,
     /// Whether to go on with what doesn't need a failed stage.
     pub(crate) keep_going: bool,
     /// What to say after a failure.
@@ -36,7 +37,7 @@ impl Executor for Local {
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
-        let showing = Showing { plan, store: &session.store, run, out, threads: self.threads, stop };
+        let showing = Showing { plan, store: &session.store, run, out, threads: self.budget.threads, stop };
         if let Some((index, failure)) = outcome.failures.first() {
             if self.keep_going {
                 show_partly(&showing, &outcome)?;
@@ -62,8 +63,16 @@ struct Outcome {
     skipped: Vec<usize>,
 }
 
-enum NodeProgress {
+/// How far a node is.
+enum Progress {
+    /// Its parents aren't done, or it hasn't been looked at since.
     Pending,
+    /// It isn't cached, and has no place yet. It is said once that it waits for memory.
+    Ready {
+        action: Action,
+        need: Need,
+        said: bool,
+    },
     Running,
     Over,
 }
@@ -72,61 +81,137 @@ enum NodeProgress {
 type Report = (usize, Result<(Record, bool), StageFailure>);
 
 fn run(work: &Work<'_>, options: &Local) -> Outcome {
-    let Work { session, plan, run: file, stop, .. } = *work;
-    let count = plan.nodes.len();
-    let mut outcome = Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() };
-    let mut progress: Vec<NodeProgress> = (0..count).map(|_| NodeProgress::Pending).collect();
     let display = Display::new();
+    let mut schedule = Schedule::new(work, options, &display);
     let (sender, reports) = mpsc::channel::<Report>();
     std::thread::scope(|scope| {
-        let mut running = 0;
         loop {
-            let give_up = stop.load(Ordering::Relaxed) || (!options.keep_going && !outcome.failures.is_empty());
-            let ready: Vec<usize> = (0..count)
-                .filter(|&i| {
-                    matches!(progress[i], NodeProgress::Pending) && plan.nodes[i].parents().all(|p| outcome.records[p].is_some())
-                })
-                .collect();
-            let places = if give_up { 0 } else { options.jobs.saturating_sub(running) };
-            let starting = &ready[..ready.len().min(places)];
-            // Stages that run side by side share the cores; one alone has them all.
-            let together = (running + starting.len()).clamp(1, options.jobs);
-            for &index in starting {
-                progress[index] = NodeProgress::Running;
-                running += 1;
-                let parents: BTreeMap<usize, Record> =
-                    plan.nodes[index].parents().filter_map(|p| Some((p, outcome.records[p].clone()?))).collect();
-                let (sender, display) = (sender.clone(), &display);
-                let threads = (options.threads / together).max(1);
-                scope.spawn(move || {
-                    let (node, store) = (&plan.nodes[index], &session.store);
-                    let job = NodeJob { plan, node, store, file, threads, display, stop };
-                    // The receiver lives as long as the scope. A panic doesn't come here: it ends the program (`panics`).
-                    sender.send((index, job.run(&parents))).ok();
-                });
+            schedule.look();
+            for (job, index, action) in schedule.starting() {
+                let sender = sender.clone();
+                // The receiver lives as long as the scope. A panic doesn't come here: it ends the program (`panics`).
+                scope.spawn(move || sender.send((index, job.carry_out(action))).ok());
             }
-            if running == 0 {
+            if schedule.places.is_idle() {
                 break;
             }
-            let Ok((index, result)) = reports.recv() else { break };
-            running -= 1;
-            progress[index] = NodeProgress::Over;
-            match result {
-                Ok((record, ran)) => {
-                    outcome.records[index] = Some(record);
-                    if ran {
-                        outcome.ran.insert(index);
-                    }
-                }
-                Err(failure) => {
-                    display.line(&format!("{}: failed: {}", plan.nodes[index].label(), failure.message));
-                    outcome.failures.push((index, failure));
-                }
-            }
+            let Ok(report) = reports.recv() else { break };
+            schedule.take_in(report);
         }
     });
-    outcome.skipped = (0..count).filter(|&i| matches!(progress[i], NodeProgress::Pending)).collect();
-    outcome
+    schedule.end()
+}
+
+/// Which nodes are done, run, or wait for a place. One that is cached takes none.
+struct Schedule<'a> {
+    work: &'a Work<'a>,
+    options: &'a Local,
+    display: &'a Display,
+    progress: Vec<Progress>,
+    places: Places,
+    /// All records, once there is something to run.
+    records: OnceCell<Vec<Record>>,
+    outcome: Outcome,
+}
+
+impl<'a> Schedule<'a> {
+    fn new(work: &'a Work<'a>, options: &'a Local, display: &'a Display) -> Self {
+        let count = work.plan.nodes.len();
+        Self {
+            work,
+            options,
+            display,
+            progress: (0..count).map(|_| Progress::Pending).collect(),
+            places: Places::new(options.budget),
+            records: OnceCell::new(),
+            outcome: Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() },
+        }
+    }
+
+    fn gives_up(&self) -> bool {
+        self.work.stop.load(Ordering::Relaxed) || (!self.options.keep_going && !self.outcome.failures.is_empty())
+    }
+
+    fn job(&self, index: usize) -> NodeJob<'a> {
+        let Work { session, plan, run: file, stop, .. } = *self.work;
+        let node = &plan.nodes[index];
+        let parents = node.parents().filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?))).collect();
+        let threads = self.options.budget.threads;
+        NodeJob { plan, node, parents, store: &session.store, file, threads, display: self.display, stop }
+    }
+
+    /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass finds all that is cached.
+    fn look(&mut self) {
+        for (index, node) in self.work.plan.nodes.iter().enumerate() {
+            let is_pending = matches!(self.progress[index], Progress::Pending);
+            if self.gives_up() || !is_pending || node.parents().any(|parent| self.outcome.records[parent].is_none()) {
+                continue;
+            }
+            match self.job(index).find() {
+                Ok(Found::Cached(record)) => {
+                    self.outcome.records[index] = Some(record);
+                    self.progress[index] = Progress::Over;
+                }
+                Ok(Found::ToDo(action)) => {
+                    // Without records every stage counts as unknown.
+                    let records = self.records.get_or_init(|| self.work.session.store.records().unwrap_or_default());
+                    let need = Need::of(action.key_parts(), &node.stage, records);
+                    self.progress[index] = Progress::Ready { action, need, said: false };
+                }
+                Err(failure) => self.fail(index, failure),
+            }
+        }
+    }
+
+    /// Gives places to nodes that are ready, in the plan's order.
+    fn starting(&mut self) -> Vec<(NodeJob<'a>, usize, Action)> {
+        let mut starting = Vec::new();
+        for index in 0..self.progress.len() {
+            let Progress::Ready { need, ref mut said, .. } = self.progress[index] else { continue };
+            match self.places.place(need) {
+                Place::LaterForMemory(why) if !*said => {
+                    *said = true;
+                    self.display.line(&format!("{}: waits: {why}", self.work.plan.nodes[index].label()));
+                }
+                Place::Never(message) if !self.gives_up() => self.fail(index, StageFailure { code: 1, message }),
+                Place::Free if !self.gives_up() => {
+                    let progress = std::mem::replace(&mut self.progress[index], Progress::Running);
+                    let Progress::Ready { action, .. } = progress else { continue };
+                    self.places.take(index, need);
+                    starting.push((self.job(index), index, action));
+                }
+                _ => {}
+            }
+        }
+        starting
+    }
+
+    fn take_in(&mut self, (index, result): Report) {
+        self.places.give_back(index);
+        match result {
+            Ok((record, ran)) => {
+                self.progress[index] = Progress::Over;
+                self.outcome.records[index] = Some(record);
+                if ran {
+                    self.outcome.ran.insert(index);
+                }
+            }
+            Err(failure) => self.fail(index, failure),
+        }
+    }
+
+    fn fail(&mut self, index: usize, failure: StageFailure) {
+        self.progress[index] = Progress::Over;
+        self.display.line(&format!("{}: failed: {}", self.work.plan.nodes[index].label(), failure.message));
+        self.outcome.failures.push((index, failure));
+    }
+
+    /// What came of it.
+    fn end(mut self) -> Outcome {
+        let is_over = |index: &usize| matches!(self.progress[*index], Progress::Over);
+        self.outcome.skipped = (0..self.progress.len()).filter(|index| !is_over(index)).collect();
+        self.outcome
+    }
 }
 
 /// Prints a few words on each result that nothing else is made of.

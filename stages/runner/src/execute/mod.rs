@@ -2,6 +2,7 @@
 
 mod local;
 mod node;
+mod places;
 mod slurm;
 
 use std::path::Path;
@@ -15,6 +16,7 @@ use crate::session::Session;
 
 pub(crate) use local::Local;
 pub(crate) use node::NodeJob;
+pub(crate) use places::Budget;
 pub(crate) use slurm::{Cluster, JOB_VERB, identities};
 
 /// Carries out plans.

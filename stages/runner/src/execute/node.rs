@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
+use serde_json::{Map, Value};
 use stage_call::{Call, Display, StageFailure, seconds};
 
 use crate::waiting::{by, enter, until_held};
@@ -17,10 +18,30 @@ struct Inputs {
     hashes: Vec<(String, String)>,
 }
 
+/// A node's action that isn't done.
+pub(crate) struct Action {
+    key_parts: Map<String, Value>,
+    hashes: Vec<(String, String)>,
+}
+
+impl Action {
+    pub(crate) fn key_parts(&self) -> &Map<String, Value> {
+        &self.key_parts
+    }
+}
+
+/// What there is of a node whose parents are done.
+pub(crate) enum Found {
+    Cached(Record),
+    ToDo(Action),
+}
+
 /// One node's work.
 pub(crate) struct NodeJob<'a> {
     pub(crate) plan: &'a Plan,
     pub(crate) node: &'a Node,
+    /// Of the nodes that it needs.
+    pub(crate) parents: BTreeMap<usize, Record>,
     pub(crate) store: &'a Store,
     pub(crate) file: &'a RunFile,
     pub(crate) threads: usize,
@@ -29,24 +50,37 @@ pub(crate) struct NodeJob<'a> {
 }
 
 impl NodeJob<'_> {
-    /// Finds the record or makes it; whether it had to. `parents` are the records of the nodes that it needs.
-    pub(crate) fn run(&self, parents: &BTreeMap<usize, Record>) -> Result<(Record, bool), StageFailure> {
-        let output_of = |index: usize| parents[&index].output.clone();
-        let hashes = input_hashes(self.node, self.store, output_of).map_err(|e| match e {
+    /// Finds the record or makes it.
+    pub(crate) fn run(&self) -> Result<Record, StageFailure> {
+        match self.find()? {
+            Found::Cached(record) => Ok(record),
+            Found::ToDo(action) => self.carry_out(action).map(|(record, _)| record),
+        }
+    }
+
+    /// Looks whether it is cached. Either way it is written down that this run needs it, so that it can't go meanwhile.
+    pub(crate) fn find(&self) -> Result<Found, StageFailure> {
+        let hashes = input_hashes(self.node, self.store, |index| self.output_of(index)).map_err(|e| match e {
             PlanError::Source(message) => StageFailure { code: 3, message },
             other => fail(other),
         })?;
         let key_parts = planning::parts(self.node, &hashes, self.device());
         let key = hash_json(&key_parts);
-        if let Some(record) = self.find(&key)? {
-            return Ok((record, false));
-        }
+        let entered = self.enter()?;
+        self.file.needs(&entered, &self.node.stage, &key).map_err(fail)?;
+        Ok(self.store.hit(&key).map_or(Found::ToDo(Action { key_parts, hashes }), Found::Cached))
+    }
+
+    /// Makes it; whether it had to.
+    pub(crate) fn carry_out(&self, action: Action) -> Result<(Record, bool), StageFailure> {
+        let Action { key_parts, hashes } = action;
+        let key = hash_json(&key_parts);
         let lock = until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || self.store.try_lock(&key))?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
             key_parts,
-            made_of: parents.values().map(Record::key).collect(),
+            made_of: self.parents.values().map(Record::key).collect(),
             started_unix: unix_time(),
         };
         let attempt = {
@@ -58,15 +92,12 @@ impl NodeJob<'_> {
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
         };
-        let folders = self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input, &output_of))).collect();
+        let folders = self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input))).collect();
         self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
     }
 
-    /// The record, if the action was done. Either way it is written down that this run needs it, so that it can't go meanwhile.
-    fn find(&self, key: &str) -> Result<Option<Record>, StageFailure> {
-        let entered = self.enter()?;
-        self.file.needs(&entered, &self.node.stage, key).map_err(fail)?;
-        Ok(self.store.hit(key))
+    fn output_of(&self, index: usize) -> String {
+        self.parents[&index].output.clone()
     }
 
     fn device(&self) -> &str {
@@ -102,7 +133,7 @@ impl NodeJob<'_> {
         let started = Instant::now();
         let result = call.run(&attempt.log, &view, self.stop);
         view.end();
-        result?;
+        let usage = result?;
         let record = Record {
             stage: action.stage,
             point: action.point,
@@ -110,8 +141,10 @@ impl NodeJob<'_> {
             made_of: action.made_of,
             output: String::new(),
             started_unix: action.started_unix,
-            seconds: (started.elapsed().as_secs_f64() * 1e3).round() / 1e3,
+            seconds: milliseconds(started.elapsed().as_secs_f64()),
             threads: self.threads,
+            peak_memory: Some(usage.peak_memory),
+            processor_seconds: Some(milliseconds(usage.processor_seconds)),
             host: host_name(),
         };
         let checked = self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
@@ -120,15 +153,20 @@ impl NodeJob<'_> {
         Ok(record)
     }
 
-    fn folder_of(&self, input: &NodeInput, output_of: &dyn Fn(usize) -> String) -> PathBuf {
+    fn folder_of(&self, input: &NodeInput) -> PathBuf {
         match &input.from {
             Origin::Node { index, subtree } => {
-                let object = self.store.object(&output_of(*index));
+                let object = self.store.object(&self.output_of(*index));
                 subtree.as_ref().map_or(object.clone(), |s| object.join(s))
             }
             Origin::Folder(folder) => folder.clone(),
         }
     }
+}
+
+/// Seconds to the millisecond.
+fn milliseconds(seconds: f64) -> f64 {
+    (seconds * 1e3).round() / 1e3
 }
 
 /// A failure that is neither the input's nor the numbers'.

@@ -80,7 +80,7 @@ impl Task<'_> {
         let parents = node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
         let (threads, display) = (slurm::cores(), Display::new());
         let Self { plan, store, run: file, stop, .. } = *self;
-        NodeJob { plan, node, store, file, threads, display: &display, stop }.run(&parents).map(drop)
+        NodeJob { plan, node, parents, store, file, threads, display: &display, stop }.run().map(drop)
     }
 
     fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
