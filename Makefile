@@ -15,7 +15,7 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build remote setup test faults lint lego sweep quality table refine-table refine-ablation held-out ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build remote setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -110,8 +110,11 @@ table: build ## The paper's tables with every method: make table SCENES="lego" P
 	@mkdir -p $(dir $(TABLE)) && cat $(TABLES:%=out/%/table.md) > $(TABLE)
 	@for kind in json csv; do cp out/paper-table/rows.$$kind $(basename $(TABLE)).$$kind; done
 
+results: ## Put tables that experiments made in out/ into docs/results, whose comments name the commands
+	UPDATE=1 cargo test --release -p end-to-end --test results --quiet -- --nocapture what_was_measured
+
 REFERENCES ?= 1
-MOST_REFERENCES = $(lastword $(sort $(REFERENCES)))
+MOST_REFERENCES = $(shell printf '%s\n' $(REFERENCES) | sort -n | tail -1)
 refine-table: build ## Rendered and refined views: make refine-table SCENES=fern PROTOCOLS="252x2 252x4" REFERENCES="1 2 4" SPLIT=paper OUT=FILE
 	@$(call experiment,refine-table,$(call each,--variant ,$(REFERENCES)) -p prep.hr_references=$(MOST_REFERENCES))
 

@@ -95,7 +95,7 @@ fn every_command_plans() {
             // `run` would train for minutes; the plan is the same code up to running. It has no use for run's own options.
             if words[0] == "run" {
                 words[0] = "plan";
-                while let Some(at) = words.iter().position(|w| ["-j", "--out"].contains(w)) {
+                while let Some(at) = words.iter().position(|w| ["-j", "--threads", "--memory", "--out"].contains(w)) {
                     words.drain(at..at + 2);
                 }
             }
