@@ -7,13 +7,13 @@ use std::sync::atomic::AtomicBool;
 
 use artifact::{FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
 use planning::{Plan, Sink};
-use serde_json::json;
+use serde_json::{Map, json};
 use stage_call::{Call, Display, StageFailure};
 
 use crate::publish;
 
 /// The record of the nodes that a sink shows and all they were made of; none where some of that isn't there, unless the sink shows what there
-/// is.
+/// is. Nothing of an artifact is read for it, so the values that scenes decide are missing ([`resolve`]).
 fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> Option<RunRecord> {
     let mut is_whole: Vec<bool> = Vec::with_capacity(plan.nodes.len());
     for (node, record) in plan.nodes.iter().zip(records) {
@@ -41,7 +41,7 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
             kind: node.program.description.output.kind.clone(),
             key: record.key(),
             output: record.output.clone(),
-            resolved: node.by_scene(&folder),
+            resolved: Map::new(),
             folder,
             parameters: node.parameters.as_object().cloned().unwrap_or_default(),
             inputs: node.run_inputs(position),
@@ -69,7 +69,16 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
     Some(RunRecord { home, nodes, failed })
 }
 
-/// By what a page is known to show a record.
+/// Adds the values that scenes decide, from the artifacts.
+fn resolve(record: RunRecord, plan: &Plan) -> RunRecord {
+    let of_node = |node: RunNode| {
+        let planned = plan.nodes.iter().find(|planned| planned.stage == node.stage && planned.point == node.point);
+        RunNode { resolved: planned.map(|planned| planned.by_scene(&node.folder)).unwrap_or_default(), ..node }
+    };
+    RunRecord { nodes: record.nodes.into_iter().map(of_node).collect(), ..record }
+}
+
+/// By what a page is known to show a record: what scenes decide follows from the rest.
 fn identity(sink: &Sink, record: &RunRecord) -> String {
     hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}))
 }
@@ -111,6 +120,7 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>
     if publish::shows(&target, &identity) {
         return Ok(Shown::UpToDate(target));
     }
+    let record = resolve(record, plan);
     let scratch = store.scratch(run.id()).join(&sink.stage);
     let (folder, params, output) = (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
     std::fs::create_dir_all(&folder)

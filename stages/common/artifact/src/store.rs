@@ -59,6 +59,9 @@ pub struct Record {
     pub processor_seconds: Option<f64>,
     /// Where it ran.
     pub host: String,
+    /// What its `summary.txt` says, so that nothing of an artifact is read to show it; records of earlier versions have none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub summary: Option<String>,
 }
 
 /// Version of a key's list of parts: names of parameters changed between 1 and 2.

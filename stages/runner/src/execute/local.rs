@@ -220,8 +220,8 @@ fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Res
         (0..plan.nodes.len()).filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i))).collect();
     for index in ends {
         let record = outcome.records[index].as_ref().context("every node is done")?;
-        let summary = std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).unwrap_or_default();
-        if !summary.is_empty() {
+        let stored = || std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).ok();
+        if let Some(summary) = record.summary.clone().or_else(stored) {
             print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
         }
     }

@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
-use artifact::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, hash_json, host_name, unix_time};
+use artifact::{
+    Attempt, Entered, Holder, KeyLock, Record, RunFile, SUMMARY_FILE, Store, Unfinished, hash_json, host_name, unix_time,
+};
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use serde_json::{Map, Value};
 use stage_call::{Call, Display, StageFailure, seconds};
@@ -146,6 +148,7 @@ impl NodeJob<'_> {
             peak_memory: Some(usage.peak_memory),
             processor_seconds: Some(milliseconds(usage.processor_seconds)),
             host: host_name(),
+            summary: std::fs::read_to_string(attempt.output.join(SUMMARY_FILE)).ok(),
         };
         let checked = self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
         let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
