@@ -15,7 +15,7 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build remote setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench fuzz clean goldens
+.PHONY: help demo build remote setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -139,6 +139,9 @@ tradeoff: build held-out ## PSNR against training time, on withheld training vie
 
 seeds: build ## Ten seeds on the demo scene: the spread of the PSNR
 	@$(call experiment,seeds)
+
+bench-runner: build ## What the runner costs beside DVC and Snakemake, which this installs: out/bench-runner/table.md
+	@python3 scripts/bench-runner.py
 
 BENCH_SCENE := out/bench/scene
 bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)

@@ -11,7 +11,7 @@ use common::Project;
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
 const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
 /// The same for those whose links alone are checked.
-const LINKED: [&str; 3] = ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md"];
+const LINKED: [&str; 4] = ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
 const LINKED_FOLDERS: [&str; 1] = ["docs/design"];
 
 fn read(path: impl AsRef<Path>) -> String {
