@@ -1,6 +1,7 @@
 //! Two results with all that they were made of, and what differs between them.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
 use artifact::{Manifest, Record, Store, label};
 use planning::{Change, changes};
@@ -51,9 +52,10 @@ impl Lineage {
         let names: BTreeSet<&String> = self.records.keys().chain(before.records.keys()).collect();
         let mut found = Vec::new();
         for name in names {
-            let [old, new] = [before, self].map(|lineage| lineage.records.get(name));
-            let [parts_before, parts_now] = [(before, old), (self, new)]
-                .map(|(lineage, record)| record.map(|record| lineage.parts(record, store)).unwrap_or_default());
+            let sides = [(before, before.records.get(name)), (self, self.records.get(name))];
+            let depth = Depth::of(sides.map(|(_, record)| record), store);
+            let [parts_before, parts_now] =
+                sides.map(|(lineage, record)| record.map(|record| lineage.parts(record, store, depth)).unwrap_or_default());
             let changes = changes(&parts_before, &parts_now);
             if !changes.is_empty() {
                 found.push(StageDifference { stage: name.clone(), changes });
@@ -62,34 +64,64 @@ impl Lineage {
         found
     }
 
-    /// All that may differ of a result, by name.
-    fn parts(&self, record: &Record, store: &Store) -> Map<String, Value> {
+    /// What may differ of a result, by name.
+    fn parts(&self, record: &Record, store: &Store, depth: Depth) -> Map<String, Value> {
+        if depth == Depth::Name {
+            return record.key_parts.iter().filter(|(name, _)| *name == "stage").map(owned).collect();
+        }
         let is_made = |hash: &Value| {
             let outputs = self.records.values().filter(|other| record.made_of.contains(&other.key()));
             outputs.into_iter().any(|other| is_of(store, hash, &other.output))
         };
         let mut parts: Map<String, Value> =
             record.key_parts.iter().filter(|(name, value)| !(name.starts_with("input ") && is_made(value))).map(owned).collect();
-        let Ok(manifest) = store.manifest(&record.output) else {
-            parts.insert("artifact".to_owned(), Value::from("gone"));
-            return parts;
-        };
-        for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
-            parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
-        }
-        let folder = store.object(&record.output);
-        for file in manifest.files.iter().filter(|file| file.path.ends_with(".json") && !file.path.contains('/')) {
-            let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
-            let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
-            let resolved = value.get("resolved").and_then(Value::as_object).into_iter().flatten();
-            parts.extend(resolved.map(|(name, value)| (format!("resolved {name}"), value.clone())));
-            if file.path == METRICS_FILE {
-                numbers("mean", &value["mean"], &mut |name, value| {
-                    parts.insert(format!("metric {name}"), value.clone());
-                });
-            }
+        let manifest = store.manifest(&record.output).ok();
+        parts.insert("artifact".to_owned(), Value::from(if manifest.is_some() { "kept" } else { "gone" }));
+        if let Some(manifest) = manifest.filter(|_| depth == Depth::Content) {
+            add_content(&mut parts, &manifest, &store.object(&record.output));
         }
         parts
+    }
+}
+
+/// How much of two results is compared.
+#[derive(Clone, Copy, PartialEq)]
+enum Depth {
+    /// One of them isn't there: its stage's name says it all.
+    Name,
+    /// The artifact of one is gone.
+    Key,
+    /// Metrics, files, and what the scene decided, too.
+    Content,
+}
+
+impl Depth {
+    fn of(records: [Option<&Record>; 2], store: &Store) -> Self {
+        match records {
+            [Some(before), Some(now)] => {
+                let is_kept = |record: &Record| store.manifest(&record.output).is_ok();
+                if is_kept(before) && is_kept(now) { Self::Content } else { Self::Key }
+            }
+            _ => Self::Name,
+        }
+    }
+}
+
+/// Adds an artifact's files by their hashes; of JSON files the numbers that count.
+fn add_content(parts: &mut Map<String, Value>, manifest: &Manifest, folder: &Path) {
+    for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
+        parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
+    }
+    for file in manifest.files.iter().filter(|file| file.path.ends_with(".json") && !file.path.contains('/')) {
+        let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
+        let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
+        let resolved = value.get("resolved").and_then(Value::as_object).into_iter().flatten();
+        parts.extend(resolved.map(|(name, value)| (format!("resolved {name}"), value.clone())));
+        if file.path == METRICS_FILE {
+            numbers("mean", &value["mean"], &mut |name, value| {
+                parts.insert(format!("metric {name}"), value.clone());
+            });
+        }
     }
 }
 

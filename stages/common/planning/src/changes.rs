@@ -42,7 +42,8 @@ fn words(value: Option<&Value>) -> String {
     match value {
         None => "absent".to_owned(),
         Some(Value::String(hash)) if hash.len() == 64 && hash.is_ascii() => short(hash).to_owned(),
-        Some(value) => value.to_string(),
+        // A whole number is one, however it was given.
+        Some(value) => value.to_string().trim_end_matches(".0").to_owned(),
     }
 }
 
@@ -55,10 +56,10 @@ mod tests {
     fn every_difference_in_words() {
         let map = |value: Value| value.as_object().cloned().unwrap();
         let before = map(json!({
-            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
+            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null, "parameter scale": 2, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
         }));
         let now = map(json!({
-            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter near": 0.5, "metric mean.psnr": 31, "device": "cpu", "input z": "y"
+            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter near": 0.5, "parameter scale": 4.0, "metric mean.psnr": 31, "device": "cpu", "input z": "y"
         }));
         let found: Vec<String> = changes(&before, &now).iter().map(ToString::to_string).collect();
         let expected = [
@@ -68,6 +69,7 @@ mod tests {
             "metric mean.psnr: 30.25 → 31 (+0.7500)",
             "parameter kernel: \"box\" → \"lanczos\"",
             "parameter near: null → 0.5",
+            "parameter scale: 2 → 4",
         ];
         assert_eq!(found, expected);
     }
