@@ -224,11 +224,52 @@ fn any_file_name_may_lie_in_a_data_folder() {
     project.run(&[&["run", "prep"][..], &from].concat()).fails(3, &["ds/loop", "remove the link"]);
 }
 
+/// All files of the store, by path and size.
+fn files(project: &Project) -> Vec<(String, u64)> {
+    let entries = walkdir::WalkDir::new(project.path(".nerf-sr")).sort_by_file_name().into_iter().flatten();
+    let files = entries.filter(|entry| entry.file_type().is_file());
+    files.map(|file| (file.path().display().to_string(), file.metadata().unwrap().len())).collect()
+}
+
 #[test]
 fn a_store_of_a_newer_form_is_refused() {
     let project = Project::fast();
+    project.ok(&["run", "prep"]);
     project.write(".nerf-sr/format", "99\n");
-    for verb in ["run", "plan", "status", "verify", "gc"] {
-        project.run(&[verb]).fails(1, &[".nerf-sr", "format 99", "use the newer nerf-sr"]);
+    let before = files(&project);
+    let verbs: [&[&str]; 10] = [
+        &["run"],
+        &["plan"],
+        &["why", "prep"],
+        &["status"],
+        &["path", "prep"],
+        &["log", "prep"],
+        &["diff", "prep", "prep"],
+        &["verify"],
+        &["pin", "mine"],
+        &["gc", "--keep-days", "0"],
+    ];
+    for verb in verbs {
+        project.run(verb).fails(1, &[".nerf-sr", "format 99", "use the newer nerf-sr"]);
     }
+    assert_eq!(files(&project), before, "nothing is written");
+}
+
+/// A newer runner takes the store over while this one trains: what this one made is not taken in, and nothing of the store changes.
+#[test]
+fn a_runner_takes_nothing_into_a_store_that_has_become_newer() {
+    let project = Project::fast();
+    let what = ["train-ss", "-p", "train-ss.rays=1000000"];
+    let run = [&["run"][..], &what].concat();
+    let child = project.spawn(&run);
+    wait_until(|| last_checkpoint(&project.path(".nerf-sr/partial")).is_some());
+    project.write(".nerf-sr/format", "2\n");
+    let before = project.store_listing();
+    Finished::of(child.wait_with_output().unwrap()).fails(1, &["train-ss: failed", "format 2", "use the newer nerf-sr"]);
+    assert_eq!(project.store_listing(), before);
+    // The older one again, once it is alone: what it had made is there to go on from.
+    project.write(".nerf-sr/format", "1\n");
+    assert!(project.ok(&[&["status"][..], &what].concat()).contains("has a checkpoint"));
+    project.ok(&run);
+    assert!(project.ok(&["verify"]).contains("0 damaged"));
 }

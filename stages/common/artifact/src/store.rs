@@ -435,7 +435,7 @@ pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), Sto
 }
 
 /// Refuses a store of a newer form; marks one that isn't marked yet.
-fn check_format(root: &Path) -> Result<(), StoreError> {
+pub(crate) fn check_format(root: &Path) -> Result<(), StoreError> {
     let path = root.join("format");
     match fs::read_to_string(&path) {
         Ok(text) => match text.trim().parse::<u32>() {
