@@ -65,12 +65,12 @@ fn plain(line: &str) -> String {
 }
 
 /// Changes the parts of a stage's key as another version would have written them; under its name as a file, the next run finds it no more.
-fn change_key(project: &Project, stage: &str, part: &str, value: Value) {
+fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
     let actions = std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap().map(|entry| entry.unwrap().path());
     for path in actions.filter(|path| path.extension().is_some_and(|end| end == "json")) {
         let mut record: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
         if record["stage"] == stage {
-            record["key_parts"][part] = value.clone();
+            record["key_parts"][part].clone_from(value);
             std::fs::remove_file(&path).unwrap();
             std::fs::write(path.with_file_name(format!("{}.json", "0".repeat(64))), record.to_string()).unwrap();
         }
@@ -120,10 +120,10 @@ fn why_tells_each_difference() {
     assert_eq!(why(&[])[0], "first: will run: its artifact ########## is gone or incomplete");
     project.ok(&["run"]);
     // Records of another version, and of another program under the block's name.
-    change_key(&project, "first", "key version", json!(1));
+    change_key(&project, "first", "key version", &json!(1));
     assert_eq!(why(&[])[0], "first: will run: key version: 1 → 2");
     project.ok(&["run"]);
-    change_key(&project, "first", "stage", json!("blend"));
+    change_key(&project, "first", "stage", &json!("blend"));
     assert_eq!(why(&[])[0], "first: will run: stage: \"blend\" → \"mix\"");
     project.ok(&["run"]);
     // A run of another block with the new program makes it known.
