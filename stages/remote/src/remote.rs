@@ -156,11 +156,11 @@ impl Remote {
         Ok(keys.filter(|key| crate::selection::is_hash(key)).collect())
     }
 
-    /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for writing.
+    /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for writing, as one of an older form.
     pub(crate) async fn check_format(&self, access: Access) -> anyhow::Result<()> {
         let bytes = match self.read("format", FORMAT_LIMIT).await? {
             Some(bytes) => bytes,
-            None if access == Access::Write => return self.write("format", format!("{STORE_FORMAT}\n").into_bytes()).await,
+            None if access == Access::Write => return self.mark().await,
             None => {
                 return Err(
                     Failure::BadInput(format!("{}: nothing was pushed here: there is no file `format`", self.name)).into()
@@ -169,6 +169,7 @@ impl Remote {
         };
         let text = String::from_utf8_lossy(&bytes);
         match text.trim().parse::<u32>() {
+            Ok(found) if found < STORE_FORMAT && access == Access::Write => self.mark().await,
             Ok(found) if found <= STORE_FORMAT => Ok(()),
             _ => Err(Failure::BadInput(format!(
                 "{}: the remote has format {}, this nerf-sr-remote knows format {STORE_FORMAT}; use the newer nerf-sr-remote, or another remote",
@@ -177,5 +178,10 @@ impl Remote {
             ))
             .into()),
         }
+    }
+
+    /// Marks the remote as of this program's format.
+    async fn mark(&self) -> anyhow::Result<()> {
+        self.write("format", format!("{STORE_FORMAT}\n").into_bytes()).await
     }
 }

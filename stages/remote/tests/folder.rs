@@ -168,6 +168,12 @@ fn other_formats_and_places_are_refused_in_one_line() {
         refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
         refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
     }
+    // Whoever writes into one of an older form marks it, so that older programs leave alone what is new there.
+    fs::write(setup.path("remote/format"), "0\n").unwrap();
+    for (words, store, format) in [(["pull", &remote], setup.path("other").as_path(), "0\n"), (["push", &remote], store, "1\n")] {
+        succeed(&mut command(store, &words));
+        assert_eq!(fs::read_to_string(setup.path("remote/format")).unwrap(), format);
+    }
     fs::remove_file(setup.path("remote/format")).unwrap();
     refused(&["pull", &remote], &setup.path("other"), 3, "nothing was pushed here");
     let inside = store.display().to_string();

@@ -43,6 +43,14 @@ pub(crate) fn enter(store: &Store, stop: &AtomicBool, say: &dyn Fn(&str)) -> Res
     until_held(stop, &words, || store.try_enter())
 }
 
+/// Enters the store for a verb that doesn't wait.
+pub(crate) fn enter_at_once(store: &Store) -> anyhow::Result<Entered> {
+    match store.try_enter()? {
+        Locked::Held(entered) => Ok(entered),
+        Locked::By(_) => Err(anyhow::anyhow!("garbage is being collected just now; try again when that is done")),
+    }
+}
+
 /// Who holds a lock, in words.
 pub(crate) fn by(holder: Option<&Holder>) -> String {
     let Some(holder) = holder else { return String::new() };

@@ -1,17 +1,16 @@
 use std::process::ExitCode;
 
-use artifact::{Locked, print_line};
+use artifact::print_line;
 use planning::{PlanError, Request, State};
 
 use crate::session::{Session, command_line};
+use crate::waiting::enter_at_once;
 
 /// Keeps what the targets have, until `unpin`.
 pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Result<ExitCode> {
     check(name)?;
     let plan = session.plan(what)?;
-    let Locked::Held(entered) = session.store.try_enter()? else {
-        return Err(anyhow::anyhow!("garbage is being collected just now; pin again when that is done"));
-    };
+    let entered = enter_at_once(&session.store)?;
     let mut actions = Vec::new();
     for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
         match state {

@@ -5,6 +5,8 @@ use anyhow::Context as _;
 use artifact::{Store, counted, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::waiting::enter_at_once;
+
 /// Reads every artifact again.
 pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
     let (objects, foreign) = list(&store.root().join("objects"))?;
@@ -19,6 +21,8 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
             damaged += 1;
             bar.suspend(|| print_line!("{damage}"));
             if remove {
+                // What is damage to this program may be whole to a newer one, which has the store by now.
+                let _entered = enter_at_once(store)?;
                 store.remove_object(object)?;
                 bar.suspend(|| print_line!("  removed; the next run makes it again"));
             }
