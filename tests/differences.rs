@@ -80,7 +80,11 @@ fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
 #[test]
 fn why_tells_each_difference() {
     let project = project();
-    // A program that no run has started isn't asked; a run of one stage tells nothing of the other.
+    // Another block makes the program known.
+    project.write("pipeline.yaml", &format!("{PIPELINE}  other: {{run: ./mix}}\n"));
+    project.ok(&["run", "other", "--store", "empty"]);
+    assert_eq!(said(&project, &["why", "first", "--store", "empty"])[0], "first: will run: it never ran before");
+    project.write("pipeline.yaml", PIPELINE);
     project.ok(&["run", "first"]);
     assert_eq!(said(&project, &["why", "second"]), ["second: will run: it never ran before", "    by scene: steps"]);
     project.ok(&["run"]);

@@ -121,8 +121,8 @@ impl Cluster {
             let cluster = Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
             let mut script = cluster.script("start");
             script.env("MINI_SLURM_PORT", free_ports().to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
-            // The daemons would hold a pipe open.
-            script.stdout(Stdio::null()).status().unwrap().success().then_some(cluster)
+            // The daemons would hold a pipe open, and write into the lines of tests.
+            script.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success().then_some(cluster)
         };
         let cluster = (0..3).find_map(|_| start());
         assert!(cluster.is_some(), "the cluster doesn't start");

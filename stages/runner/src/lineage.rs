@@ -78,7 +78,7 @@ impl Lineage {
         let manifest = store.manifest(&record.output).ok();
         parts.insert("artifact".to_owned(), Value::from(if manifest.is_some() { "kept" } else { "gone" }));
         if let Some(manifest) = manifest.filter(|_| depth == Depth::Content) {
-            add_content(&mut parts, &manifest, &store.object(&record.output));
+            add_content(&mut parts, record, &manifest, &store.object(&record.output));
         }
         parts
     }
@@ -108,15 +108,18 @@ impl Depth {
 }
 
 /// Adds an artifact's files by their hashes; of JSON files the numbers that count.
-fn add_content(parts: &mut Map<String, Value>, manifest: &Manifest, folder: &Path) {
+fn add_content(parts: &mut Map<String, Value>, record: &Record, manifest: &Manifest, folder: &Path) {
     for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
         parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
     }
     for file in manifest.files.iter().filter(|file| file.path.ends_with(".json") && !file.path.contains('/')) {
         let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
         let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
+        // Which file has the values in use isn't recorded: what names no parameter is something else.
         let resolved = value.get("resolved").and_then(Value::as_object).into_iter().flatten();
-        parts.extend(resolved.map(|(name, value)| (format!("resolved {name}"), value.clone())));
+        for (name, value) in resolved.filter(|(name, _)| record.key_parts.contains_key(&format!("parameter {name}"))) {
+            parts.insert(format!("resolved {name}"), value.clone());
+        }
         if file.path == METRICS_FILE {
             numbers("mean", &value["mean"], &mut |name, value| {
                 parts.insert(format!("metric {name}"), value.clone());

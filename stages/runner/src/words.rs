@@ -24,22 +24,24 @@ pub(crate) fn causes(states: &[State], index: usize) -> Vec<usize> {
 }
 
 /// A node's state in words; with records, why it will run.
-pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State, records: &[Record]) -> String {
+pub(crate) fn words(session: &Session, plan: &Plan, index: usize, state: &State, records: Option<&[Record]>) -> String {
     match state {
         State::Cached(record) => format!("cached ({}, made in {})", age(record), seconds(record.seconds)),
         State::Waits { on } => {
             let names: Vec<String> = on.iter().map(|&p| plan.nodes[p].label()).collect();
             format!("waits for {}; if that comes out as before, it stays cached", names.join(", "))
         }
-        State::WillRun { .. } if records.is_empty() => "will run".to_owned(),
-        State::WillRun { key_parts } => match planning::explain(key_parts, &plan.nodes[index].stage, records) {
-            None => "will run: it never ran before".to_owned(),
-            Some(changes) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
-                Some(record) => format!("will run: its artifact {} is gone or incomplete", short(&record.output)),
+        State::WillRun { key_parts } => {
+            match records.map(|records| planning::explain(key_parts, &plan.nodes[index].stage, records)) {
                 None => "will run".to_owned(),
-            },
-            Some(changes) => format!("will run: {}", changes.join("; ")),
-        },
+                Some(None) => "will run: it never ran before".to_owned(),
+                Some(Some(changes)) if changes.is_empty() => match session.store.record(&hash_json(key_parts)) {
+                    Some(record) => format!("will run: its artifact {} is gone or incomplete", short(&record.output)),
+                    None => "will run".to_owned(),
+                },
+                Some(Some(changes)) => format!("will run: {}", changes.join("; ")),
+            }
+        }
     }
 }
 

@@ -395,17 +395,29 @@ impl Store {
         Ok(record)
     }
 
-    /// Moves a checked folder to an object's place, unless a whole object `is_there`.
+    /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions may make one object at once: it is moved
+    /// where there is nothing, and what is there then stays if it is whole.
     pub(crate) fn place(&self, folder: &Path, identity: &str, is_there: bool) -> Result<(), StoreError> {
+        use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty, NotADirectory};
         let object = self.object(identity);
         if is_there && object.exists() {
             return Ok(());
         }
-        if object.symlink_metadata().is_ok() {
-            self.discard(&object)?;
+        loop {
+            match fs::rename(folder, &object) {
+                Ok(()) => return at(&object, sync_folder(&self.root.join("objects"))),
+                Err(error) if matches!(error.kind(), AlreadyExists | DirectoryNotEmpty | NotADirectory) => {}
+                Err(source) => return Err(StoreError::Io { path: object, source }),
+            }
+            if self.verify(identity).is_ok() {
+                return Ok(());
+            }
+            match self.discard(&object) {
+                // The other action was faster.
+                Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
+                result => result?,
+            }
         }
-        at(&object, fs::rename(folder, &object))?;
-        at(&object, sync_folder(&self.root.join("objects")))
     }
 
     pub(crate) fn write_record(&self, record: &Record) -> Result<(), StoreError> {
@@ -618,6 +630,24 @@ mod tests {
         assert_eq!(newer.hit(&made.key()), Some(made));
         Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
+    }
+
+    /// Actions with different keys mend one damaged object at once, again and again.
+    #[test]
+    fn actions_at_once_make_one_object() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let output = make(&store, "a", "1234").output;
+        for round in 0..200 {
+            fs::write(store.object(&output).join("x"), "4321").unwrap();
+            std::thread::scope(|scope| {
+                for action in 0..3 {
+                    let store = &store;
+                    scope.spawn(move || assert_eq!(make(store, &format!("{round} {action}"), "1234").output.len(), 64));
+                }
+            });
+            store.verify(&output).unwrap();
+        }
     }
 
     /// Who is inside when a newer program comes is waited for. Of several newer ones the newest has the store.

@@ -15,7 +15,7 @@ pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Res
         return super::print_json(&PlanReport::new(session, &plan, &states, &[]));
     }
     for (i, state) in states.iter().enumerate() {
-        print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, &[]));
+        print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, None));
         by_scene(session, &plan.nodes[i], state).iter().for_each(|line| print_line!("    {line}"));
     }
     for sink in &plan.sinks {

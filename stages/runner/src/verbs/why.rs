@@ -16,7 +16,7 @@ pub(crate) fn why(session: &Session, stage: &str, what: &Request, json: bool) ->
         return super::print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
     }
     let say = |index: usize, indent: &str| {
-        print_line!("{indent}{}: {}", plan.nodes[index].label(), words(session, &plan, index, &states[index], &records));
+        print_line!("{indent}{}: {}", plan.nodes[index].label(), words(session, &plan, index, &states[index], Some(&records)));
     };
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", shown(&plan, sink, &states));
