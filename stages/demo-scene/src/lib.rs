@@ -1,4 +1,5 @@
-//! `demo-scene`: a small procedural scene, rendered in linear light and written as a Blender-format dataset with exact depth.
+//! `demo-scene`: a small procedural scene, rendered in linear light and written as a data set: in Blender's form with exact depth, or as
+//! photographs are, in JPEG with a `transforms.json`.
 //!
 //! It is made to tell methods apart: fine texture (base, crate, sign), thin parts (cage, spring), gloss (ball, copper),
 //! occlusion (a striped ball inside the cage). Everything is arithmetic and `libm`, so equal parameters give equal bytes.
@@ -6,22 +7,22 @@
 //! * `world`: shapes, where they stand, how they intersect a ray.
 //! * `material`: albedo and gloss of a point.
 //! * `render`: light, shadow, reflection, anti-aliasing.
+//! * `written`: files of both forms.
 
 mod material;
 mod render;
 mod world;
+mod written;
 
-use anyhow::Context as _;
 use artifact::{Context, Output, Stage};
 use glam::{DMat3, DVec3};
-use pixels::{Channel, PixelError, SampleType, write_exr, write_png};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use serde_json::json;
 
 pub use render::RenderedImage;
 pub use world::World;
+use written::Written;
 
 /// Horizontal angle of view, as in NeRF's Blender scenes.
 const CAMERA_ANGLE_X: f64 = 0.691_111_2;
@@ -32,13 +33,16 @@ const DISTANCE: f64 = 4.0;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Side of the square images, in pixels.
+    /// Width of the images, in pixels.
     #[schemars(range(min = 1, max = 2048))]
     pub size: u32,
+    /// Width over height.
+    #[schemars(range(min = 0.25, max = 4.0))]
+    pub aspect: f64,
     /// Number of training views.
     #[schemars(range(min = 1, max = 1000))]
     pub train: u32,
-    /// Number of test views, which have depth.
+    /// Number of test views, which have depth in Blender's form.
     #[schemars(range(min = 1, max = 1000))]
     pub test: u32,
     /// Rays along each side of a pixel, against aliasing.
@@ -48,13 +52,33 @@ pub struct Params {
     pub layout: Layout,
     /// Adds an unbounded background: ground, towers far away, a sky.
     pub backdrop: bool,
+    /// Files that are written.
+    pub form: Form,
     /// Seed of the objects' places and textures.
     pub seed: u32,
 }
 
+/// Files of a data set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Form {
+    /// NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and `transforms_test.json`, depth of test views.
+    Blender,
+    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no depth.
+    Transforms,
+}
+
+impl Params {
+    /// Width and height of the images.
+    fn sides(&self) -> [u32; 2] {
+        [self.size, ((f64::from(self.size) / self.aspect).round() as u32).max(1)]
+    }
+}
+
 impl Default for Params {
     fn default() -> Self {
-        Self { size: 200, train: 80, test: 10, samples_per_axis: 4, layout: Layout::Around, backdrop: false, seed: 0 }
+        let (layout, form) = (Layout::Around, Form::Blender);
+        Self { size: 200, aspect: 1.0, train: 80, test: 10, samples_per_axis: 4, layout, backdrop: false, form, seed: 0 }
     }
 }
 
@@ -74,7 +98,7 @@ pub struct DemoScene;
 impl Stage for DemoScene {
     type Params = Params;
     const NAME: &'static str = "demo-scene";
-    const SUMMARY: &'static str = "Renders a small procedural scene as a Blender-format dataset with exact depth.";
+    const SUMMARY: &'static str = "Renders a small procedural scene as a data set, with exact depth in Blender's form.";
 
     fn output() -> Output {
         Output::kind("dataset")
@@ -85,63 +109,31 @@ impl Stage for DemoScene {
         let world = if params.backdrop { world.with_backdrop() } else { world };
         let total = u64::from(params.train + params.test);
         let progress = context.progress("rendering", total);
+        let mut written = Written::new(params.form, params.sides());
         for (split, count) in [("train", params.train), ("test", params.test)] {
             let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.layout, split, i, count)).collect();
-            context.output_path(&format!("{split}/."))?;
+            context.output_path(&format!("{}/.", params.form.folder(split)))?;
             (0..count)
                 .into_par_iter()
                 .map(|i| {
                     context.check_interrupt()?;
-                    let frame = render::render(&world, &poses[i as usize], CAMERA_ANGLE_X, params.size, params.samples_per_axis);
-                    write_png(&context.output_path(&format!("{split}/r_{i}.png"))?, &frame.colour)?;
-                    if split == "test" {
-                        write_depth(&context.output_path(&format!("test/r_{i}_depth.exr"))?, &frame)?;
-                    }
+                    let pose = &poses[i as usize];
+                    let frame = render::render(&world, pose, CAMERA_ANGLE_X, params.sides(), params.samples_per_axis);
+                    params.form.write_view(context, split, i, &frame)?;
                     progress.add(1);
                     Ok(())
                 })
                 .collect::<anyhow::Result<Vec<()>>>()?;
-            let frames: Vec<_> = poses
-                .iter()
-                .enumerate()
-                .map(|(i, pose)| {
-                    let mut frame = json!({"file_path": format!("./{split}/r_{i}"), "transform_matrix": pose});
-                    if split == "test" {
-                        frame["depth_file_path"] = json!(format!("./test/r_{i}_depth.exr"));
-                    }
-                    frame
-                })
-                .collect();
-            context
-                .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}))
-                .context("cannot write the cameras")?;
+            written.add(context, split, &poses)?;
         }
+        written.end(context)?;
+        let [width, height] = params.sides();
         context.write_summary(&format!(
-            "{}, {}, {size}×{size}",
+            "{}, {}, {width}×{height}",
             artifact::counted(params.train as usize, "training view"),
             artifact::counted(params.test as usize, "test view"),
-            size = params.size
         ))
     }
-}
-
-/// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
-fn write_depth(path: &std::path::Path, frame: &RenderedImage) -> Result<(), PixelError> {
-    let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
-    let size = frame.colour.width;
-    write_exr(
-        path,
-        (size, size),
-        &channels,
-        "Z: camera-space z-depth in scene units; A: 0 where nothing is seen",
-        |first, rows, samples| {
-            let band = &frame.depth[first * size..(first + rows) * size];
-            for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
-                sample.copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
-            }
-            Ok(())
-        },
-    )
 }
 
 /// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test views on a wavy circle between them.
@@ -183,7 +175,7 @@ mod tests {
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
         let pose = pose(Layout::Around, "test", 3, 10);
-        let frame = render::render(&world, &pose, CAMERA_ANGLE_X, 64, 2);
+        let frame = render::render(&world, &pose, CAMERA_ANGLE_X, [64, 64], 2);
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
         assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
@@ -197,7 +189,7 @@ mod tests {
         // What a test view sees must be inside the training views' frusta, or near/far and hull would be guesses.
         let world = World::new(0);
         for i in 0..10 {
-            let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), CAMERA_ANGLE_X, 48, 1);
+            let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), CAMERA_ANGLE_X, [48, 48], 1);
             for k in 0..48 {
                 for (x, y) in [(k, 0), (k, 47), (0, k), (47, k)] {
                     assert_eq!(frame.colour.data[(y * 48 + x) * 4 + 3], 0, "view {i} is cut off at ({x}, {y})");
@@ -208,7 +200,7 @@ mod tests {
 
     #[test]
     fn seeds_differ() {
-        let view = |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE_X, 32, 1).colour;
+        let view = |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE_X, [32, 32], 1).colour;
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
     }

@@ -15,17 +15,23 @@ pub struct RenderedImage {
 /// Where the sun stands.
 const SUN: DVec3 = DVec3::new(0.48, 0.36, 0.8);
 
-/// Renders one view with `samples`² rays a pixel, averaged in linear light over the pixel's square.
-pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u32, samples: u32) -> RenderedImage {
-    let focal = 0.5 * f64::from(size) / libm::tan(0.5 * angle_x);
-    let half = 0.5 * f64::from(size);
+/// Renders one view of `width`×`height` pixels with `samples`² rays a pixel, averaged in linear light over the pixel's square.
+pub(crate) fn render(
+    world: &World,
+    pose: &[[f64; 4]; 4],
+    angle_x: f64,
+    [width, height]: [u32; 2],
+    samples: u32,
+) -> RenderedImage {
+    let [half_x, half_y] = [width, height].map(|side| 0.5 * f64::from(side));
+    let focal = half_x / libm::tan(0.5 * angle_x);
     let column = |c: usize| DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
     let (right, up, back, centre) = (column(0), column(1), column(2), column(3));
-    let direction = |x: f64, y: f64| (((x - half) / focal) * right - ((y - half) / focal) * up - back).normalize();
-    let mut colour = Vec::with_capacity((size * size * 4) as usize);
-    let mut depth = Vec::with_capacity((size * size) as usize);
-    for j in 0..size {
-        for i in 0..size {
+    let direction = |x: f64, y: f64| (((x - half_x) / focal) * right - ((y - half_y) / focal) * up - back).normalize();
+    let mut colour = Vec::with_capacity((width * height * 4) as usize);
+    let mut depth = Vec::with_capacity((width * height) as usize);
+    for j in 0..height {
+        for i in 0..width {
             let mut light = DVec3::ZERO;
             let mut hits = 0u32;
             for b in 0..samples {
@@ -46,7 +52,7 @@ pub(crate) fn render(world: &World, pose: &[[f64; 4]; 4], angle_x: f64, size: u3
             depth.push(world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32));
         }
     }
-    RenderedImage { colour: Rgba8::new(size as usize, size as usize, colour), depth }
+    RenderedImage { colour: Rgba8::new(width as usize, height as usize, colour), depth }
 }
 
 /// Light from the first surface along a ray, or from the sky; `None` where there is neither.

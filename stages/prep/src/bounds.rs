@@ -34,13 +34,21 @@ const BEYOND: f64 = 2.5;
 /// A posed view, and between which depths it sees anything, where that is known.
 pub type SeenDepths = (Camera, Option<[f64; 2]>);
 
-/// Where the scene is, and the space that suits it: NDC where all cameras look one way and the depths they see are known, the
-/// contraction where something is known to lie far outside the box, else the box. A `kind` that is given is taken. The box is that of
-/// the training views; `others` are cameras that will look, too.
-pub fn place(training: &[SeenDepths], others: &[SeenDepths], kind: Option<SpaceKind>) -> Result<Bounds, SpaceError> {
+/// Where the scene is, and the space that suits it. It is NDC where all cameras look one way and the depths they see are known, the
+/// contraction where something is known to lie far outside the box, else the box. Where images say that the scene goes on behind what is looked
+/// at (`goes_on`), a box holds it never: depths that aren't known are guessed where cameras look one way, and elsewhere it is the
+/// contraction. A `kind` that is given is taken. The box is that of the training views; `others` are cameras that will look, too.
+pub fn place(
+    training: &[SeenDepths],
+    others: &[SeenDepths],
+    goes_on: bool,
+    kind: Option<SpaceKind>,
+) -> Result<Bounds, SpaceError> {
     let boxed = bounds_of(training);
+    let guessed = if goes_on { guessed_depths(training) } else { None };
     let ndc = || -> Result<Bounds, SpaceError> {
-        let all = [training, others].concat();
+        let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
+        let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
         let space = Space::Ndc(frustum(&all)?);
         Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
     };
@@ -50,10 +58,26 @@ pub fn place(training: &[SeenDepths], others: &[SeenDepths], kind: Option<SpaceK
         Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
         None => Ok(match ndc() {
             Ok(bounds) => bounds,
-            Err(_) if reaches_beyond(&boxed, training) => contracted(boxed, training),
+            Err(_) if goes_on || reaches_beyond(&boxed, training) => contracted(boxed, training),
             Err(_) => boxed,
         }),
     }
+}
+
+/// Share of the distance to what cameras look at before which nothing is taken to lie, and how many times as far they see.
+const GUESSED: [f64; 2] = [0.25, 50.0];
+
+/// Depths that cameras which look one way may see, by the cameras alone: around the point that they look at, or where their axes are parallel,
+/// around a place four times as far away as they stand apart. Too near a guess costs detail and loses nothing. `None` where they look every
+/// way, or stand in one place.
+fn guessed_depths(sights: &[SeenDepths]) -> Option<[f64; 2]> {
+    let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
+    let forward = common_direction(cameras.iter().copied())?;
+    let mean = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
+    let apart = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
+    let focus = crossing(&cameras, PARALLEL).map(|point| (point - mean).dot(forward)).filter(|distance| *distance > apart);
+    let distance = focus.unwrap_or(4.0 * apart);
+    (distance > 0.0).then(|| GUESSED.map(|factor| factor * distance))
 }
 
 /// What all cameras see, from the middle of them: the frustum of NDC.
@@ -98,13 +122,20 @@ fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
     2 * sights.iter().filter(|s| far(s)).count() > sights.len()
 }
 
-/// The same box with all around it: from where the nearest view sees something to far beyond the farthest.
+/// The same box with all around it: from where the nearest view sees something to far beyond the farthest. Where cameras look outwards, away
+/// from the box's middle, it reaches twice as far as they stand: to what is near them.
 fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
-    let radius = 0.5 * boxed.longest_side();
+    let centre = 0.5 * (DVec3::from(boxed.min) + DVec3::from(boxed.max));
+    let outwards = |(camera, _): &&SeenDepths| camera.forward().dot(camera.centre() - centre) > 0.0;
+    let looks_out = 2 * sights.iter().filter(outwards).count() > sights.len();
+    let stands = sights.iter().map(|(camera, _)| (camera.centre() - centre).length()).fold(0.0, f64::max);
+    let radius = (0.5 * boxed.longest_side()).max(if looks_out { 2.0 * stands } else { 0.0 });
+    let half = if looks_out { DVec3::splat(radius) } else { 0.5 * (DVec3::from(boxed.max) - DVec3::from(boxed.min)) };
     let known = |pick: &dyn Fn([f64; 2]) -> f64| sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>();
     let near = known(&|d| 0.5 * d[0]).into_iter().fold(0.05 * radius, f64::min);
     let far = known(&|d| 10.0 * d[1]).into_iter().fold(100.0 * radius, f64::max);
-    Bounds { near, far, space: Space::Contraction, ..boxed }
+    let (min, max) = if looks_out { ((centre - half).to_array(), (centre + half).to_array()) } else { (boxed.min, boxed.max) };
+    Bounds { min, max, near, far, space: Space::Contraction }
 }
 
 /// The border of what a camera sees between two depths.
@@ -121,19 +152,9 @@ fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_
 /// that is known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender scenes' habit.
 fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
-    let mut normal = DMat3::ZERO;
-    let mut right = DVec3::ZERO;
-    for camera in &cameras {
-        let d = camera.forward();
-        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        normal += across;
-        right += across * camera.centre();
-    }
     let count = cameras.len().max(1) as f64;
-    let crossing = normal * (1.0 / count);
-    // The determinant is 0 for parallel axes and 8/27 for axes from all sides.
-    let centre = if crossing.determinant() > 1e-3 {
-        normal.inverse() * right
+    let centre = if let Some(crossing) = crossing(&cameras, 1e-3) {
+        crossing
     } else if let Some(bounds) = around_frusta(sights) {
         return bounds;
     } else {
@@ -155,6 +176,23 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
         space: Space::Box,
     };
     with_range(box_only, cameras)
+}
+
+/// The determinant of axes that say nothing of where they cross.
+const PARALLEL: f64 = 1e-9;
+
+/// The point nearest to all optical axes, where they cross well enough: the determinant is 0 for parallel axes and 8/27 for axes from all
+/// sides.
+fn crossing(cameras: &[&Camera], least: f64) -> Option<DVec3> {
+    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for camera in cameras {
+        let d = camera.forward();
+        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        normal += across;
+        right += across * camera.centre();
+    }
+    let mean = normal * (1.0 / cameras.len().max(1) as f64);
+    (mean.determinant() > least).then(|| normal.inverse() * right)
 }
 
 /// A box around what each camera sees between its depths, a tenth more to either side. `None` where a camera has none.
@@ -271,6 +309,7 @@ mod tests {
             let bounds = place(
                 &sights(&row[1..], Some([2.0 * scale, 10.0 * scale])),
                 &sights(&row[..1], Some([2.0 * scale, 9.0 * scale])),
+                false,
                 None,
             );
             let bounds = bounds.unwrap();
@@ -288,7 +327,7 @@ mod tests {
     #[test]
     fn the_space_is_what_the_cameras_see() {
         let ring = circle(DVec3::ZERO, 4.0);
-        let chosen = |depths, kind| place(&sights(&ring, depths), &[], kind).map(|b| b.space);
+        let chosen = |depths, kind| place(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
         assert_eq!(chosen(None, None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 5.0]), None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 40.0]), None), Ok(Space::Contraction));
@@ -296,7 +335,39 @@ mod tests {
         assert_eq!(chosen(None, Some(SpaceKind::Contraction)), Ok(Space::Contraction));
         assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
         let one = [looking_at(DVec3::Y, DVec3::ZERO)];
-        assert_eq!(place(&sights(&one, None), &[], Some(SpaceKind::Ndc)), Err(SpaceError::NoDepths));
-        assert_eq!(place(&sights(&one, None), &[], None).map(|b| b.space), Ok(Space::Box));
+        assert_eq!(place(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::NoDepths));
+        assert_eq!(place(&sights(&one, None), &[], false, None).map(|b| b.space), Ok(Space::Box));
+    }
+
+    /// Without any depth: where images say that the scene goes on, cameras say how.
+    #[test]
+    fn a_scene_that_goes_on_is_in_no_box() {
+        for scale in [1e-3, 1.0, 1e3] {
+            let ring = circle(DVec3::ZERO, 4.0 * scale);
+            let around = place(&sights(&ring, None), &[], true, None).unwrap();
+            assert_eq!(around.space, Space::Contraction);
+            let half = 0.5 * around.longest_side() / scale;
+            assert!((1.4..1.7).contains(&half) && around.far > 100.0 * scale && around.near < 0.1 * scale, "{around:?}");
+            // From within: a room.
+            let outwards: Vec<Camera> = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
+            let room = place(&sights(&outwards, None), &[], true, None).unwrap();
+            assert_eq!(room.space, Space::Contraction);
+            assert!((7.9..8.5).contains(&(0.5 * room.longest_side() / scale)), "{room:?}");
+            // Forward: parallel axes, and axes that meet at a distance of 6.
+            let parallel = |i: u32| {
+                looking_at(scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.0), scale * DVec3::new(0.2 * f64::from(i), 9.0, 0.0))
+            };
+            let meeting =
+                |i: u32| looking_at(scale * DVec3::new(0.2 * f64::from(i) - 0.4, 0.0, 0.0), scale * DVec3::new(0.0, 6.0, 0.0));
+            let forward: [(Vec<Camera>, f64); 2] = [((0..5).map(parallel).collect(), 3.2), ((0..5).map(meeting).collect(), 6.0)];
+            for (cameras, distance) in forward {
+                let seen = place(&sights(&cameras, None), &sights(&cameras[1..2], None), true, None).unwrap();
+                let Space::Ndc(frustum) = seen.space else { panic!("{seen:?}") };
+                assert!(frustum.near < 0.3 * distance * scale && frustum.near > 0.1 * distance * scale, "{frustum:?}");
+                assert!(frustum.far > 40.0 * distance * scale && seen.is_valid(), "{frustum:?}");
+            }
+            // One camera says nothing of how far anything is.
+            assert_eq!(place(&sights(&ring[..1], None), &[], true, None).unwrap().space, Space::Contraction);
+        }
     }
 }

@@ -11,6 +11,7 @@
 //! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `train-cameras/` and `cameras/` (the training
 //! and the test cameras at HR size, no images), `truth/` (HR test images, depth), `references/` (HR training images).
 
+mod borders;
 mod bounds;
 mod degrade;
 mod hull;
@@ -30,6 +31,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
+use borders::{Behind, Borders};
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
 pub use degrade::{LrImage, degrade};
 pub use hull::{GRID, carve};
@@ -59,7 +61,8 @@ pub struct Params {
     /// Treatment of lens distortion, where the data set states it.
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
-    /// What lies behind the scene. Default: `opaque` in NDC and in contraction where images have no alpha, else `white`.
+    /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white` or `black` where the borders of nine in ten
+    /// views are that colour, else `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
     /// Distance along rays before which nothing lies. Default: from the cameras.
@@ -68,8 +71,8 @@ pub struct Params {
     /// Distance along rays behind which nothing lies. Default: from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way and the nearest depth is known, `contraction`
-    /// where points are known far outside the space that the cameras look at, else `box`.
+    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way and the nearest depth is known or the background
+    /// is `opaque`, `contraction` where else it is `opaque` or points are known far outside the space that the cameras look at, else `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
     /// `alpha` carves a visual hull from the LR images' alpha. Training is faster, with information that the paper's method doesn't use.
@@ -278,14 +281,12 @@ fn pose_warnings(set: &Dataset, split: &Split) -> anyhow::Result<Vec<String>> {
     Ok(pose_warnings::warnings(&training, &test).into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 
-/// What lies behind a scene: nothing, where the space holds all that is seen and one of the images is opaque.
-fn background_of(space: &Space, frame: &Frame) -> anyhow::Result<Background> {
-    if *space == Space::Box {
-        return Ok(Background::White);
-    }
-    let image = frame.photograph().bad_input(frame_name(frame))?;
-    let is_opaque = image.data.chunks_exact(4).all(|p| p[3] == 255);
-    Ok(if is_opaque { Background::Opaque } else { Background::White })
+/// Looks at the borders of training views, spread evenly.
+fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
+    let count = frames.len().min(borders::LOOKED_AT);
+    let chosen = (0..count).into_par_iter().map(|i| frames[i * frames.len() / count]);
+    let images = chosen.map(|frame| frame.photograph().bad_input(frame_name(frame)));
+    Ok(Borders::of(&images.collect::<anyhow::Result<Vec<Rgba8>>>()?))
 }
 
 /// Which frames are for what.
@@ -392,14 +393,14 @@ impl Job<'_> {
             cameras.iter().cloned().zip(frames.iter().map(|f| f.depths.or(given))).collect()
         };
         let (training, others) = (sights(&train_cameras, train), sights(&test_cameras, test));
-        let mut bounds = place(&training, &others, self.params.space).map_err(|e| Failure::Usage(e.to_string()))?;
+        let borders = borders(train)?;
+        let background = self.params.background.unwrap_or(borders.background());
+        let goes_on = background == Background::Opaque;
+        let placed = place(&training, &others, goes_on, self.params.space);
+        let mut bounds = placed.map_err(|e| Failure::Usage(e.to_string()))?;
         if self.params.hull == HullSource::Alpha && bounds.space != Space::Box {
             return Err(Failure::Usage("parameter hull: alpha carves a box; choose space: box, too".to_owned()).into());
         }
-        let background = match self.params.background {
-            Some(background) => background,
-            None => background_of(&bounds.space, train[0])?,
-        };
         for (name, given, bound) in [("near", self.params.near, &mut bounds.near), ("far", self.params.far, &mut bounds.far)] {
             if let Some(value) = given {
                 if !value.is_finite() {
@@ -415,8 +416,11 @@ impl Job<'_> {
             let message = format!("parameter near: {} is not before far = {}", bounds.near, bounds.far);
             return Err(Failure::Usage(message).into());
         }
-        notes.push(space_note(&bounds, background));
-        self.context.say(space_note(&bounds, background));
+        let signs = (borders.behind != Behind::Transparent).then(|| borders.to_string());
+        for note in signs.into_iter().chain([space_note(&bounds, background)]) {
+            self.context.say(&note);
+            notes.push(note);
+        }
 
         let count = if self.making.has_truth { self.params.hr_references as usize } else { 0 };
         let references = references::choose(train_cameras.iter().map(Camera::centre), count);

@@ -1,0 +1,128 @@
+//! Files of a data set, in both forms.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::Context;
+use image::codecs::jpeg::JpegEncoder;
+use image::{ExtendedColorType, ImageEncoder as _};
+use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr, write_png};
+use serde_json::{Value, json};
+
+use crate::render::RenderedImage;
+use crate::{CAMERA_ANGLE_X, Form};
+
+/// JPEG's quality: that of a careful camera.
+const QUALITY: u8 = 95;
+
+impl Form {
+    /// Where a split's images lie.
+    pub(crate) fn folder(self, split: &str) -> &str {
+        match self {
+            Self::Blender => split,
+            Self::Transforms => "images",
+        }
+    }
+
+    /// Writes a view's files.
+    pub(crate) fn write_view(self, context: &Context, split: &str, number: u32, frame: &RenderedImage) -> anyhow::Result<()> {
+        if self == Self::Transforms {
+            let path = context.output_path(&photograph(split, number))?;
+            return write_jpeg(&path, &frame.colour).with_context(|| format!("cannot write {}", path.display()));
+        }
+        write_png(&context.output_path(&format!("{split}/r_{number}.png"))?, &frame.colour)?;
+        if split == "test" {
+            write_depth(&context.output_path(&format!("test/r_{number}_depth.exr"))?, frame)?;
+        }
+        Ok(())
+    }
+}
+
+/// Name of a photograph.
+fn photograph(split: &str, number: u32) -> String {
+    format!("images/{split}_{number}.jpg")
+}
+
+/// The files with cameras.
+pub(crate) struct Written {
+    form: Form,
+    sides: [u32; 2],
+    /// Frames of `transforms.json`, and which of them are for what.
+    frames: Vec<Value>,
+    splits: Vec<(String, Vec<String>)>,
+}
+
+impl Written {
+    pub(crate) fn new(form: Form, sides: [u32; 2]) -> Self {
+        Self { form, sides, frames: Vec::new(), splits: Vec::new() }
+    }
+
+    /// Takes in a split's cameras.
+    pub(crate) fn add(&mut self, context: &Context, split: &str, poses: &[[[f64; 4]; 4]]) -> anyhow::Result<()> {
+        if self.form == Form::Transforms {
+            let names: Vec<String> = (0..poses.len() as u32).map(|number| photograph(split, number)).collect();
+            let frames = names.iter().zip(poses).map(|(name, pose)| json!({"file_path": name, "transform_matrix": pose}));
+            self.frames.extend(frames);
+            self.splits.push((format!("{split}_filenames"), names));
+            return Ok(());
+        }
+        let frame = |(number, pose): (usize, &[[f64; 4]; 4])| {
+            let mut frame = json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
+            if split == "test" {
+                frame["depth_file_path"] = json!(format!("./test/r_{number}_depth.exr"));
+            }
+            frame
+        };
+        let frames: Vec<Value> = poses.iter().enumerate().map(frame).collect();
+        context
+            .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}))
+            .context("cannot write the cameras")
+    }
+
+    /// Writes what is about all of them.
+    pub(crate) fn end(self, context: &Context) -> anyhow::Result<()> {
+        if self.form == Form::Blender {
+            return Ok(());
+        }
+        let [width, height] = self.sides;
+        let focal = 0.5 * f64::from(width) / libm::tan(0.5 * CAMERA_ANGLE_X);
+        let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
+        let mut file = json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "frames": self.frames});
+        for (key, names) in self.splits {
+            file[key] = json!(names);
+        }
+        context.write_json("transforms.json", &file).context("cannot write the cameras")
+    }
+}
+
+/// Writes an image over white.
+fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
+    let over_white = |p: &[u8]| -> [u8; 3] {
+        let alpha = u32::from(p[3]);
+        std::array::from_fn(|c| ((u32::from(p[c]) * alpha + 255 * (255 - alpha) + 127) / 255) as u8)
+    };
+    let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(over_white).collect();
+    let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), QUALITY);
+    Ok(encoder.write_image(&rgb, image.width as u32, image.height as u32, ExtendedColorType::Rgb8)?)
+}
+
+/// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
+fn write_depth(path: &std::path::Path, frame: &RenderedImage) -> Result<(), PixelError> {
+    let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+    let (width, height) = (frame.colour.width, frame.colour.height);
+    write_exr(
+        path,
+        (width, height),
+        &channels,
+        "Z: camera-space z-depth in scene units; A: 0 where nothing is seen",
+        |first, rows, samples| {
+            let band = &frame.depth[first * width..(first + rows) * width];
+            for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
+                sample.copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
+            }
+            Ok(())
+        },
+    )
+}

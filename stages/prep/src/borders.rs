@@ -1,0 +1,150 @@
+//! What lies behind a scene, by the borders of its images.
+
+use std::fmt::{self, Display, Formatter};
+
+use pixels::Rgba8;
+use scene::Background;
+
+/// Views that are looked at, spread evenly: enough to tell nine of ten.
+pub(crate) const LOOKED_AT: usize = 20;
+/// Levels by which a flat colour may vary: JPEG's noise beside nothing else. A clear sky varies by more from corner to corner.
+const NOISE: u8 = 8;
+
+/// What lies behind a scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Behind {
+    /// Images have alpha.
+    Transparent,
+    /// Borders are one flat colour.
+    Flat([u8; 3]),
+    /// More of the scene.
+    Scene,
+}
+
+/// What the borders of some images show.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Borders {
+    pub(crate) behind: Behind,
+    /// Views whose borders are the flat colour, and views looked at.
+    flat: usize,
+    views: usize,
+}
+
+impl Borders {
+    /// Looks at images. One with alpha makes all transparent. A flat colour must be that of nine in ten views.
+    pub(crate) fn of(images: &[Rgba8]) -> Self {
+        if images.iter().any(|image| image.data.chunks_exact(4).any(|p| p[3] != u8::MAX)) {
+            return Self { behind: Behind::Transparent, flat: 0, views: images.len() };
+        }
+        let colours: Vec<Option<[u8; 3]>> = images.iter().map(flat_border).collect();
+        let known: Vec<[u8; 3]> = colours.iter().flatten().copied().collect();
+        let common = median(&known);
+        let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
+        let behind = if !images.is_empty() && 10 * flat >= 9 * images.len() { Behind::Flat(common) } else { Behind::Scene };
+        Self { behind, flat, views: images.len() }
+    }
+
+    /// What rays see behind everything. A flat colour that is neither white nor black counts as a wall, a part of the scene.
+    pub(crate) fn background(&self) -> Background {
+        match self.behind {
+            Behind::Transparent => Background::White,
+            Behind::Flat(colour) if is_like(colour, [u8::MAX; 3]) => Background::White,
+            Behind::Flat(colour) if is_like(colour, [0; 3]) => Background::Black,
+            Behind::Flat(_) | Behind::Scene => Background::Opaque,
+        }
+    }
+}
+
+/// In words; nothing to say of images with alpha.
+impl Display for Borders {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self { flat, views, .. } = self;
+        let of = artifact::counted(*views, "view");
+        match self.behind {
+            Behind::Transparent => write!(f, "images have alpha"),
+            Behind::Flat([r, g, b]) => {
+                write!(f, "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of {of} looked at")
+            }
+            Behind::Scene => {
+                write!(
+                    f,
+                    "images have no alpha, and borders of one flat colour in {flat} of {of} looked at: the scene goes on behind"
+                )
+            }
+        }
+    }
+}
+
+/// The colour of an image's border, where nine tenths of its pixels are like their median.
+fn flat_border(image: &Rgba8) -> Option<[u8; 3]> {
+    let (width, height) = (image.width, image.height);
+    let pixel = |x: usize, y: usize| -> [u8; 3] { std::array::from_fn(|c| image.data[4 * (y * width + x) + c]) };
+    let rows = (0..width).flat_map(|x| [pixel(x, 0), pixel(x, height - 1)]);
+    let border: Vec<[u8; 3]> = rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
+    let middle = median(&border);
+    let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
+    (10 * alike >= 9 * border.len()).then_some(middle)
+}
+
+fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
+    colour.iter().zip(other).all(|(a, b)| a.abs_diff(b) <= NOISE)
+}
+
+/// The median of each channel; black where there is none.
+fn median(colours: &[[u8; 3]]) -> [u8; 3] {
+    std::array::from_fn(|c| {
+        let mut values: Vec<u8> = colours.iter().map(|colour| colour[c]).collect();
+        values.sort_unstable();
+        values.get(values.len() / 2).copied().unwrap_or(0)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A picture of 20×10 pixels: a border of a colour with some noise, and something in the middle, which may touch the border.
+    fn picture(border: [u8; 3], noise: u8, touching: usize) -> Rgba8 {
+        let pixel = |at: usize| -> [u8; 4] {
+            let (x, y) = (at % 20, at / 20);
+            let inside = (5..15).contains(&x) && (3..7).contains(&y) || y == 0 && x < touching;
+            let [r, g, b] = if inside { [90, 40, 200] } else { border.map(|v| v.saturating_sub(at as u8 % (noise + 1))) };
+            [r, g, b, u8::MAX]
+        };
+        Rgba8::new(20, 10, (0..200).flat_map(pixel).collect())
+    }
+
+    #[test]
+    fn a_flat_border_is_told_from_a_scene() {
+        let views = |image: &Rgba8, count| vec![image.clone(); count];
+        let white = Borders::of(&views(&picture([255; 3], 6, 4), 3));
+        assert_eq!(white.background(), Background::White);
+        assert_eq!(
+            white.to_string(),
+            "images have no alpha; borders are one flat colour (252 252 252) in 3 of 3 views looked at"
+        );
+        assert_eq!(Borders::of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
+        // A tenth of a border may be something else, and a tenth of the views.
+        let cut = views(&picture([255; 3], 0, 12), 3);
+        assert_eq!(Borders::of(&cut).behind, Behind::Scene);
+        let mut most = views(&picture([255; 3], 0, 0), 9);
+        most.push(picture([120; 3], 60, 0));
+        assert_eq!(Borders::of(&most).background(), Background::White);
+        most.push(picture([120; 3], 60, 0));
+        assert_eq!(Borders::of(&most).background(), Background::Opaque);
+        // Walls: each view has another flat colour, or all the same grey.
+        let walls: Vec<Rgba8> = (0..5).map(|i| picture([50 * i; 3], 0, 0)).collect();
+        assert_eq!(Borders::of(&walls).behind, Behind::Scene);
+        let grey = Borders::of(&views(&picture([128; 3], 0, 0), 5));
+        assert_eq!((grey.behind, grey.background()), (Behind::Flat([128; 3]), Background::Opaque));
+        assert_eq!(Borders::of(&[]).background(), Background::Opaque);
+    }
+
+    #[test]
+    fn alpha_says_it_all() {
+        let mut image = picture([10, 200, 30], 90, 0);
+        image.data[7] = 254;
+        let borders = Borders::of(&[picture([0; 3], 0, 0), image]);
+        assert_eq!((borders.behind, borders.background()), (Behind::Transparent, Background::White));
+    }
+}

@@ -1,0 +1,115 @@
+//! Scenes on a background, forward-facing ones and such as go on are told apart, also without known depths.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::Path;
+
+use common::{Project, data, stage};
+use dataset::Dataset;
+use pixels::{Rgba8, write_png};
+use serde_json::{Value, json};
+
+/// What `prep` makes of a data set: background, kind of space, and its notes.
+fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, String, String) {
+    let scene = project.path("scene");
+    std::fs::remove_dir_all(&scene).ok();
+    let finished = stage("prep", &params.to_string(), &[("dataset", dataset)], &scene, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    let text = std::fs::read_to_string(scene.join("scene.json")).unwrap();
+    let summary: Value = serde_json::from_str(&text).unwrap();
+    let space = match &summary["bounds"]["space"] {
+        Value::String(name) => name.clone(),
+        Value::Object(fields) => fields.keys().next().unwrap().clone(),
+        other => panic!("{other}"),
+    };
+    (summary["background"].as_str().unwrap().to_owned(), space, summary["notes"].to_string())
+}
+
+/// Some views of a Blender scene, as RGB on white.
+fn on_white(source: &Path, folder: &Path) {
+    for split in ["train", "test"] {
+        std::fs::create_dir_all(folder.join(split)).unwrap();
+        let text = std::fs::read_to_string(source.join(format!("transforms_{split}.json"))).unwrap();
+        let mut transforms: Value = serde_json::from_str(&text).unwrap();
+        let frames = transforms["frames"].as_array_mut().unwrap();
+        *frames = frames.iter().step_by(frames.len() / 10).take(10).cloned().collect();
+        std::fs::write(folder.join(format!("transforms_{split}.json")), transforms.to_string()).unwrap();
+    }
+    let chosen = |file: &str| -> Vec<String> {
+        let transforms: Value = serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
+        let frames = transforms["frames"].as_array().unwrap();
+        frames.iter().map(|frame| Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned()).collect()
+    };
+    let (train, test) = (chosen("transforms_train.json"), chosen("transforms_test.json"));
+    let set = Dataset::read(source).unwrap();
+    let given = set.split.clone().unwrap();
+    for (split, numbers, names) in [("train", given.train, train), ("test", given.test, test)] {
+        for number in numbers {
+            let frame = &set.frames[number];
+            let name = frame.image.file_stem().unwrap().to_str().unwrap();
+            if !names.iter().any(|chosen| chosen == name) {
+                continue;
+            }
+            let image = frame.photograph().unwrap();
+            let over = |p: &[u8]| {
+                let alpha = u32::from(p[3]);
+                let level = |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
+                [level(0), level(1), level(2), 255]
+            };
+            let data = image.data.chunks_exact(4).flat_map(over).collect();
+            write_png(&folder.join(split).join(format!("{name}.png")), &Rgba8::new(image.width, image.height, data)).unwrap();
+        }
+    }
+}
+
+#[test]
+fn objects_on_white_stay_in_a_box_on_white() {
+    let Some(data) = data() else { return };
+    let project = Project::tiny();
+    for scene in ["lego", "chair"] {
+        let folder = project.path(scene);
+        on_white(&data.join("nerf_synthetic").join(scene), &folder);
+        let (background, space, notes) = prepared(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
+        assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{scene}: {notes}");
+        assert!(notes.contains("borders are one flat colour (255 255 255) in 10 of 10 views looked at"), "{notes}");
+    }
+}
+
+#[test]
+fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
+    let project = Project::tiny();
+    let folder = project.path("photographs");
+    let demo = |layout: &str, backdrop: bool| {
+        std::fs::remove_dir_all(&folder).ok();
+        let params = json!({"form": "transforms", "backdrop": backdrop, "layout": layout, "size": 64, "aspect": 1.5, "train": 12, "test": 3,
+            "samples_per_axis": 1});
+        assert_eq!(stage("demo-scene", &params.to_string(), &[], &folder, &[]).code, 0);
+        prepared(&project, &folder, &json!({}))
+    };
+    let (background, space, notes) = demo("around", true);
+    assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
+    assert!(notes.contains("of 12 views looked at: the scene goes on behind"), "{notes}");
+    let (background, space, notes) = demo("forward", true);
+    assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
+    let (background, space, notes) = demo("around", false);
+    assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{notes}");
+    // What is said by hand holds.
+    let (background, space, _) = prepared(&project, &folder, &json!({"background": "opaque"}));
+    assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"));
+}
+
+#[test]
+fn fern_without_points_is_forward() {
+    let Some(data) = data() else { return };
+    let project = Project::tiny();
+    let (source, folder) = (data.join("nerf_llff_data/fern"), project.path("fern"));
+    std::fs::create_dir_all(&folder).unwrap();
+    for entry in std::fs::read_dir(&source).unwrap().map(|entry| entry.unwrap()) {
+        if entry.file_name() != "sparse" {
+            std::os::unix::fs::symlink(entry.path(), folder.join(entry.file_name())).unwrap();
+        }
+    }
+    let (background, space, notes) = prepared(&project, &folder, &json!({"lr_width": 63, "scale": 2}));
+    assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
+}
