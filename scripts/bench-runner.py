@@ -3,7 +3,7 @@
 
 Two questions are asked of each program, by turns, and the medians are compared:
 
-* A run with nothing to do, of five stages in a chain with 1 GB in 500 files: `nerf-sr run`, `dvc repro`, `snakemake -n`.
+* A run with nothing to do, of the default pipeline's graph with 1 GB in 500 files: `nerf-sr run`, `dvc repro`, `snakemake -n`.
 * The plan of a sweep: a stage at each of 1,000 points below two stages that are made (DVC plans nothing below what isn't):
   `nerf-sr plan`, `dvc repro --dry`, `snakemake -n`.
 
@@ -20,94 +20,110 @@ import sys
 import time
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
-CHAIN = ["dataset", "prep", "train", "render", "eval"]
+# The default pipeline: each stage with what it needs. The last is a sink.
+DEFAULT = {
+    "dataset": [], "prep": ["dataset"], "train": ["prep"], "render": ["train", "prep"], "eval": ["render", "prep"], "report": ["eval"]
+}
+# The sweep: its last stage has many points, which share the others.
+SWEEP = {"dataset": [], "prep": ["dataset"], "train": ["prep"]}
 FILES, BYTES = 100, 2_000_000
-# Stages that the sweep's points share.
-SHARED = 2
+# What is asked of nerf-sr: seconds, and how many times as fast as others.
+MOST, LEAST = {"run": 0.025, "plan": 1.0}, 20
 
-# Writes files; for nerf-sr it keeps the stage contract.
+# Writes files; for nerf-sr it keeps the stage contract. A sink writes one small page.
 STAGE = """#!/usr/bin/env python3
 import json, pathlib, sys
 arguments = sys.argv[1:]
+is_sink = pathlib.Path(sys.argv[0]).name == "show"
 if arguments[:1] == ["describe"]:
-    number = lambda default: {"type": "number", "default": default}
-    print(json.dumps({"name": "write", "version": "1", "code": "1", "summary": "Writes files.",
-        "inputs": {"from": {"kinds": ["files"], "summary": "files", "optional": True}},
-        "parameters": {"type": "object", "properties": {"files": number(%d), "bytes": number(%d), "seed": number(0)}},
-        "output": {"kind": "files"}}))
+    files = {"kinds": ["run" if is_sink else "files"], "summary": "files", "optional": not is_sink}
+    print(json.dumps({"name": "write", "version": "1", "code": "1", "summary": "Writes files.", "sink": is_sink,
+        "inputs": {"run": files} if is_sink else {"a": files, "b": files},
+        "parameters": {"type": "object", "properties": {"seed": {"type": "number", "default": 0}}}, "output": {"kind": "files"}}))
     sys.exit()
 given = dict(zip(arguments[::2], arguments[1::2]))
 out = pathlib.Path(given["--output"])
 out.mkdir(parents=True, exist_ok=True)
-for number in range(%d):
-    (out / f"{number}.bin").write_bytes(bytes([number]) * %d)
-""" % (FILES, BYTES, FILES, BYTES)
+for number in range(1 if is_sink else %d):
+    (out / f"{number}.bin").write_bytes(bytes([number]) * (10 if is_sink else %d))
+""" % (FILES, BYTES)
 
 
-def blocks(names):
-    """nerf-sr's pipeline: a chain."""
-    lines = [f"default: [{names[-1]}]", "stages:"]
-    for before, name in zip([None, *names], names):
-        inputs = f", inputs: {{from: {before}}}" if before else ""
-        lines.append(f"  {name}: {{run: ./write{inputs}}}")
+def pipeline(graph, points=None):
+    """nerf-sr's. The points are given on the command line."""
+    lines = [f"default: [{list(graph)[-1]}]", "stages:"]
+    for name, needs in graph.items():
+        is_sink = name == "report"
+        inputs = ", ".join(f"{'run' if is_sink else key}: {need}" for key, need in zip("ab", needs))
+        lines.append(f"  {name}: {{run: ./{'show' if is_sink else 'write'}, inputs: {{{inputs}}}}}")
     return "\n".join(lines) + "\n"
 
 
-def dvc_file(names, points=None):
-    """DVC's: a chain whose last stage has as many points."""
+def dvc_file(graph, points=None):
+    """DVC's; with points the last stage has so many."""
     lines = ["stages:"]
-    for before, name in zip([None, *names], names):
-        swept = points is not None and name == names[-1]
-        suffix = "-${item}" if swept else ""
+    for name, needs in graph.items():
+        swept = points is not None and name == list(graph)[-1]
+        suffix, inner = ("-${item}", "      ") if swept else ("", "    ")
         lines.append(f"  {name}:")
-        inner = "    "
         if swept:
             lines += [f"    foreach: {list(range(1, points + 1))}", "    do:"]
-            inner = "      "
-        lines.append(f"{inner}cmd: ./write --output data/{name}{suffix}")
-        if before:
-            lines.append(f"{inner}deps: ['data/{before}']")
-        lines.append(f"{inner}outs: ['data/{name}{suffix}']")
+        lines.append(f"{inner}cmd: ./{'show' if name == 'report' else 'write'} --output data/{name}{suffix}")
+        lines += [f"{inner}deps: [{', '.join(f'data/{need}' for need in needs)}]", f"{inner}outs: ['data/{name}{suffix}']"]
     return "\n".join(lines) + "\n"
 
 
-def snakefile(names, points=None):
-    """Snakemake's: likewise."""
-    last = names[-1]
+def snakefile(graph, points=None):
+    """Snakemake's; likewise."""
+    last = list(graph)[-1]
     wanted = f"expand('data/{last}-{{seed}}', seed=range(1, {points + 1}))" if points else f"'data/{last}'"
     lines = [f"rule all:\n    input: {wanted}\n"]
-    for before, name in zip([None, *names], names):
+    for name, needs in graph.items():
         suffix = "-{seed}" if points and name == last else ""
-        given = f"    input: 'data/{before}'\n" if before else ""
-        lines.append(f"rule {name}:\n{given}    output: directory('data/{name}{suffix}')\n    shell: './write --output {{output}}'\n")
+        given = ", ".join(f"'data/{need}'" for need in needs)
+        program = "show" if name == "report" else "write"
+        lines.append(f"rule {name}:\n    input: {given}\n    output: directory('data/{name}{suffix}')\n    shell: './{program} --output {{output}}'\n")
     return "\n".join(lines)
 
 
 def prepare(folder, text, file):
     folder.mkdir(parents=True)
     (folder / file).write_text(text)
-    (folder / "write").write_text(STAGE)
-    (folder / "write").chmod(0o755)
+    for program in ["write", "show"]:
+        (folder / program).write_text(STAGE)
+        (folder / program).chmod(0o755)
     return folder
 
 
-def call(command, folder, environment):
+def call(command, folder, environment, says=""):
+    """Seconds of a command, which must go well and say something so many times."""
     begun = time.perf_counter()
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    if result.returncode != 0:
-        sys.exit(f"bench-runner: {' '.join(map(str, command))}: {result.stderr[-2000:]}{result.stdout[-2000:]}")
-    return time.perf_counter() - begun
+    taken = time.perf_counter() - begun
+    said = result.stdout + result.stderr
+    words, count = says if says else ("", 0)
+    if result.returncode != 0 or (says and said.count(words) != count):
+        sys.exit(f"bench-runner: {' '.join(map(str, command))}: not {count} times {words!r}: {said[-2000:]}")
+    return taken
 
 
 def by_turns(commands, rounds, environment):
-    """Median seconds of each command; (name, command, folder) are called by turns, once before it counts."""
+    """Median seconds of each command; (name, command, folder, what it says) are called by turns, once before it counts."""
     seconds = {name: [] for name, *_ in commands}
     for number in range(rounds + 1):
-        for name, command, folder in commands:
-            taken = call(command, folder, environment)
+        for name, command, folder, says in commands:
+            taken = call(command, folder, environment, says)
             if number > 0:
                 seconds[name].append(taken)
     return {name: statistics.median(taken) for name, taken in seconds.items()}
+
+
+def missed(verb, seconds):
+    """What was asked for and isn't reached, in words."""
+    ours, *others = seconds.values()
+    if ours > MOST[verb]:
+        yield f"nerf-sr {verb} takes {1000 * ours:.0f} ms, not {1000 * MOST[verb]:.0f}"
+    yield from (f"nerf-sr {verb} is {other / ours:.0f} times as fast, not {LEAST}" for other in others if other < LEAST * ours)
 
 
 def rows(title, seconds):
@@ -135,32 +151,40 @@ def main():
     work = options.out / "work"
     subprocess.run(["rm", "-rf", work], check=True)
 
-    table = ["| asked | program | median | over nerf-sr |", "| --- | --- | --- | --- |"]
-    dry = [snakemake, "-n", "--quiet", "all", "--cores", "1"]
-    chain = [
-        ("nerf-sr run", [options.nerf_sr, "run"], prepare(work / "chain/nerf-sr", blocks(CHAIN), "pipeline.yaml")),
-        ("dvc repro", [dvc, "repro"], prepare(work / "chain/dvc", dvc_file(CHAIN), "dvc.yaml")),
-        ("snakemake -n", dry, prepare(work / "chain/snakemake", snakefile(CHAIN), "Snakefile")),
+    places = {name: work / name for name in ["run/nerf-sr", "run/dvc", "run/snakemake", "plan/nerf-sr", "plan/dvc", "plan/snakemake"]}
+    files = {"nerf-sr": (pipeline, "pipeline.yaml"), "dvc": (dvc_file, "dvc.yaml"), "snakemake": (snakefile, "Snakefile")}
+    for name, folder in places.items():
+        verb, tool = name.split("/")
+        graph, points = (DEFAULT, None) if verb == "run" else (SWEEP, options.points)
+        text, file = files[tool]
+        prepare(folder, text(graph, points), file)
+        if tool == "dvc":
+            call([dvc, "init", "--no-scm", "--quiet"], folder, environment)
+    dry = [snakemake, "-n", "--cores", "1"]
+
+    run = [
+        ("nerf-sr run", [options.nerf_sr, "run"], places["run/nerf-sr"], ("nothing to run", 1)),
+        ("dvc repro", [dvc, "repro"], places["run/dvc"], ("didn't change, skipping", len(DEFAULT))),
+        ("snakemake -n", dry, places["run/snakemake"], ("Nothing to be done", 1)),
     ]
-    call([dvc, "init", "--no-scm", "--quiet"], chain[1][2], environment)
-    call([snakemake, "--cores", "1"], chain[2][2], environment)
-    table += rows("a run with nothing to do, 1 GB in 500 files", by_turns(chain, options.rounds, environment))
+    for command, place in [([options.nerf_sr, "run"], "nerf-sr"), ([dvc, "repro"], "dvc"), ([snakemake, "--cores", "1"], "snakemake")]:
+        call(command, places[f"run/{place}"], environment)
+    nothing = by_turns(run, options.rounds, environment)
 
     seeds = ",".join(map(str, range(1, options.points + 1)))
-    sweep = CHAIN[:SHARED + 1]
-    plan = [options.nerf_sr, "plan", "-p", f"{sweep[-1]}.seed={seeds}"]
-    swept = [
-        ("nerf-sr plan", plan, prepare(work / "sweep/nerf-sr", blocks(sweep), "pipeline.yaml")),
-        ("dvc repro --dry", [dvc, "repro", "--dry"], prepare(work / "sweep/dvc", dvc_file(sweep, options.points), "dvc.yaml")),
-        ("snakemake -n", dry, prepare(work / "sweep/snakemake", snakefile(sweep, options.points), "Snakefile")),
+    plan = [
+        ("nerf-sr plan", [options.nerf_sr, "plan", "-p", f"train.seed={seeds}"], places["plan/nerf-sr"], ("will run", options.points)),
+        ("dvc repro --dry", [dvc, "repro", "--dry"], places["plan/dvc"], ("Running stage 'train@", options.points)),
+        ("snakemake -n", dry, places["plan/snakemake"], ("rule train:", options.points)),
     ]
-    made = sweep[SHARED - 1]
-    call([options.nerf_sr, "run", made], swept[0][2], environment)
-    call([dvc, "init", "--no-scm", "--quiet"], swept[1][2], environment)
-    call([dvc, "repro", made], swept[1][2], environment)
-    call([snakemake, "--cores", "1", f"data/{made}"], swept[2][2], environment)
-    table += rows(f"the plan of {options.points:,} points", by_turns(swept, options.rounds, environment))
+    # DVC plans nothing below what isn't made.
+    for command, place in [([options.nerf_sr, "run", "prep"], "nerf-sr"), ([dvc, "repro", "prep"], "dvc"), ([snakemake, "--cores", "1", "data/prep"], "snakemake")]:
+        call(command, places[f"plan/{place}"], environment)
+    sweep = by_turns(plan, options.rounds, environment)
 
+    table = ["| asked | program | median | over nerf-sr |", "| --- | --- | --- | --- |"]
+    table += rows("a run with nothing to do, 1 GB in 500 files", nothing)
+    table += rows(f"the plan of {options.points:,} points", sweep)
     about = (
         f"{os.cpu_count()} cores, {platform.machine()}, load {os.getloadavg()[0]:.1f}; nerf-sr {version(options.nerf_sr, environment)}, "
         f"DVC {version(dvc, environment)}, Snakemake {version(snakemake, environment)}, Python {platform.python_version()}"
@@ -168,6 +192,9 @@ def main():
     text = "\n".join(table) + f"\n\n{about}\n"
     (options.out / "table.md").write_text(text)
     print(text, end="")
+    problems = [*missed("run", nothing), *missed("plan", sweep)]
+    if problems:
+        sys.exit("bench-runner: " + "; ".join(problems))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,10 @@ fn on_white(source: &Path, folder: &Path) {
     let chosen = |file: &str| -> Vec<String> {
         let transforms: Value = serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
         let frames = transforms["frames"].as_array().unwrap();
-        frames.iter().map(|frame| Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned()).collect()
+        frames
+            .iter()
+            .map(|frame| Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned())
+            .collect()
     };
     let (train, test) = (chosen("transforms_train.json"), chosen("transforms_test.json"));
     let set = Dataset::read(source).unwrap();

@@ -24,8 +24,8 @@ pub use render::RenderedImage;
 pub use world::World;
 use written::Written;
 
-/// Horizontal angle of view, as in NeRF's Blender scenes.
-const CAMERA_ANGLE_X: f64 = 0.691_111_2;
+/// Angle of view across the shorter side, as in NeRF's Blender scenes: the things stay in every view.
+const CAMERA_ANGLE: f64 = 0.691_111_2;
 /// Distance of every camera from the scene's centre.
 const DISTANCE: f64 = 4.0;
 
@@ -73,6 +73,15 @@ impl Params {
     fn sides(&self) -> [u32; 2] {
         [self.size, ((f64::from(self.size) / self.aspect).round() as u32).max(1)]
     }
+
+    /// Horizontal angle of view.
+    fn angle_x(&self) -> f64 {
+        let [width, height] = self.sides();
+        if width <= height {
+            return CAMERA_ANGLE;
+        }
+        2.0 * libm::atan(libm::tan(0.5 * CAMERA_ANGLE) * f64::from(width) / f64::from(height))
+    }
 }
 
 impl Default for Params {
@@ -109,7 +118,7 @@ impl Stage for DemoScene {
         let world = if params.backdrop { world.with_backdrop() } else { world };
         let total = u64::from(params.train + params.test);
         let progress = context.progress("rendering", total);
-        let mut written = Written::new(params.form, params.sides());
+        let mut written = Written::new(params);
         for (split, count) in [("train", params.train), ("test", params.test)] {
             let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.layout, split, i, count)).collect();
             context.output_path(&format!("{}/.", params.form.folder(split)))?;
@@ -118,7 +127,7 @@ impl Stage for DemoScene {
                 .map(|i| {
                     context.check_interrupt()?;
                     let pose = &poses[i as usize];
-                    let frame = render::render(&world, pose, CAMERA_ANGLE_X, params.sides(), params.samples_per_axis);
+                    let frame = render::render(&world, pose, params.angle_x(), params.sides(), params.samples_per_axis);
                     params.form.write_view(context, split, i, &frame)?;
                     progress.add(1);
                     Ok(())
@@ -175,7 +184,7 @@ mod tests {
     fn depth_is_that_of_the_surface() {
         let world = World::new(0);
         let pose = pose(Layout::Around, "test", 3, 10);
-        let frame = render::render(&world, &pose, CAMERA_ANGLE_X, [64, 64], 2);
+        let frame = render::render(&world, &pose, CAMERA_ANGLE, [64, 64], 2);
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
         assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
@@ -188,11 +197,15 @@ mod tests {
     fn the_scene_stays_in_every_view() {
         // What a test view sees must be inside the training views' frusta, or near/far and hull would be guesses.
         let world = World::new(0);
-        for i in 0..10 {
-            let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), CAMERA_ANGLE_X, [48, 48], 1);
-            for k in 0..48 {
-                for (x, y) in [(k, 0), (k, 47), (0, k), (47, k)] {
-                    assert_eq!(frame.colour.data[(y * 48 + x) * 4 + 3], 0, "view {i} is cut off at ({x}, {y})");
+        for aspect in [1.0, 1.5, 0.75] {
+            let params = Params { size: 48, aspect, ..Params::default() };
+            let [width, height] = params.sides();
+            for i in 0..10 {
+                let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), params.angle_x(), [width, height], 1);
+                let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
+                for (x, y) in rows.chain((0..height).flat_map(|y| [(0, y), (width - 1, y)])) {
+                    let alpha = frame.colour.data[((y * width + x) * 4 + 3) as usize];
+                    assert_eq!(alpha, 0, "view {i} of {width}×{height} is cut off at ({x}, {y})");
                 }
             }
         }
@@ -200,7 +213,8 @@ mod tests {
 
     #[test]
     fn seeds_differ() {
-        let view = |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE_X, [32, 32], 1).colour;
+        let view =
+            |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE, [32, 32], 1).colour;
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
     }

@@ -12,7 +12,7 @@ use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr, write_png};
 use serde_json::{Value, json};
 
 use crate::render::RenderedImage;
-use crate::{CAMERA_ANGLE_X, Form};
+use crate::{Form, Params};
 
 /// JPEG's quality: that of a careful camera.
 const QUALITY: u8 = 95;
@@ -49,14 +49,16 @@ fn photograph(split: &str, number: u32) -> String {
 pub(crate) struct Written {
     form: Form,
     sides: [u32; 2],
+    angle_x: f64,
     /// Frames of `transforms.json`, and which of them are for what.
     frames: Vec<Value>,
     splits: Vec<(String, Vec<String>)>,
 }
 
 impl Written {
-    pub(crate) fn new(form: Form, sides: [u32; 2]) -> Self {
-        Self { form, sides, frames: Vec::new(), splits: Vec::new() }
+    pub(crate) fn new(params: &Params) -> Self {
+        let (sides, angle_x) = (params.sides(), params.angle_x());
+        Self { form: params.form, sides, angle_x, frames: Vec::new(), splits: Vec::new() }
     }
 
     /// Takes in a split's cameras.
@@ -77,7 +79,7 @@ impl Written {
         };
         let frames: Vec<Value> = poses.iter().enumerate().map(frame).collect();
         context
-            .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}))
+            .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": self.angle_x, "frames": frames}))
             .context("cannot write the cameras")
     }
 
@@ -87,7 +89,7 @@ impl Written {
             return Ok(());
         }
         let [width, height] = self.sides;
-        let focal = 0.5 * f64::from(width) / libm::tan(0.5 * CAMERA_ANGLE_X);
+        let focal = 0.5 * f64::from(width) / libm::tan(0.5 * self.angle_x);
         let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
         let mut file = json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "frames": self.frames});
         for (key, names) in self.splits {

@@ -121,7 +121,7 @@ mod tests {
         assert_eq!(white.background(), Background::White);
         assert_eq!(
             white.to_string(),
-            "images have no alpha; borders are one flat colour (252 252 252) in 3 of 3 views looked at"
+            "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 views looked at"
         );
         assert_eq!(Borders::of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
         // A tenth of a border may be something else, and a tenth of the views.
