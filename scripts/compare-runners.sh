@@ -56,7 +56,9 @@ for tool in $tools; do
   ps -eo pid,sid | awk -v s="$leader" '$2 == s { print $1 }' | xargs -r kill -9 2> /dev/null; pkill -9 -f "$work/$tool/step.sh"; sleep 0.5
   echo 0 > nap; before=$(runs); run "$tool" > log 2>&1
   echo "$tool: after kill -9 halfway: exit code $?, ran again $(($(runs) - before)) times, result: $(tr '\n' ' ' < "$(result "$tool")")"
-  [ "$tool" = snakemake ] && snakemake -q all --cores 1 --rerun-incomplete out > log 2>&1
+  if [ "$tool" = snakemake ]; then
+    snakemake --unlock > log 2>&1; snakemake -q all --cores 1 --rerun-incomplete out > log 2>&1
+  fi
 
   echo z > data/in; echo 3 > nap; before=$(runs)
   run "$tool" > first 2>&1 & sleep 2
