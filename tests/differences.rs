@@ -179,7 +179,7 @@ fn diff_tells_of_code_environment_and_sources() {
     let project = project();
     let pin = |name: &str, mode: &str| {
         for verb in [&["run", "first"][..], &["pin", name, "first"]] {
-            assert!(project.command(verb).env("MIX_MODE", mode).status().unwrap().success());
+            assert!(project.command(verb).env("MIX_MODE", mode).output().unwrap().status.success());
         }
     };
     pin("one", "");
