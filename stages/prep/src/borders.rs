@@ -21,6 +21,33 @@ pub(crate) enum Behind {
     Scene,
 }
 
+/// What one image shows behind the scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Border {
+    /// It has alpha.
+    Transparent,
+    /// Nine tenths of its border's pixels are like their median.
+    Flat([u8; 3]),
+    /// Anything else.
+    Mixed,
+}
+
+impl Border {
+    /// Looks at an image.
+    pub(crate) fn of(image: &Rgba8) -> Self {
+        if image.data.chunks_exact(4).any(|p| p[3] != u8::MAX) {
+            return Self::Transparent;
+        }
+        let (width, height) = (image.width, image.height);
+        let pixel = |x: usize, y: usize| -> [u8; 3] { std::array::from_fn(|c| image.data[4 * (y * width + x) + c]) };
+        let rows = (0..width).flat_map(|x| [pixel(x, 0), pixel(x, height - 1)]);
+        let border: Vec<[u8; 3]> = rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
+        let middle = median(&border);
+        let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
+        if 10 * alike >= 9 * border.len() { Self::Flat(middle) } else { Self::Mixed }
+    }
+}
+
 /// What the borders of some images show.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Borders {
@@ -31,17 +58,18 @@ pub(crate) struct Borders {
 }
 
 impl Borders {
-    /// Looks at images. One with alpha makes all transparent. A flat colour must be that of nine in ten views.
-    pub(crate) fn of(images: &[Rgba8]) -> Self {
-        if images.iter().any(|image| image.data.chunks_exact(4).any(|p| p[3] != u8::MAX)) {
-            return Self { behind: Behind::Transparent, flat: 0, views: images.len() };
+    /// Of all that were looked at. One image with alpha makes all transparent. A flat colour must be that of nine in ten views.
+    pub(crate) fn new(borders: &[Border]) -> Self {
+        let views = borders.len();
+        if borders.contains(&Border::Transparent) {
+            return Self { behind: Behind::Transparent, flat: 0, views };
         }
-        let colours: Vec<Option<[u8; 3]>> = images.iter().map(flat_border).collect();
-        let known: Vec<[u8; 3]> = colours.iter().flatten().copied().collect();
+        let colour = |border: &Border| if let Border::Flat(colour) = border { Some(*colour) } else { None };
+        let known: Vec<[u8; 3]> = borders.iter().filter_map(colour).collect();
         let common = median(&known);
         let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
-        let behind = if !images.is_empty() && 10 * flat >= 9 * images.len() { Behind::Flat(common) } else { Behind::Scene };
-        Self { behind, flat, views: images.len() }
+        let behind = if views > 0 && 10 * flat >= 9 * views { Behind::Flat(common) } else { Behind::Scene };
+        Self { behind, flat, views }
     }
 
     /// What rays see behind everything. A flat colour that is neither white nor black counts as a wall, a part of the scene.
@@ -55,7 +83,7 @@ impl Borders {
     }
 }
 
-/// In words; nothing to say of images with alpha.
+/// In words.
 impl Display for Borders {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self { flat, views, .. } = self;
@@ -73,17 +101,6 @@ impl Display for Borders {
             }
         }
     }
-}
-
-/// The colour of an image's border, where nine tenths of its pixels are like their median.
-fn flat_border(image: &Rgba8) -> Option<[u8; 3]> {
-    let (width, height) = (image.width, image.height);
-    let pixel = |x: usize, y: usize| -> [u8; 3] { std::array::from_fn(|c| image.data[4 * (y * width + x) + c]) };
-    let rows = (0..width).flat_map(|x| [pixel(x, 0), pixel(x, height - 1)]);
-    let border: Vec<[u8; 3]> = rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
-    let middle = median(&border);
-    let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
-    (10 * alike >= 9 * border.len()).then_some(middle)
 }
 
 fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
@@ -114,37 +131,41 @@ mod tests {
         Rgba8::new(20, 10, (0..200).flat_map(pixel).collect())
     }
 
+    fn of(images: &[Rgba8]) -> Borders {
+        Borders::new(&images.iter().map(Border::of).collect::<Vec<_>>())
+    }
+
     #[test]
     fn a_flat_border_is_told_from_a_scene() {
         let views = |image: &Rgba8, count| vec![image.clone(); count];
-        let white = Borders::of(&views(&picture([255; 3], 6, 4), 3));
+        let white = of(&views(&picture([255; 3], 6, 4), 3));
         assert_eq!(white.background(), Background::White);
         assert_eq!(
             white.to_string(),
             "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 views looked at"
         );
-        assert_eq!(Borders::of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
+        assert_eq!(of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
         // A tenth of a border may be something else, and a tenth of the views.
         let cut = views(&picture([255; 3], 0, 12), 3);
-        assert_eq!(Borders::of(&cut).behind, Behind::Scene);
+        assert_eq!(of(&cut).behind, Behind::Scene);
         let mut most = views(&picture([255; 3], 0, 0), 9);
         most.push(picture([120; 3], 60, 0));
-        assert_eq!(Borders::of(&most).background(), Background::White);
+        assert_eq!(of(&most).background(), Background::White);
         most.push(picture([120; 3], 60, 0));
-        assert_eq!(Borders::of(&most).background(), Background::Opaque);
+        assert_eq!(of(&most).background(), Background::Opaque);
         // Walls: each view has another flat colour, or all the same grey.
         let walls: Vec<Rgba8> = (0..5).map(|i| picture([50 * i; 3], 0, 0)).collect();
-        assert_eq!(Borders::of(&walls).behind, Behind::Scene);
-        let grey = Borders::of(&views(&picture([128; 3], 0, 0), 5));
+        assert_eq!(of(&walls).behind, Behind::Scene);
+        let grey = of(&views(&picture([128; 3], 0, 0), 5));
         assert_eq!((grey.behind, grey.background()), (Behind::Flat([128; 3]), Background::Opaque));
-        assert_eq!(Borders::of(&[]).background(), Background::Opaque);
+        assert_eq!(of(&[]).background(), Background::Opaque);
     }
 
     #[test]
     fn alpha_says_it_all() {
         let mut image = picture([10, 200, 30], 90, 0);
         image.data[7] = 254;
-        let borders = Borders::of(&[picture([0; 3], 0, 0), image]);
+        let borders = of(&[picture([0; 3], 0, 0), image]);
         assert_eq!((borders.behind, borders.background()), (Behind::Transparent, Background::White));
     }
 }

@@ -36,7 +36,7 @@ pub type SeenDepths = (Camera, Option<[f64; 2]>);
 
 /// Where the scene is, and the space that suits it. It is NDC where all cameras look one way and the depths they see are known, the
 /// contraction where something is known to lie far outside the box, else the box. Where images say that the scene goes on behind what is looked
-/// at (`goes_on`), a box holds it never: depths that aren't known are guessed where cameras look one way, and elsewhere it is the
+/// at (`goes_on`) and depths aren't known, no box is known to hold it: depths are guessed where cameras look one way, and elsewhere it is the
 /// contraction. A `kind` that is given is taken. The box is that of the training views; `others` are cameras that will look, too.
 pub fn place(
     training: &[SeenDepths],
@@ -45,7 +45,8 @@ pub fn place(
     kind: Option<SpaceKind>,
 ) -> Result<Bounds, SpaceError> {
     let boxed = bounds_of(training);
-    let guessed = if goes_on { guessed_depths(training) } else { None };
+    let goes_on_unseen = goes_on && training.iter().any(|(_, depths)| depths.is_none());
+    let guessed = if goes_on_unseen { guessed_depths(training) } else { None };
     let ndc = || -> Result<Bounds, SpaceError> {
         let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
         let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
@@ -58,7 +59,7 @@ pub fn place(
         Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
         None => Ok(match ndc() {
             Ok(bounds) => bounds,
-            Err(_) if goes_on || reaches_beyond(&boxed, training) => contracted(boxed, training),
+            Err(_) if goes_on_unseen || reaches_beyond(&boxed, training) => contracted(boxed, training),
             Err(_) => boxed,
         }),
     }
@@ -348,6 +349,9 @@ mod tests {
             assert_eq!(around.space, Space::Contraction);
             let half = 0.5 * around.longest_side() / scale;
             assert!((1.4..1.7).contains(&half) && around.far > 100.0 * scale && around.near < 0.1 * scale, "{around:?}");
+            // Where depths are known they decide.
+            let known = place(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None).unwrap();
+            assert_eq!(known.space, Space::Box);
             // From within: a room.
             let outwards: Vec<Camera> = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
             let room = place(&sights(&outwards, None), &[], true, None).unwrap();

@@ -31,7 +31,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use borders::{Behind, Borders};
+use borders::{Behind, Border, Borders};
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
 pub use degrade::{LrImage, degrade};
 pub use hull::{GRID, carve};
@@ -281,12 +281,16 @@ fn pose_warnings(set: &Dataset, split: &Split) -> anyhow::Result<Vec<String>> {
     Ok(pose_warnings::warnings(&training, &test).into_iter().map(|text| format!("{WARNING}{text}")).collect())
 }
 
-/// Looks at the borders of training views, spread evenly.
+/// Looks at the borders of training views, spread evenly; where the first has alpha, at no other. No more images than threads are
+/// held at once.
 fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
+    let look = |frame: &Frame| -> anyhow::Result<Border> { Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?)) };
     let count = frames.len().min(borders::LOOKED_AT);
-    let chosen = (0..count).into_par_iter().map(|i| frames[i * frames.len() / count]);
-    let images = chosen.map(|frame| frame.photograph().bad_input(frame_name(frame)));
-    Ok(Borders::of(&images.collect::<anyhow::Result<Vec<Rgba8>>>()?))
+    if count > 0 && look(frames[0])? == Border::Transparent {
+        return Ok(Borders::new(&[Border::Transparent]));
+    }
+    let chosen = (0..count).into_par_iter().map(|i| look(frames[i * frames.len() / count]));
+    Ok(Borders::new(&chosen.collect::<anyhow::Result<Vec<Border>>>()?))
 }
 
 /// Which frames are for what.
@@ -382,6 +386,16 @@ struct Job<'a> {
 }
 
 impl Job<'_> {
+    /// What lies behind the scene, and by which sign that is known where it wasn't given.
+    fn background(&self, train: &[&Frame]) -> anyhow::Result<(Background, Option<String>)> {
+        if let Some(given) = self.params.background {
+            return Ok((given, None));
+        }
+        let borders = borders(train)?;
+        let sign = (borders.behind != Behind::Transparent).then(|| borders.to_string());
+        Ok((borders.background(), sign))
+    }
+
     fn run(&self, set: &Dataset, mut notes: Vec<String>, train: &[&Frame], test: &[&Frame]) -> anyhow::Result<()> {
         let progress = self.context.progress("preparing", (train.len() + test.len()) as u64);
         let cameras = |frames: &[&Frame]| -> Vec<Camera> { frames.iter().map(|f| f.camera()).collect() };
@@ -393,8 +407,7 @@ impl Job<'_> {
             cameras.iter().cloned().zip(frames.iter().map(|f| f.depths.or(given))).collect()
         };
         let (training, others) = (sights(&train_cameras, train), sights(&test_cameras, test));
-        let borders = borders(train)?;
-        let background = self.params.background.unwrap_or(borders.background());
+        let (background, sign) = self.background(train)?;
         let goes_on = background == Background::Opaque;
         let placed = place(&training, &others, goes_on, self.params.space);
         let mut bounds = placed.map_err(|e| Failure::Usage(e.to_string()))?;
@@ -416,8 +429,7 @@ impl Job<'_> {
             let message = format!("parameter near: {} is not before far = {}", bounds.near, bounds.far);
             return Err(Failure::Usage(message).into());
         }
-        let signs = (borders.behind != Behind::Transparent).then(|| borders.to_string());
-        for note in signs.into_iter().chain([space_note(&bounds, background)]) {
+        for note in sign.into_iter().chain([space_note(&bounds, background)]) {
             self.context.say(&note);
             notes.push(note);
         }
