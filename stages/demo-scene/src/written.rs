@@ -111,7 +111,7 @@ fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
 }
 
 /// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
-fn write_depth(path: &std::path::Path, frame: &RenderedImage) -> Result<(), PixelError> {
+fn write_depth(path: &Path, frame: &RenderedImage) -> Result<(), PixelError> {
     let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
     let (width, height) = (frame.colour.width, frame.colour.height);
     write_exr(
