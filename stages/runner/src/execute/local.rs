@@ -64,7 +64,7 @@ struct Outcome {
 }
 
 /// How far a node is.
-enum Progress {
+enum NodeProgress {
     /// Its parents aren't done, or it hasn't been looked at since.
     Pending,
     /// It isn't cached, and has no place yet. It is said once that it waits for memory.
@@ -107,7 +107,7 @@ struct Schedule<'a> {
     work: &'a Work<'a>,
     options: &'a Local,
     display: &'a Display,
-    progress: Vec<Progress>,
+    progress: Vec<NodeProgress>,
     places: Places,
     /// All records, once there is something to run.
     records: OnceCell<Vec<Record>>,
@@ -121,7 +121,7 @@ impl<'a> Schedule<'a> {
             work,
             options,
             display,
-            progress: (0..count).map(|_| Progress::Pending).collect(),
+            progress: (0..count).map(|_| NodeProgress::Pending).collect(),
             places: Places::new(options.budget),
             records: OnceCell::new(),
             outcome: Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() },
@@ -143,20 +143,20 @@ impl<'a> Schedule<'a> {
     /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass finds all that is cached.
     fn look(&mut self) {
         for (index, node) in self.work.plan.nodes.iter().enumerate() {
-            let is_pending = matches!(self.progress[index], Progress::Pending);
+            let is_pending = matches!(self.progress[index], NodeProgress::Pending);
             if self.gives_up() || !is_pending || node.parents().any(|parent| self.outcome.records[parent].is_none()) {
                 continue;
             }
             match self.job(index).find() {
                 Ok(Found::Cached(record)) => {
                     self.outcome.records[index] = Some(record);
-                    self.progress[index] = Progress::Over;
+                    self.progress[index] = NodeProgress::Over;
                 }
                 Ok(Found::ToDo(action)) => {
                     // Without records every stage counts as unknown.
                     let records = self.records.get_or_init(|| self.work.session.store.records().unwrap_or_default());
                     let need = Need::of(action.key_parts(), &node.stage, records);
-                    self.progress[index] = Progress::Ready { action, need, said: false };
+                    self.progress[index] = NodeProgress::Ready { action, need, said: false };
                 }
                 Err(failure) => self.fail(index, failure),
             }
@@ -167,7 +167,7 @@ impl<'a> Schedule<'a> {
     fn starting(&mut self) -> Vec<(NodeJob<'a>, usize, Action)> {
         let mut starting = Vec::new();
         for index in 0..self.progress.len() {
-            let Progress::Ready { need, ref mut said, .. } = self.progress[index] else { continue };
+            let NodeProgress::Ready { need, ref mut said, .. } = self.progress[index] else { continue };
             match self.places.place(need) {
                 Place::LaterForMemory(why) if !*said => {
                     *said = true;
@@ -175,8 +175,8 @@ impl<'a> Schedule<'a> {
                 }
                 Place::Never(message) if !self.gives_up() => self.fail(index, StageFailure { code: 1, message }),
                 Place::Free if !self.gives_up() => {
-                    let progress = std::mem::replace(&mut self.progress[index], Progress::Running);
-                    let Progress::Ready { action, .. } = progress else { continue };
+                    let progress = std::mem::replace(&mut self.progress[index], NodeProgress::Running);
+                    let NodeProgress::Ready { action, .. } = progress else { continue };
                     self.places.take(index, need);
                     starting.push((self.job(index), index, action));
                 }
@@ -190,7 +190,7 @@ impl<'a> Schedule<'a> {
         self.places.give_back(index);
         match result {
             Ok((record, ran)) => {
-                self.progress[index] = Progress::Over;
+                self.progress[index] = NodeProgress::Over;
                 self.outcome.records[index] = Some(record);
                 if ran {
                     self.outcome.ran.insert(index);
@@ -201,14 +201,14 @@ impl<'a> Schedule<'a> {
     }
 
     fn fail(&mut self, index: usize, failure: StageFailure) {
-        self.progress[index] = Progress::Over;
+        self.progress[index] = NodeProgress::Over;
         self.display.line(&format!("{}: failed: {}", self.work.plan.nodes[index].label(), failure.message));
         self.outcome.failures.push((index, failure));
     }
 
     /// What came of it.
     fn end(mut self) -> Outcome {
-        let is_over = |index: &usize| matches!(self.progress[*index], Progress::Over);
+        let is_over = |index: &usize| matches!(self.progress[*index], NodeProgress::Over);
         self.outcome.skipped = (0..self.progress.len()).filter(|index| !is_over(index)).collect();
         self.outcome
     }
