@@ -144,13 +144,14 @@ bench-runner: build ## What the runner costs beside DVC and Snakemake, which thi
 	@python3 scripts/bench-runner.py
 
 BENCH_SCENE := out/bench/scene
-bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene)
+bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene); SIMD=avx2|portable; AGAINST=FILE of an earlier run or the folder of another checkout
 	@rm -rf out/bench && mkdir -p out/bench
 	@if [ -d $(DATA)/nerf_synthetic/lego ]; then ln -s $(abspath $(DATA))/nerf_synthetic/lego out/bench/data; \
 	  else target/release/demo-scene --output out/bench/data; fi
 	@echo '{"lr_width": 100, "scale": 2, "test_views": 10}' > out/bench/prep.json
 	@target/release/prep --params out/bench/prep.json --input dataset=out/bench/data --output $(BENCH_SCENE)
-	@SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) cargo bench --quiet -p train-ss --bench bench
+	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
+	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py && .venv/bin/python scripts/make-goldens-refiner.py

@@ -1,33 +1,35 @@
 //! `make bench`: what the engine costs, and that cost over what the machine can do, measured side by side in one run.
 //!
 //! `SCENE=DIR` is a scene that `prep` made (×2, 100 px in the Makefile), `OUT=FILE` gets rows of JSON `{name, value, unit}`,
-//! `RAYS=N` sets the length of the measured training (default 12 million).
+//! `RAYS=N` sets the length of the measured training (default 3 million), `SIMD=avx512|avx2|portable` the SIMD family.
+//! `AGAINST=FILE` is what an earlier run wrote: each of its values is compared with this run's.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use anyhow::Context as _;
 use artifact::GivenInput;
-use radiance::{Architecture, Field, Passes, Ray, Trainer};
+use radiance::{Architecture, Family, Field, Passes, Ray, Trainer, set_family};
 use scene::{Bounds, Camera, Views};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 #[cfg(feature = "torch")]
 use train_ss::MlpParams;
 use train_ss::{FieldParams, GridParams, Params, Photographs, ResolvedField, SceneFacts};
 
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 struct Row {
     name: String,
     value: f64,
-    unit: &'static str,
+    unit: String,
 }
 
 #[derive(Default)]
 struct Rows(Vec<Row>);
 
 impl Rows {
-    fn add(&mut self, name: impl Into<String>, value: f64, unit: &'static str) {
-        let row = Row { name: name.into(), value, unit };
+    fn add(&mut self, name: impl Into<String>, value: f64, unit: &str) {
+        let row = Row { name: name.into(), value, unit: unit.to_owned() };
         println!("{:<52} {:>14.1} {unit}", row.name, row.value);
         self.0.push(row);
     }
@@ -61,8 +63,43 @@ impl Rows {
     }
 }
 
+/// Runs the kernels of a family, which the machine must support.
+fn choose_family(name: &str) -> anyhow::Result<()> {
+    let family = match name {
+        "avx512" => Family::Avx512,
+        "avx2" => Family::Avx2,
+        "portable" => Family::Portable,
+        _ => anyhow::bail!("SIMD = {name} is none of avx512, avx2, portable"),
+    };
+    anyhow::ensure!(family.is_supported(), "SIMD = {name}: this machine doesn't support it");
+    set_family(family);
+    Ok(())
+}
+
+/// Reads the rows that an earlier run wrote.
+fn read_rows(file: &Path) -> anyhow::Result<Rows> {
+    let bytes = std::fs::read(file).with_context(|| format!("AGAINST = {}", file.display()))?;
+    Ok(Rows(serde_json::from_slice(&bytes).with_context(|| format!("AGAINST = {}", file.display()))?))
+}
+
+/// Prints this run's values over those of an earlier one.
+fn compare(rows: &Rows, earlier: &Rows) {
+    println!("\n{:<52} {:>14} {:>14} {:>7}", "", "earlier", "now", "ratio");
+    for row in &earlier.0 {
+        let now = rows.value(&row.name);
+        if now.is_finite() {
+            println!("{:<52} {:>14.1} {now:>14.1} {:>7.2} {}", row.name, row.value, now / row.value, row.unit);
+        }
+    }
+}
+
 fn main() -> anyhow::Result<()> {
     let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
+    if let Some(name) = variable("SIMD") {
+        choose_family(&name)?;
+    }
+    // Read first: a run of minutes shouldn't end in a wrong name.
+    let earlier = variable("AGAINST").map(|file| read_rows(Path::new(&file))).transpose()?;
     let mut rows = Rows::default();
     let load = std::fs::read_to_string("/proc/loadavg").unwrap_or_default();
     println!("load before: {}", load.trim());
@@ -72,12 +109,15 @@ fn main() -> anyhow::Result<()> {
     rows.add("memory_bandwidth", bandwidth(), "GB/s");
     passes(&mut rows);
     if let Some(scene) = variable("SCENE") {
-        let rays = variable("RAYS").map_or(Ok(12_000_000), |r| r.parse())?;
+        let rays = variable("RAYS").map_or(Ok(3_000_000), |r| r.parse())?;
         training(&mut rows, Path::new(&scene), rays)?;
     } else {
         println!("skipped: no SCENE, so nothing was trained or rendered");
     }
     rows.relate();
+    if let Some(earlier) = &earlier {
+        compare(&rows, earlier);
+    }
     rows.add("peak_rss_mib", peak_memory(), "MiB");
     if let Some(out) = variable("OUT").map(PathBuf::from) {
         artifact::write_json(&out, &rows.0)?;
