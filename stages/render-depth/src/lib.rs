@@ -3,8 +3,13 @@
 //! A field may have several members, trained apart or one on from another; what they render is averaged: each errs in its own
 //! way where the images leave it open.
 //!
+//! Where a view is smooth, a pixel shows one ray through its centre; elsewhere it shows the mean of several
+//! ([`Params::tolerance`]): adaptive sampling, as in Whitted 1980.
+//!
 //! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
 //! written sixteen at a time, so memory doesn't grow with the image.
+
+use std::ops::Range;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
@@ -25,6 +30,10 @@ pub struct Params {
     /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
+    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The error is found from the pixel's neighbours and
+    /// exact where the view is quadratic. 0 casts all rays everywhere.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub tolerance: f64,
     /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the surface and floaters before it.
     pub depth: Depth,
     /// Also writes the distance along the ray, as channel `distance`.
@@ -33,7 +42,7 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: None, samples_per_axis: 2, depth: Depth::Median, ray_distance: false }
+        Self { size: None, samples_per_axis: 2, tolerance: 0.005, depth: Depth::Median, ray_distance: false }
     }
 }
 
@@ -77,8 +86,8 @@ impl Stage for RenderDepth {
         let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
             let [image, preview] = [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
-            let job = RenderJob { context, params, members: &fields, background: file.background, camera: &camera };
-            context.part(&camera.name, &[&image, &preview], || job.render(&image, &preview, &progress))?;
+            let job = RenderJob { params, members: &fields, background: file.background, camera: &camera };
+            context.part(&camera.name, &[&image, &preview], || job.render(context, &image, &preview, &progress))?;
             done += u64::from(camera.intrinsics.height);
             progress.set(done, "");
             views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
@@ -108,7 +117,6 @@ fn pixels_of(cameras: &Views, width: Option<u32>) -> u64 {
 
 /// One view.
 struct RenderJob<'a> {
-    context: &'a Context,
     params: &'a Params,
     members: &'a [Box<dyn RayField>],
     background: Background,
@@ -116,16 +124,20 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
-    fn render(&self, image: &str, preview: &str, progress: &artifact::Progress) -> anyhow::Result<()> {
+    fn render(&self, context: &Context, image: &str, preview: &str, progress: &artifact::Progress) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
-        let exr = self.context.output_path(image)?;
-        let mut png = PngRows::create(&self.context.output_path(preview)?, width, height)?;
+        let exr = context.output_path(image)?;
+        let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
+        let mut centres = Centres::default();
         write_exr(&exr, (width, height), channels, VIEW_NOTE, |first, rows, samples| -> Result<(), Stopped> {
-            self.context.check_interrupt().map_err(Stopped::Other)?;
-            let bytes = self.band(first, rows, samples, channels.len()).map_err(Stopped::Other)?;
-            png.write(&bytes)?;
+            context.check_interrupt().map_err(Stopped::Other)?;
+            let pixels = self.band(&mut centres, first..first + rows).map_err(Stopped::Other)?;
+            for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
+                sample.copy_from_slice(&pixel.channels[..channels.len()]);
+            }
+            png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
             progress.add(rows as u64);
             Ok(())
         })
@@ -137,17 +149,42 @@ impl RenderJob<'_> {
         png.finish().context("cannot write the preview")
     }
 
-    /// Renders some rows into EXR samples; returns the preview's bytes.
-    fn band(&self, first: usize, rows: usize, samples: &mut [f32], channels: usize) -> anyhow::Result<Vec<u8>> {
-        let width = self.camera.intrinsics.width as usize;
-        let background = [self.background.shown(); 3];
+    /// Renders some rows. `centres` is kept from one band to the next.
+    fn band(&self, centres: &mut Centres, rows: Range<usize>) -> anyhow::Result<Vec<Shown>> {
+        let k = self.camera.intrinsics;
+        let (width, height) = (k.width as usize, k.height as usize);
         let n = self.params.samples_per_axis as usize;
-        let (rays, to_z): (Vec<Ray>, Vec<f32>) = (0..rows * width * n * n)
-            .map(|i| {
-                let (pixel, sub) = (i / (n * n), i % (n * n));
-                let within = |k: usize| (k as f64 + 0.5) / n as f64;
-                let u = (pixel % width) as f64 + within(sub % n);
-                let v = (first + pixel / width) as f64 + within(sub / n);
+        let all = |rows: Range<usize>| -> Vec<[usize; 2]> { rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect() };
+        if n == 1 || self.params.tolerance == 0.0 {
+            return self.cast(&all(rows), n);
+        }
+        // The row above is there already, the row below is the next band's first.
+        let kept = rows.start.saturating_sub(1).max(centres.first);
+        centres.pixels.drain(..(kept - centres.first) * width);
+        centres.first = kept;
+        let next = kept + centres.pixels.len() / width;
+        centres.pixels.extend(self.cast(&all(next..(rows.end + 1).min(height)), 1)?);
+
+        let tolerance = self.params.tolerance as f32;
+        let mut pixels = all(rows.clone());
+        pixels.retain(|&pixel| centres.error(pixel, width) > tolerance);
+        let several = self.cast(&pixels, n)?;
+        let first = (rows.start - centres.first) * width;
+        let mut shown = centres.pixels[first..first + rows.len() * width].to_vec();
+        for ([x, y], several) in pixels.into_iter().zip(several) {
+            shown[(y - rows.start) * width + x] = several;
+        }
+        Ok(shown)
+    }
+
+    /// Casts n × n rays through each pixel `[x, y]`.
+    fn cast(&self, pixels: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<Shown>> {
+        let background = [self.background.shown(); 3];
+        let within = |k: usize| (k as f64 + 0.5) / n as f64;
+        let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
+            .iter()
+            .flat_map(|[x, y]| (0..n * n).map(move |sub| (*x as f64 + within(sub % n), *y as f64 + within(sub / n))))
+            .map(|(u, v)| {
                 let ray = self.camera.ray(u, v);
                 let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
                 (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
@@ -155,28 +192,26 @@ impl RenderJob<'_> {
             .unzip();
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(|e| anyhow::anyhow!(e))?;
-        let share = 1.0 / (n * n * self.members.len()) as f32;
-        let mut preview = Vec::with_capacity(3 * rows * width);
-        let (mut subs, mut distances) = (Vec::new(), Vec::new());
-        for (i, sample) in samples.chunks_exact_mut(channels).enumerate() {
+        let mut subs = Vec::new();
+        let shown = |i: usize| {
             let rays = i * n * n..(i + 1) * n * n;
             subs.clear();
-            subs.extend(rendered.iter().flat_map(|r| &r[rays.clone()]));
-            let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(of).sum::<f32>() * share;
-            for c in 0..3 {
-                sample[c] = mean(&|p| p.premultiplied[c]);
-            }
-            sample[3] = mean(&|p| p.opacity);
-            distances.clear();
-            distances.extend(subs.iter().map(|p| self.distance(p)).zip(to_z[rays].iter().copied().cycle()));
-            let (distance, to_z) = middle(&mut distances);
-            sample[4] = distance * to_z;
-            if let Some(last) = sample.get_mut(5) {
-                *last = distance;
-            }
-            preview.extend((0..3).map(|c| to_u8(mean(&|p| p.colour[c]))));
+            subs.extend(rendered.iter().flat_map(|r| r[rays.clone()].iter().zip(&to_z[rays.clone()])));
+            self.shown(&subs)
+        };
+        Ok((0..pixels.len()).map(shown).collect())
+    }
+
+    /// What a pixel shows of its rays, each with its z-depth per distance.
+    fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> Shown {
+        let share = 1.0 / subs.len() as f32;
+        let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share;
+        let [r, g, b] = std::array::from_fn(|c| mean(&|p| p.premultiplied[c]));
+        let (distance, to_z) = middle(&mut subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect::<Vec<_>>());
+        Shown {
+            channels: [r, g, b, mean(&|p| p.opacity), distance * to_z, distance],
+            colour: std::array::from_fn(|c| mean(&|p| p.colour[c])),
         }
-        Ok(preview)
     }
 
     fn distance(&self, pixel: &radiance::Pixel) -> f32 {
@@ -184,6 +219,40 @@ impl RenderJob<'_> {
             Depth::Expected => pixel.depth,
             Depth::Median => pixel.median_depth,
         }
+    }
+}
+
+/// What a pixel shows.
+#[derive(Clone, Copy)]
+struct Shown {
+    /// Premultiplied colour, opacity, z-depth and distance: channels of the EXR.
+    channels: [f32; 6],
+    /// Colour over the background, for the preview.
+    colour: [f32; 3],
+}
+
+/// Rows of pixels by one ray through the centre of each.
+#[derive(Default)]
+struct Centres {
+    /// First row.
+    first: usize,
+    pixels: Vec<Shown>,
+}
+
+impl Centres {
+    /// How far a pixel's mean colour and opacity may be from its centre's: the view's second differences over 24, since the mean of a quadratic
+    /// over a square of side 1 differs from its centre by that part of its second derivatives. Unknown at the view's border.
+    fn error(&self, [x, y]: [usize; 2], width: usize) -> f32 {
+        let at = (y - self.first) * width + x;
+        let inside = x > 0 && x + 1 < width && at >= width && at + width < self.pixels.len();
+        if !inside {
+            return f32::INFINITY;
+        }
+        let bend = |c: usize, by: usize| {
+            let [before, own, after] = [at - by, at, at + by].map(|i| self.pixels[i].channels[c]);
+            (before - 2.0 * own + after).abs()
+        };
+        (0..4).map(|c| bend(c, 1) + bend(c, width)).fold(0.0, f32::max) / 24.0
     }
 }
 
@@ -202,5 +271,83 @@ enum Stopped {
 impl From<PixelError> for Stopped {
     fn from(error: PixelError) -> Self {
         Self::Pixels(error)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::error::Error;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use scene::Intrinsics;
+
+    use super::*;
+
+    const SIZE: usize = 24;
+    const CENTRE: f64 = SIZE as f64 / 2.0;
+
+    /// A picture on the plane z = -1, before a camera with a focal length of 1 pixel.
+    struct Picture {
+        colour: fn(f64, f64) -> f64,
+        rays: Arc<AtomicUsize>,
+    }
+
+    impl RayField for Picture {
+        fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, Box<dyn Error + Send + Sync>> {
+            self.rays.fetch_add(rays.len(), Ordering::Relaxed);
+            let pixel = |ray: &Ray| {
+                let [x, y, z] = ray.direction.map(f64::from);
+                let value = (self.colour)(CENTRE - x / z, CENTRE + y / z) as f32;
+                radiance::Pixel { colour: [value; 3], premultiplied: [value; 3], opacity: 1.0, depth: 2.0, median_depth: 2.0 }
+            };
+            Ok(rays.iter().map(pixel).collect())
+        }
+    }
+
+    /// Renders a picture in bands of some rows; returns red of each pixel and the number of rays.
+    fn red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
+        let angle = 2.0 * CENTRE.atan();
+        let intrinsics = Intrinsics::from_angle_x(SIZE as u32, SIZE as u32, angle);
+        let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let camera = Camera { name: "a".to_owned(), intrinsics, camera_to_world };
+        let count = Arc::new(AtomicUsize::new(0));
+        let members: Vec<Box<dyn RayField>> = vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
+        let params = Params { tolerance, ..Params::default() };
+        let job = RenderJob { params: &params, members: &members, background: Background::White, camera: &camera };
+        let mut centres = Centres::default();
+        let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
+        let shown: Vec<Shown> = bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
+        (shown.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
+    }
+
+    /// Bends more and more to the right.
+    fn bent(x: f64, y: f64) -> f64 {
+        0.2 + 0.004 * x + 2e-5 * x.powi(3) - 0.001 * y * y + 0.002 * x * y
+    }
+
+    #[test]
+    fn one_ray_shows_what_is_smooth_within_the_tolerance() {
+        let (all, most) = red(bent, 0.0, SIZE);
+        assert_eq!(most, 4 * SIZE * SIZE);
+        for tolerance in [1e-5, 1e-4, 1.5e-4, 2e-4, 1e-3] {
+            let (adaptive, rays) = red(bent, tolerance, SIZE);
+            let error = all.iter().zip(&adaptive).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
+            println!("tolerance {tolerance}: error {error}, {rays} rays");
+            assert!(error <= tolerance + 1e-6, "an error of {error} is above {tolerance}");
+            assert!(rays <= most + SIZE * SIZE);
+        }
+        let [few, several, many] = [1e-3, 1.5e-4, 1e-5].map(|tolerance| red(bent, tolerance, SIZE).1);
+        assert!(few < several && several < many, "{few}, {several}, {many} rays");
+        // The border's pixels have all rays.
+        assert_eq!(few, SIZE * SIZE + 4 * (4 * SIZE - 4));
+    }
+
+    #[test]
+    fn bands_change_nothing() {
+        let expected = red(bent, 1.5e-4, SIZE);
+        for band in [1, 2, 5, 16] {
+            assert!(red(bent, 1.5e-4, band) == expected, "bands of {band} rows");
+        }
     }
 }
