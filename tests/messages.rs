@@ -102,11 +102,14 @@ fn logs_of_our_stages_have_parameters_inputs_and_result() {
     project.ok(&["run"]);
     let scene = project.output_of("prep", &[]).remove(0);
     let log = project.ok(&["log", "train-ss"]);
+    let field = project.output_of("train-ss", &[]).remove(0);
+    let summary = std::fs::read_to_string(project.object(&field).join("summary.txt")).unwrap();
+    assert!(summary.contains(" rays in "), "{summary}");
     for words in [
         "train-ss: started 2",
         r#""rays":60000"#,
         &format!("input scene: {}", project.object(&scene).display()),
-        "result: 60,000 rays",
+        &format!("result: {}", summary.trim()),
     ] {
         assert!(log.contains(words), "{words}\n{log}");
     }

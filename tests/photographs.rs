@@ -306,7 +306,7 @@ fn poses_are_refined_and_test_views_registered() {
     }
     std::fs::write(&file, transforms.to_string()).unwrap();
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
-    project.replace("rays: 60000", "rays: 300000");
+    project.replace("rays: 60000", "rays: 600000");
     let scored = |refined: &str| {
         let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
         project.ok(&[&["run"], &settings[..]].concat());
@@ -348,7 +348,7 @@ fn what_masks_leave_out_is_not_learnt() {
         frame["mask_path"] = json!(format!("masks/{name}"));
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
-    project.replace("rays: 60000", "rays: 300000");
+    project.replace("rays: 60000", "rays: 600000");
     let mut scored = |masked: bool| {
         for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !masked) {
             frame.as_object_mut().unwrap().remove("mask_path");

@@ -31,7 +31,7 @@ use artifact::{
     Context, Failure, FailureExt as _, GivenInput, Input, Output, Progress, Rule, Stage, WARNING, amount, with_warnings,
 };
 use pixels::{DEGRADATION_FILE, Degradation, Kernel};
-use radiance::{FIELD_FILE, FieldFile};
+use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use scene::{Photograph, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -151,7 +151,13 @@ impl Stage for TrainSs {
         let has_kernel = input.path(DEGRADATION_FILE).exists();
         let params = params.resolve(&SceneFacts { is_fine_tuning: init.is_some(), ..SceneFacts::of(&views, has_kernel) });
         let (model, combine) = (params.model(), params.combine);
-        let mut file = FieldFile { field: model, members: params.ensemble, bounds: views.bounds, background: views.background };
+        let mut file = FieldFile {
+            format: FIELD_FORMAT,
+            field: model,
+            members: params.ensemble,
+            bounds: views.bounds,
+            background: views.background,
+        };
         let init = init.map(|input| InitField::read(input, &file)).transpose()?;
         let first = match (&init, combine) {
             (Some(init), Combine::Ensemble) => init.keep_beside(context, &mut file)?,

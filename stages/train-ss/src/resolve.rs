@@ -21,6 +21,8 @@ const DISTORTION_IN_NDC: f64 = 0.004;
 const FLOATER_LOSS: f64 = 0.001;
 /// How much more often detail is drawn, in random order.
 const PIXEL_IMPORTANCE: f64 = 10.0;
+/// Gradients shorter than so many times the mean are drawn at random.
+const ROULETTE: f32 = 1.0;
 /// Cells of the finest level for each LR pixel across the field.
 const CELLS_PER_PIXEL: f64 = 2.56;
 
@@ -356,6 +358,7 @@ impl Resolved {
             distortion: distortion as f32,
             floater_loss: floater_loss as f32,
             network_decay: grid.network_decay as f32,
+            roulette: ROULETTE,
             seed: self.seed,
         }
     }

@@ -123,7 +123,13 @@ mod tests {
         let architecture = Architecture { finest: 32, levels: 4, log2_entries: 10, steps: 64, ..Architecture::default() };
         let folder = tempfile::tempdir().unwrap();
         let write = |members: u32| {
-            let file = FieldFile { field: FieldModel::Grid(architecture), members, bounds, background: Background::White };
+            let file = FieldFile {
+                format: radiance::FIELD_FORMAT,
+                field: FieldModel::Grid(architecture),
+                members,
+                bounds,
+                background: Background::White,
+            };
             std::fs::write(folder.path().join(FIELD_FILE), serde_json::to_vec(&file).unwrap()).unwrap();
         };
         let fields: Vec<Field> = [3, 4].map(|seed| Field::new(architecture, bounds, seed)).into();

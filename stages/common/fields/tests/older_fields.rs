@@ -1,4 +1,5 @@
-//! Fields that an older build trained are read and render as they did then: commit 5af0c3e made the files in `goldens/`, of the demo scene at 16 px.
+//! Fields that an older build trained render as they did then, or are refused. The files in `goldens/` are of the demo scene at 16 px: commit 5af0c3e
+//! made `mlp`, the first commit with format 2 `grid`.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -53,6 +54,19 @@ fn renders_as_before(name: &str) {
 #[test]
 fn a_grid_renders_as_before() {
     renders_as_before("grid");
+}
+
+#[test]
+fn a_grid_of_the_first_format_is_refused() {
+    let folder = artifact("grid");
+    let file = folder.path().join(FIELD_FILE);
+    let mut description: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    // Such files don't say their format.
+    description.as_object_mut().unwrap().remove("format").unwrap();
+    std::fs::write(&file, description.to_string()).unwrap();
+    let error = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").err().unwrap();
+    let line = format!("{error:#}");
+    assert!(line.ends_with("another build trained this field, in format 1; this build reads format 2: train it again"), "{line}");
 }
 
 #[cfg(feature = "torch")]

@@ -2,18 +2,16 @@
 
 use crate::math::{exp, one_minus_exp_neg};
 use crate::simd::kernel;
+use crate::spec::MAX_RAW_DENSITY;
 
 kernel! {
     /// Optical depth τ of each sample: density e^raw times the step.
     pub(crate) fn optical_depths<L>(raw: &[f32], step: f32, tau: &mut [f32]) {
         for (tau, &raw) in tau.iter_mut().zip(raw) {
-            *tau = exp(raw.min(MAX_RAW)) * step;
+            *tau = exp(raw.min(MAX_RAW_DENSITY)) * step;
         }
     }
 }
-
-/// Density stops growing here (e^15): a step is opaque long before.
-pub(crate) const MAX_RAW: f32 = 15.0;
 
 kernel! {
     /// Transmittance before each sample and its weight, from the optical depth before it and its own.

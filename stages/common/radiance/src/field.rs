@@ -9,11 +9,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::chunk::Chunk;
 use crate::field_file::in_ranges;
-use crate::grid::{FEATURES, Level, levels};
+use crate::grid::{Level, levels};
 use crate::mlp::Layer;
-use crate::occupancy::{CELLS, Occupancy};
+use crate::occupancy::{CELLS, Cell, Occupancy, Strides};
 use crate::ray::{Ray, clip};
-use crate::spherical::BASIS;
+use crate::spec::{DENSITY_OUTPUTS, FEATURES, VIEW_INPUTS};
 
 /// What a field is made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -79,17 +79,13 @@ pub struct Field {
     pub(crate) occupancy: Occupancy,
 }
 
-/// The five layers of the two networks: features → 16 (density, 15 for colour); those and direction → colour.
+/// The five layers of the two networks: a sample's features → raw density, raw colour and view features; a ray's composited view features
+/// and direction → what is added to the raw colours of its samples.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layers {
     pub(crate) density: [Layer; 2],
-    pub(crate) colour: [Layer; 3],
+    pub(crate) view: [Layer; 3],
 }
-
-/// Outputs of the density network: raw density and what the colour network gets.
-pub(crate) const DENSITY_OUTPUTS: usize = 16;
-/// Inputs of the colour network.
-pub(crate) const COLOUR_INPUTS: usize = DENSITY_OUTPUTS - 1 + BASIS;
 
 impl Layers {
     fn new(features: usize, hidden: usize) -> Self {
@@ -101,17 +97,17 @@ impl Layers {
         };
         Self {
             density: [layer(features, hidden), layer(hidden, DENSITY_OUTPUTS)],
-            colour: [layer(COLOUR_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
+            view: [layer(VIEW_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
         }
     }
 
     pub(crate) fn all(&self) -> [Layer; 5] {
-        let ([a, b], [c, d, e]) = (self.density, self.colour);
+        let ([a, b], [c, d, e]) = (self.density, self.view);
         [a, b, c, d, e]
     }
 
     fn len(&self) -> usize {
-        self.colour[2].range().end
+        self.view[2].range().end
     }
 }
 
@@ -209,7 +205,7 @@ impl Field {
         rays.par_chunks(CHUNK_RAYS)
             .map_init(Chunk::default, |chunk, rays| {
                 let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
-                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
+                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
                 let pixel = |(i, ray): (usize, &Ray)| {
                     let sum = &chunk.sums[i];
                     let far = if clipped[i].leave > clipped[i].enter {
@@ -253,9 +249,9 @@ impl Field {
         (&mut self.grid, &mut self.network, &mut self.occupancy)
     }
 
-    /// Multiplications of the networks for one sample, forward; backward takes twice as many.
+    /// Multiplications of the density network for one sample, forward; backward takes twice as many.
     pub fn network_multiplications(&self) -> usize {
-        self.layers.all().iter().map(|l| l.inputs * l.outputs).sum()
+        self.layers.density.iter().map(|l| l.inputs * l.outputs).sum()
     }
 
     /// Makes every parameter the mean of its own and of another field's of the same architecture. Where one was trained on from the other, that is nearly
@@ -277,7 +273,7 @@ impl Field {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())
     }
 
-    /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest). No metadata, so bytes repeat.
+    /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest: 0 empty, 1 thin, 2 dense). No metadata, so bytes repeat.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
         write_tensors(
@@ -299,7 +295,7 @@ impl Field {
         read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
         read_f32(&tensors, "network", &mut field.network).map_err(format)?;
         let occupancy = read_u8(&tensors, "occupancy", CELLS).map_err(format)?;
-        field.occupancy.set(|cell| occupancy[cell] != 0);
+        field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
         if !field.is_finite() {
             return Err(format("a parameter is not finite".to_owned()));
         }
@@ -358,7 +354,7 @@ mod tests {
     fn fields_are_averaged() {
         let architecture = Architecture { finest: 32, levels: 4, log2_entries: 10, steps: 64, ..Architecture::default() };
         let [mut mean, own, other] = [3, 3, 4].map(|seed| Field::new(architecture, Bounds::default(), seed));
-        mean.occupancy.set(|cell| cell % 3 == 0);
+        mean.occupancy.set(|cell| if cell % 3 == 0 { Cell::Thin } else { Cell::Empty });
         mean.average_with(&other);
         let all = |field: &Field| -> Vec<f32> { field.grid.iter().chain(&field.network).copied().collect() };
         let expected = all(&own).into_iter().zip(all(&other)).map(|(own, other)| 0.5 * (own + other));

@@ -8,10 +8,17 @@ use crate::Architecture;
 /// Name of the description in a field's artifact; the weights lie beside it, each member's in [`FieldFile::member`].
 pub const FIELD_FILE: &str = "field.json";
 
+/// Format of the weights that this build writes: grid fields of another one it can't read, since their networks and the order of their
+/// entries differ. The paper's field has had one format.
+pub const FIELD_FORMAT: u32 = 2;
+
 /// `field.json`: what a reader of the weights must know.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FieldFile {
+    /// [`FIELD_FORMAT`] of the build that trained it; files from before there was such a number have none, and format 1.
+    #[serde(default = "first_format")]
+    pub format: u32,
     /// Which field, and what it is made of.
     pub field: FieldModel,
     /// How many there are, trained apart or one on from another: what they render is averaged.
@@ -21,6 +28,11 @@ pub struct FieldFile {
     pub bounds: Bounds,
     /// What lies behind the scene.
     pub background: scene::Background,
+}
+
+/// Format of files that don't say it.
+fn first_format() -> u32 {
+    1
 }
 
 impl FieldFile {
@@ -35,6 +47,10 @@ impl FieldFile {
             return Err(format!("members = {} is not in 1..=16", self.members));
         }
         match self.field {
+            FieldModel::Grid(_) if self.format != FIELD_FORMAT => Err(format!(
+                "another build trained this field, in format {}; this build reads format {FIELD_FORMAT}: train it again",
+                self.format
+            )),
             FieldModel::Grid(architecture) => architecture.check(),
             FieldModel::Mlp(architecture) => architecture.check(),
         }

@@ -1,15 +1,15 @@
 //! The multi-resolution grid: levels of growing resolution, four features a vertex, trilinear interpolation.
 //!
-//! A level whose vertices fit its table is stored densely; a finer one is hashed (Müller et al. 2022, "Instant neural graphics
-//! primitives", eq. 4), and collisions are left to the networks.
+//! Vertices lie in bricks of 2³, so that the eight corners of a cell touch few cache lines. A level whose bricks fit its table is stored
+//! densely; of a finer one the bricks are hashed (Müller et al. 2022, "Instant neural graphics primitives", eq. 4), and collisions are
+//! left to the networks.
 
 use crate::adam::Touched;
 use crate::field::Architecture;
 use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
+use crate::spec::{BRICK, FEATURES, HASH_FACTORS};
 
-/// Features a vertex.
-pub(crate) const FEATURES: usize = 4;
 /// Entries in a block that the optimiser takes at once.
 const PER_BLOCK: usize = LANES / FEATURES;
 
@@ -20,7 +20,9 @@ pub(crate) struct Level {
     pub(crate) resolution: [u32; 3],
     /// Entries in its table.
     pub(crate) entries: usize,
-    /// Whether vertices are hashed; then `entries` is a power of two.
+    /// Bricks along x and y.
+    bricks: [u32; 2],
+    /// Whether bricks are hashed; then `entries` is a power of two.
     pub(crate) hashed: bool,
     /// First float of its table.
     pub(crate) offset: usize,
@@ -46,11 +48,11 @@ pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
         .map(|i| {
             let cells = (f64::from(coarsest) * ratio.powi(i as i32)).round() as u32;
             let resolution = [cells, cells, cells.min(finest_z)];
-            let vertices: u64 = resolution.iter().map(|n| u64::from(*n) + 1).product();
+            let bricks = resolution.map(|n| (n + 1).div_ceil(2));
+            let vertices = bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
             let hashed = vertices > 1 << log2_entries;
-            // Whole cache lines a level.
-            let entries = if hashed { 1usize << log2_entries } else { (vertices as usize).next_multiple_of(LANES) };
-            let level = Level { resolution, entries, hashed, offset };
+            let entries = if hashed { 1usize << log2_entries } else { vertices as usize };
+            let level = Level { resolution, entries, bricks: [bricks[0], bricks[1]], hashed, offset };
             offset += entries * FEATURES;
             level
         })
@@ -78,17 +80,19 @@ fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
             fraction[axis][l] = at - whole;
         }
     }
-    let [across, down, _] = level.resolution.map(|n| n + 1);
-    let mask = level.entries as u32 - 1;
+    let [across, down] = level.bricks;
+    let mask = (level.entries / BRICK) as u32 - 1;
     for (corner, (index, weight)) in out.index.iter_mut().zip(&mut out.weight).enumerate() {
         let (dx, dy, dz) = (corner as u32 & 1, corner as u32 >> 1 & 1, corner as u32 >> 2);
         for l in 0..LANES {
             let (x, y, z) = (cell[0][l] + dx, cell[1][l] + dy, cell[2][l] + dz);
-            index[l] = if level.hashed {
-                (x ^ y.wrapping_mul(2_654_435_761) ^ z.wrapping_mul(805_459_861)) & mask
+            let (bx, by, bz) = (x >> 1, y >> 1, z >> 1);
+            let brick = if level.hashed {
+                (bx ^ by.wrapping_mul(HASH_FACTORS[0]) ^ bz.wrapping_mul(HASH_FACTORS[1])) & mask
             } else {
-                x + across * (y + down * z)
+                bx + across * (by + down * bz)
             };
+            index[l] = brick << 3 | (z & 1) << 2 | (y & 1) << 1 | x & 1;
             let share = |f: f32, d: u32| if d == 1 { f } else { 1.0 - f };
             weight[l] = share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
         }
@@ -183,7 +187,9 @@ mod tests {
         for z in 0..9 {
             for y in 0..17 {
                 for x in 0..17 {
-                    table[(x + 17 * (y + 17 * z)) * FEATURES] = (x + 2 * y + 6 * z) as f32 / 16.0;
+                    let brick = x / 2 + 9 * (y / 2 + 9 * (z / 2));
+                    let vertex = brick * BRICK + x % 2 + 2 * (y % 2) + 4 * (z % 2);
+                    table[vertex * FEATURES] = (x + 2 * y + 6 * z) as f32 / 16.0;
                 }
             }
         }

@@ -5,11 +5,15 @@
 //! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that casts rays and judges colours.
 //! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere (`torch-field`) shares: how far it has come, where there
 //!   may be something, how rays run through the unit cube.
+//! * [`spec`]: the constants that the libtorch twin shares.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
 //! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
 //!
-//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, colour
-//! and back in chunks that stay in the cache; what falls on the grid is kept and added level by level, in sample order. So
+//! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view features. A ray composites its samples' view features,
+//! and the view network makes of them and the direction a raw colour that is added to those of all its samples.
+//!
+//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, shading
+//! and back in chunks that stay in the cache; gradients of the grid are kept and added level by level, in sample order. So
 //! sums have one order, and results are equal bits at any thread count. Kernels work on 16 logical lanes whatever the machine
 //! has, and multiply-adds are fused everywhere, so AVX-512, AVX2 and portable code give equal bits, too.
 //!
@@ -37,15 +41,18 @@ mod passes;
 mod ray;
 #[cfg(test)]
 mod reference;
+mod samples;
+mod shading;
 mod simd;
+pub mod spec;
 mod spherical;
 mod tally;
 mod trainer;
 
 pub use composite::LIKE_BACKGROUND;
 pub use field::{Architecture, Field, FieldError, Pixel, RayField};
-pub use field_file::{FIELD_FILE, FieldFile, FieldModel, MlpArchitecture};
-pub use occupancy::Occupancy;
+pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldModel, MlpArchitecture};
+pub use occupancy::{Occupancy, Strides};
 pub use passes::Passes;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
 pub use simd::{Family, set_family};

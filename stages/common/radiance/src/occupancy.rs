@@ -1,4 +1,4 @@
-//! Which cells of the unit cube may hold something: what rays skip by.
+//! Which cells of the unit cube may hold something: what rays skip by, and where they take fewer samples.
 
 use counter_rng::CounterRng;
 use rayon::prelude::*;
@@ -6,9 +6,8 @@ use scene::Bounds;
 
 use crate::ray::{FASTEST, NormalizedRay, RayMap};
 use crate::simd::kernel;
+use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
 
-/// Cells along each axis.
-pub(crate) const GRID: usize = 128;
 /// Cells in all.
 pub(crate) const CELLS: usize = GRID * GRID * GRID;
 /// A word holds 4³ of what is below it: cells in a brick, bricks in a block.
@@ -24,35 +23,74 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
     (word, x % SIDE + SIDE * (y % SIDE + SIDE * (z % SIDE)))
 }
 
-/// Steps of a training between looks at the occupancy.
+/// Steps of a training between updates of the occupancy.
 const EVERY: u64 = 16;
-/// Until this step every cell is looked at; later those that are occupied, and of the others one in so many.
+/// An update looks at one occupied cell in so many, and at one empty cell in so many.
+const OCCUPIED_TURNS: usize = 4;
+const EMPTY_TURNS: usize = 16;
+/// Until this step empty cells are looked at as often as occupied ones.
 const WARM_UP: u64 = 256;
-const TURNS: usize = 16;
-/// Share of a density that is left at the next look.
-const DECAY: f32 = 0.95;
+/// Share of a density that is left when its cell is looked at again.
+const DECAY: f32 = 0.7;
 
 /// Which cell along each axis a number means.
 fn corner(cell: usize) -> [usize; 3] {
     [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)]
 }
 
-/// A slowly decaying maximum of the density seen in each cell, and the cells where it counts: 128³ over the unit cube, x fastest.
+/// Density of a cell that hasn't been looked at.
+const UNKNOWN: f32 = -1.0;
+
+/// What a cell holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Cell {
+    /// Nothing: rays leap over it.
+    Empty,
+    /// Little ([`THIN`]): in training, rays take every other sample, of double length.
+    Thin,
+    /// Much, or what isn't known yet.
+    Dense,
+}
+
+impl Cell {
+    /// As a byte of a file.
+    fn byte(self) -> u8 {
+        match self {
+            Self::Empty => 0,
+            Self::Thin => 1,
+            Self::Dense => 2,
+        }
+    }
+
+    /// From a byte of a file.
+    pub(crate) fn from_byte(byte: u8) -> Self {
+        match byte {
+            0 => Self::Empty,
+            1 => Self::Thin,
+            _ => Self::Dense,
+        }
+    }
+}
+
+/// A slowly decaying maximum of the density seen in each cell, and what it makes of the cell: 128³ over the unit cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
     density: Vec<f32>,
     /// Cells that may be occupied at all.
     hull: Option<Vec<bool>>,
-    /// A bit a cell, and a bit a brick that isn't empty.
+    /// A bit a cell that isn't empty, and a bit a brick that isn't.
     bricks: Vec<u64>,
     blocks: Vec<u64>,
+    /// A bit a dense cell.
+    dense: Vec<u64>,
 }
 
 impl Occupancy {
     /// Everything may be occupied.
     pub fn full() -> Self {
-        let mut full = Self { density: vec![0.0; CELLS], hull: None, bricks: Vec::new(), blocks: Vec::new() };
-        full.set(|_| true);
+        let mut full =
+            Self { density: vec![UNKNOWN; CELLS], hull: None, bricks: Vec::new(), blocks: Vec::new(), dense: Vec::new() };
+        full.set(|_| Cell::Dense);
         full
     }
 
@@ -90,7 +128,7 @@ impl Occupancy {
         if let Some(hull) = &self.hull {
             mask.iter_mut().zip(hull).for_each(|(kept, hull)| *kept &= hull);
         }
-        self.set(|cell| mask[cell]);
+        self.set(|cell| if mask[cell] { Cell::Dense } else { Cell::Empty });
         self.hull = Some(mask);
     }
 
@@ -99,12 +137,13 @@ impl Occupancy {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
-        let turn = (step / EVERY) as usize % TURNS;
+        let turn = (step / EVERY) as usize;
         let is_looked_at = |&cell: &u32| {
             let cell = cell as usize;
             let allowed = self.hull.as_ref().is_none_or(|h| h[cell]);
             let [.., z] = corner(cell);
-            let wanted = step <= WARM_UP || self.is_occupied(cell) || (cell % (GRID * GRID) + z) % TURNS == turn;
+            let turns = if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
+            let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
             allowed && wanted
         };
         (0..CELLS as u32).into_par_iter().filter(is_looked_at).collect()
@@ -116,8 +155,7 @@ impl Occupancy {
         corner(cell as usize).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
-    /// Takes the densities that were found in cells, and decides anew which cells may hold something, for rays with samples so far apart in
-    /// the cube.
+    /// Takes the densities that were found in cells, and decides anew what every cell holds, for rays with samples so far apart in the cube.
     pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
         if cells.is_empty() {
             return;
@@ -126,13 +164,21 @@ impl Occupancy {
             let density = &mut self.density[cell as usize];
             *density = (*density * DECAY).max(found);
         }
-        let possible = self.hull.as_ref().map_or(CELLS, |h| h.iter().filter(|k| **k).count()).max(1);
-        let mean = (self.density.iter().map(|&d| f64::from(d)).sum::<f64>() / possible as f64) as f32;
+        let known = self.density.iter().filter(|d| **d >= 0.0);
+        let (sum, count) = known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1));
+        let mean = (sum / f64::from(count.max(1))) as f32;
         // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what is denser than the mean.
-        let threshold = mean.min(0.01 / step);
+        let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
         let allowed = |cell: usize| self.hull.as_ref().is_none_or(|h| h[cell]);
-        let occupied: Vec<bool> = self.density.iter().enumerate().map(|(i, &d)| d >= threshold && allowed(i)).collect();
-        self.set(|cell| occupied[cell]);
+        let held = |(cell, &density): (usize, &f32)| match density {
+            _ if !allowed(cell) => Cell::Empty,
+            d if d < 0.0 => self.cell(cell),
+            d if d < empty => Cell::Empty,
+            d if d < thin => Cell::Thin,
+            _ => Cell::Dense,
+        };
+        let held: Vec<Cell> = self.density.iter().enumerate().map(held).collect();
+        self.set(|cell| held[cell]);
     }
 
     /// Whether a cell may hold something.
@@ -141,15 +187,28 @@ impl Occupancy {
         self.bricks[word] >> bit & 1 == 1
     }
 
+    /// What a cell holds.
+    fn cell(&self, cell: usize) -> Cell {
+        let (word, bit) = place(corner(cell), BRICKS);
+        match (self.bricks[word] >> bit & 1, self.dense[word] >> bit & 1) {
+            (0, _) => Cell::Empty,
+            (_, 0) => Cell::Thin,
+            _ => Cell::Dense,
+        }
+    }
+
     /// Sets every cell anew.
-    pub(crate) fn set(&mut self, occupied: impl Fn(usize) -> bool) {
+    pub(crate) fn set(&mut self, held: impl Fn(usize) -> Cell) {
         self.bricks = vec![0; BRICKS * BRICKS * BRICKS];
         self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
+        self.dense = vec![0; BRICKS * BRICKS * BRICKS];
         for cell in 0..CELLS {
-            if occupied(cell) {
+            let held = held(cell);
+            if held != Cell::Empty {
                 let at = corner(cell);
                 let (word, bit) = place(at, BRICKS);
                 self.bricks[word] |= 1 << bit;
+                self.dense[word] |= u64::from(held == Cell::Dense) << bit;
                 let (word, bit) = place(at.map(|c| c / SIDE), BLOCKS);
                 self.blocks[word] |= 1 << bit;
             }
@@ -167,32 +226,75 @@ impl Occupancy {
     }
 
     /// Goes on with the densities and the cells of a checkpoint.
-    pub fn restore(&mut self, density: Vec<f32>, occupied: &[u8]) {
+    pub fn restore(&mut self, density: Vec<f32>, cells: &[u8]) {
         self.density = density;
-        self.set(|cell| occupied[cell] != 0);
+        self.set(|cell| Cell::from_byte(cells[cell]));
     }
 
-    /// Cells as bytes, 1 where occupied, for a file.
+    /// Cells as bytes for a file: 0 is empty, 1 thin, 2 dense.
     pub fn to_bytes(&self) -> Vec<u8> {
-        (0..CELLS).map(|cell| u8::from(self.is_occupied(cell))).collect()
+        (0..CELLS).map(|cell| self.cell(cell).byte()).collect()
     }
 }
 
 /// Where a ray's march stands: the number of its next step; [`DONE`] once it has left the box.
 pub(crate) const DONE: u32 = u32::MAX;
 
+/// Rays to march, and how.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct March<'a> {
+    pub(crate) occupancy: &'a Occupancy,
+    pub(crate) rays: &'a [NormalizedRay],
+    /// Share of a step by which each ray's samples are shifted.
+    pub(crate) offsets: &'a [f32],
+    /// Distance between samples, in cube sides.
+    pub(crate) step: f32,
+    /// Whether thin cells get fewer samples.
+    pub(crate) strides: Strides,
+}
+
+/// Where rays take samples in thin cells.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Strides {
+    /// At every step, as in dense cells: to render.
+    Even,
+    /// At every other step, each for both: to train, where samples of other rays lie in between.
+    ByCell,
+}
+
+/// Samples found by marching, ray by ray.
+#[derive(Debug, Default)]
+pub(crate) struct Marched {
+    /// Where each sample lies along its ray.
+    pub(crate) t: Vec<f32>,
+    /// How many steps it stands for.
+    pub(crate) lengths: Vec<f32>,
+    /// Its place in the unit cube.
+    pub(crate) positions: Vec<[f32; 3]>,
+    /// First sample of each active ray, and the end.
+    pub(crate) starts: Vec<usize>,
+}
+
+impl Marched {
+    #[inline(always)]
+    fn push(&mut self, t: f32, length: f32, position: [f32; 3]) {
+        self.t.push(t);
+        self.lengths.push(length);
+        self.positions.push(position);
+    }
+}
+
 kernel! {
-    /// Marches on: at most `most` more samples of each of the `active` rays, wherever a cell is occupied, at t =
-    /// enter + (k + offset)·step. `next` is each ray's k, from 0 to [`DONE`]. Appends t and positions; `starts` gets
-    /// the first sample of each active ray, and the end.
-    pub(crate) fn march<L>(
-        occupancy: &Occupancy, rays: &[NormalizedRay], offsets: &[f32], step: f32, most: usize, active: &[u32], next: &mut [u32],
-        t: &mut Vec<f32>, positions: &mut Vec<[f32; 3]>, starts: &mut Vec<usize>,
-    ) {
+    /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies at t = enter + (k + offset)·step. An
+    /// occupied cell gives a sample there; by [`Strides::ByCell`], a thin one gives a sample of two steps where k is even, in the middle of
+    /// both. `next` is each ray's k, from 0 to [`DONE`].
+    pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32], samples: &mut Marched) {
         let last = GRID as f32 - 1.0;
+        let March { occupancy, rays, offsets, step, strides } = *march;
+        let always = u64::from(strides == Strides::Even);
         let per_step = 1.0 / step;
         for &r in active {
-            starts.push(t.len());
+            samples.starts.push(samples.t.len());
             let (ray, offset) = (&rays[r as usize], offsets[r as usize]);
             let inverse = ray.direction.map(|d| 1.0 / d);
             let mut k = next[r as usize];
@@ -216,10 +318,17 @@ kernel! {
                 } else if occupancy.bricks[brick_word] >> cell_bit & 1 == 0 {
                     (cell, 1)
                 } else {
-                    t.push(at);
-                    positions.push(p);
+                    if (occupancy.dense[brick_word] >> cell_bit & 1) | always == 1 {
+                        samples.push(at, 1.0, p);
+                        left -= 1;
+                    } else if k & 1 == 0 {
+                        let middle = (k as f32 + offset + 0.5).mul_add(step, ray.enter);
+                        if middle < ray.leave {
+                            samples.push(middle, 2.0, ray.position(middle));
+                            left -= 1;
+                        }
+                    }
                     k += 1;
-                    left -= 1;
                     continue;
                 };
                 // Where the ray leaves this empty cell or block; at least one step on.
@@ -246,7 +355,7 @@ kernel! {
             }
             next[r as usize] = k;
         }
-        starts.push(t.len());
+        samples.starts.push(samples.t.len());
     }
 }
 
@@ -258,7 +367,11 @@ mod tests {
     #[test]
     fn skipping_loses_no_sample() {
         let mut occupancy = Occupancy::full();
-        occupancy.set(|cell| (cell / 7) % 11 == 0 && cell % GRID > 40);
+        occupancy.set(|cell| match cell {
+            _ if (cell / 7) % 11 != 0 || cell % GRID <= 40 => Cell::Empty,
+            _ if (cell / GRID).is_multiple_of(2) => Cell::Thin,
+            _ => Cell::Dense,
+        });
         let step = 3.0f32.sqrt() / 512.0;
         for seed in 0..200 {
             let mut rng = CounterRng::new(1, 2, seed);
@@ -272,20 +385,29 @@ mod tests {
                 .map(|i| (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i])
                 .fold(f32::INFINITY, f32::min);
             let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
-            let mut found = Vec::new();
             // In parts, as the renderer does.
-            let (mut next, mut positions) = ([0], Vec::new());
+            let (mut next, mut found) = ([0], Marched::default());
             while next[0] != DONE {
-                march(&occupancy, &[ray], &[0.3], step, 5, &[0], &mut next, &mut found, &mut positions, &mut Vec::new());
+                march(
+                    &March { occupancy: &occupancy, rays: &[ray], offsets: &[0.3], step, strides: Strides::ByCell },
+                    5,
+                    &[0],
+                    &mut next,
+                    &mut found,
+                );
             }
-            let all = (0..2000).map(|k| (k as f32 + 0.3).mul_add(step, 0.0)).take_while(|t| *t < leave);
-            let expected: Vec<f32> = all
-                .filter(|&t| {
-                    let c: Vec<usize> =
-                        (0..3).map(|i| (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize).collect();
-                    occupancy.is_occupied(c[0] + GRID * (c[1] + GRID * c[2]))
-                })
-                .collect();
+            let found: Vec<(f32, f32)> = found.t.into_iter().zip(found.lengths).collect();
+            let sample = |k: u32| {
+                let t = (k as f32 + 0.3).mul_add(step, 0.0);
+                let c = [0, 1, 2].map(|i| (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize);
+                let middle = (k as f32 + 0.3 + 0.5).mul_add(step, 0.0);
+                match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
+                    Cell::Dense if t < leave => Some((t, 1.0)),
+                    Cell::Thin if k.is_multiple_of(2) && middle < leave => Some((middle, 2.0)),
+                    _ => None,
+                }
+            };
+            let expected: Vec<(f32, f32)> = (0..2000).filter_map(sample).collect();
             // Rounding at a face may move one sample in a thousand across it.
             let missing = expected.iter().filter(|t| !found.contains(t)).count();
             assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());
@@ -299,7 +421,7 @@ mod tests {
         let mut occupancy = Occupancy::full();
         let cell = |x: usize, y: usize, z: usize| x + GRID * (y + GRID * z);
         let (inside, corner) = (cell(5, 60, 70), cell(0, GRID - 1, 0));
-        occupancy.set(|c| c == inside || c == corner);
+        occupancy.set(|c| if c == inside || c == corner { Cell::Thin } else { Cell::Empty });
         occupancy.limit_to_occupied();
         assert_eq!(occupancy.cells().count(), 27 + 8);
         let mut hull = vec![1; CELLS];
@@ -307,7 +429,8 @@ mod tests {
         occupancy.limit_to_hull(&Bounds { max: [1.0; 3], ..Bounds::default() }, &hull);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        assert_eq!(occupancy.cells_to_update(EVERY).len(), 26 + 8);
+        let updates = (1..=OCCUPIED_TURNS as u64).map(|turn| occupancy.cells_to_update(turn * EVERY).len());
+        assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);
     }
@@ -316,7 +439,7 @@ mod tests {
     fn cells_are_those_set() {
         let mut occupancy = Occupancy::full();
         assert_eq!(occupancy.cells().count(), GRID * GRID * GRID);
-        occupancy.set(|cell| cell % 1000 == 3);
+        occupancy.set(|cell| if cell % 1000 == 3 { Cell::Dense } else { Cell::Empty });
         assert!(occupancy.cells().eq((0..GRID * GRID * GRID).filter(|c| c % 1000 == 3)));
     }
 }

@@ -1,7 +1,9 @@
-use crate::chunk::{Chunk, FeatureGradients};
+use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::composite::Regularisers;
 use crate::field::{CHUNK_RAYS, Field};
+use crate::occupancy::Strides;
 use crate::ray::{Ray, clip};
+use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 
 /// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what another reading of the field is
@@ -29,25 +31,17 @@ impl Passes {
     /// a trainer scatters. Returns the samples marched and those that got a colour.
     pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
         let mut samples = [0; 2];
-        self.into.positions.clear();
-        self.into.levels.iter_mut().for_each(Vec::clear);
+        self.into.clear();
         for rays in rays.chunks(CHUNK_RAYS) {
             let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
-            self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()]);
+            self.chunk.forward(field, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
             samples[0] += self.chunk.samples();
             samples[1] += self.chunk.coloured();
             if backward {
-                let backgrounds = [[1.0; 3]; CHUNK_RAYS];
-                let gradients = [[1.0; 3]; CHUNK_RAYS];
-                self.chunk.backward(
-                    field,
-                    &self.transposed,
-                    &gradients,
-                    &backgrounds,
-                    Regularisers::default(),
-                    &mut self.lanes,
-                    &mut self.into,
-                );
+                let ones = [[1.0; 3]; CHUNK_RAYS];
+                let towards = RayGradients { colours: &ones, backgrounds: &ones, regularisers: Regularisers::default() };
+                let mut network = NetworkGradients { transposed: &self.transposed, lanes: &mut self.lanes };
+                self.chunk.backward(field, towards, Roulette::default(), &mut network, &mut self.into);
             }
         }
         samples

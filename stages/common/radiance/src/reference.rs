@@ -3,14 +3,16 @@
 use counter_rng::CounterRng;
 use scene::Bounds;
 
-use crate::chunk::{Chunk, FeatureGradients};
+use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::composite::{Regularisers, likeness};
-use crate::field::{Architecture, COLOUR_INPUTS, DENSITY_OUTPUTS, Field};
-use crate::grid::{FEATURES, Level, scatter};
+use crate::field::{Architecture, Field};
+use crate::grid::{Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
-use crate::occupancy::march;
-use crate::ray::{Ray, clip};
+use crate::occupancy::{Cell, March, Marched, Strides, march};
+use crate::ray::{NormalizedRay, Ray, clip};
+use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
+use crate::spec::{BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS};
 use crate::spherical::spherical_harmonics;
 
 /// Parameters in f64.
@@ -34,12 +36,14 @@ impl Judge<'_> {
                     if d[i] == 1 { f } else { 1.0 - f }
                 })
                 .product();
-            let [across, down, _] = level.resolution.map(|n| n + 1);
-            let index = if level.hashed {
-                (v[0] ^ v[1].wrapping_mul(2_654_435_761) ^ v[2].wrapping_mul(805_459_861)) as usize % level.entries
+            let [across, down, _] = level.resolution.map(|n| n / 2 + 1);
+            let [x, y, z] = v.map(|n| n / 2);
+            let brick = if level.hashed {
+                (x ^ y.wrapping_mul(HASH_FACTORS[0]) ^ z.wrapping_mul(HASH_FACTORS[1])) as usize % (level.entries / BRICK)
             } else {
-                (v[0] + across * (v[1] + down * v[2])) as usize
+                (x + across * (y + down * z)) as usize
             };
+            let index = BRICK * brick + (v[0] % 2 + 2 * (v[1] % 2) + 4 * (v[2] % 2)) as usize;
             for k in 0..FEATURES {
                 sum[k] += w * self.grid[level.offset + index * FEATURES + k];
             }
@@ -57,42 +61,92 @@ impl Judge<'_> {
             .collect()
     }
 
-    /// Raw density and the colour network's share of the inputs.
+    /// Outputs of the density network.
     fn density(&self, p: [f64; 3]) -> Vec<f64> {
         let features: Vec<f64> = self.field.levels.iter().flat_map(|l| self.interpolate(l, p)).collect();
         let [first, second] = self.field.layers.density;
         self.layer(second, &self.layer(first, &features, true), false)
     }
 
-    fn colour(&self, density: &[f64], direction: [f32; 3]) -> [f64; 3] {
-        let input: Vec<f64> = density[1..].iter().copied().chain(spherical_harmonics(direction).map(f64::from)).collect();
-        assert_eq!((density.len(), input.len()), (DENSITY_OUTPUTS, COLOUR_INPUTS));
-        let [first, second, third] = self.field.layers.colour;
-        let raw = self.layer(third, &self.layer(second, &self.layer(first, &input, true), true), false);
-        [0, 1, 2].map(|c| 1.0 / (1.0 + (-raw[c]).exp()))
+    /// What is added to the raw colours of a ray's samples, by their composited outputs.
+    fn added(&self, composited: &[f64], direction: [f32; 3]) -> Vec<f64> {
+        let features = composited[VIEW_FEATURE..].iter().copied();
+        let input: Vec<f64> = features.chain(spherical_harmonics(direction).map(f64::from)).collect();
+        assert_eq!((composited.len(), input.len()), (DENSITY_OUTPUTS, VIEW_INPUTS));
+        let [first, second, third] = self.field.layers.view;
+        self.layer(third, &self.layer(second, &self.layer(first, &input, true), true), false)
     }
 
-    /// Weight and colour of a ray's samples, and the light that comes through; samples that aren't `kept` are dark, as in the fused pass.
-    fn shaded(&self, ray: &Ray, samples: &[[f32; 3]], kept: &[bool]) -> (Vec<(f64, [f64; 3])>, f64) {
+    /// Weight and colour of a ray's samples that count, and the light that comes through. Without those that don't count, it is what the fused
+    /// pass sees.
+    fn shaded(&self, ray: &Ray, samples: &[Sample]) -> (Vec<(f64, [f64; 3])>, f64) {
         let step = f64::from(self.field.step());
-        let (mut depth, mut shaded) = (0.0f64, Vec::new());
-        for (p, kept) in samples.iter().zip(kept) {
-            let density = self.density(p.map(f64::from));
-            let tau = density[0].exp() * step;
-            if *kept {
-                shaded.push(((-depth).exp() * -(-tau).exp_m1(), self.colour(&density, ray.direction)));
+        let (mut depth, mut counted) = (0.0f64, Vec::new());
+        let mut composited = vec![0.0; DENSITY_OUTPUTS];
+        for sample in samples {
+            let outputs = self.density(sample.position.map(f64::from));
+            let tau = outputs[0].exp() * step * f64::from(sample.length);
+            if sample.counts {
+                let weight = (-depth).exp() * -(-tau).exp_m1();
+                composited.iter_mut().zip(&outputs).for_each(|(sum, value)| *sum += weight * value);
+                counted.push((weight, outputs));
             }
             depth += tau;
         }
-        (shaded, (-depth).exp())
+        let added = self.added(&composited, ray.direction);
+        let colour = |outputs: &[f64]| [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()));
+        (counted.iter().map(|(weight, outputs)| (*weight, colour(outputs))).collect(), (-depth).exp())
     }
 
     /// Colour of a ray over its background.
-    fn ray(&self, ray: &Ray, samples: &[[f32; 3]], kept: &[bool]) -> [f64; 3] {
-        let (shaded, transmittance) = self.shaded(ray, samples, kept);
+    fn ray(&self, ray: &Ray, samples: &[Sample]) -> [f64; 3] {
+        let (shaded, transmittance) = self.shaded(ray, samples);
         let sum = |c: usize| shaded.iter().map(|(weight, colour)| weight * colour[c]).sum::<f64>();
         std::array::from_fn(|c| transmittance.mul_add(f64::from(ray.background[c]), sum(c)))
     }
+}
+
+/// A sample of a ray.
+#[derive(Clone, Copy, Debug)]
+struct Sample {
+    position: [f32; 3],
+    /// Steps that it stands for.
+    length: f32,
+    /// Whether it has a colour and a gradient.
+    counts: bool,
+}
+
+/// All samples of each ray, marched at once.
+fn samples(field: &Field, rays: &[NormalizedRay], offsets: &[f32], strides: Strides) -> Vec<Vec<Sample>> {
+    let rays_alone = rays.iter().zip(offsets).map(|(&ray, &offset)| {
+        let mut marched = Marched::default();
+        let one = March { occupancy: &field.occupancy, rays: &[ray], offsets: &[offset], step: field.step(), strides };
+        march(&one, 9999, &[0], &mut [0], &mut marched);
+        let samples = marched.positions.into_iter().zip(marched.lengths);
+        samples.map(|(position, length)| Sample { position, length, counts: true }).collect()
+    });
+    rays_alone.collect()
+}
+
+/// Runs the fused backward pass: gradients by the grid and by the networks.
+fn fused_gradients(
+    field: &Field,
+    chunk: &mut Chunk,
+    towards: RayGradients<'_>,
+    roulette: Roulette,
+) -> (Vec<f32>, Vec<f32>, usize) {
+    let mut transposed = vec![0.0; field.network.len()];
+    field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
+    let mut lanes = vec![0.0; field.network.len() * LANES];
+    let mut features = FeatureGradients::default();
+    chunk.backward(field, towards, roulette, &mut NetworkGradients { transposed: &transposed, lanes: &mut lanes }, &mut features);
+    let mut network = vec![0.0; field.network.len()];
+    drain_lanes(&mut lanes, &mut network);
+    let mut grid = vec![0.0f32; field.grid.len()];
+    for (level, gradients) in field.levels.iter().zip(&features.levels) {
+        scatter(level, &mut grid[level.range()], &mut vec![0; level.blocks()], &features.positions, gradients);
+    }
+    (grid, network, features.positions.len())
 }
 
 fn example() -> (Field, Vec<Ray>) {
@@ -102,6 +156,7 @@ fn example() -> (Field, Vec<Ray>) {
     let mut rng = CounterRng::new(8, 8, 8);
     // Features of the size that training reaches, and density high enough that every sample counts.
     field.grid.iter_mut().for_each(|g| *g = rng.uniform() - 0.5);
+    field.occupancy.set(|cell| if cell / 40 % 3 == 0 { Cell::Thin } else { Cell::Dense });
     let rays = (0..20)
         .map(|_| {
             let mut unit = || 2.0 * rng.uniform() - 1.0;
@@ -120,25 +175,18 @@ fn fused_passes_equal_the_plain_ones() {
     let (field, mut rays) = example();
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
-    chunk.forward(&field, &clipped, &[0.5; 20]);
-    // All samples of each ray, marched at once.
-    let samples: Vec<Vec<[f32; 3]>> = (0..rays.len())
-        .map(|r| {
-            let mut positions = Vec::new();
-            let (step, mut next) = (field.step(), vec![0; rays.len()]);
-            let one = [r as u32];
-            march(&field.occupancy, &clipped, &[0.5; 20], step, 999, &one, &mut next, &mut vec![], &mut positions, &mut vec![]);
-            positions
-        })
-        .collect();
-    let kept: Vec<Vec<bool>> =
-        samples.iter().zip(chunk.kept_positions()).map(|(all, kept)| all.iter().map(|p| kept.contains(p)).collect()).collect();
-    assert!(samples.iter().map(Vec::len).sum::<usize>() > 100);
+    chunk.forward(&field, &clipped, &[0.5; 20], Strides::ByCell);
+    let mut samples = samples(&field, &clipped, &[0.5; 20], Strides::ByCell);
+    for (all, kept) in samples.iter_mut().zip(chunk.kept_positions()) {
+        all.iter_mut().for_each(|sample| sample.counts = kept.contains(&sample.position));
+    }
+    let of_length = |length: f32| samples.iter().flatten().filter(|s| s.length == length && s.counts).count();
+    assert!(of_length(1.0) > 100 && of_length(2.0) > 20, "{} and {}", of_length(1.0), of_length(2.0));
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let mut judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
     // Each ray's background is like one of its samples.
     for (i, ray) in rays.iter_mut().enumerate() {
-        let (shaded, _) = judge.shaded(ray, &samples[i], &kept[i]);
+        let (shaded, _) = judge.shaded(ray, &samples[i]);
         if let Some((_, colour)) = shaded.get(shaded.len() / 2) {
             ray.background = colour.map(|c| c as f32 + 0.02);
         }
@@ -149,7 +197,7 @@ fn fused_passes_equal_the_plain_ones() {
     let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
-            let (shaded, through) = judge.shaded(&rays[i], &samples[i], &kept[i]);
+            let (shaded, through) = judge.shaded(&rays[i], &samples[i]);
             let like = |colour: &[f64; 3]| f64::from(likeness(colour.map(|c| c as f32), rays[i].background));
             shaded.iter().map(|(_, colour)| through * like(colour)).collect()
         })
@@ -161,34 +209,25 @@ fn fused_passes_equal_the_plain_ones() {
     let g: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
     let loss = |judge: &Judge<'_>| -> f64 {
         let dot = |i: usize| -> f64 {
-            let (shaded, _) = judge.shaded(&rays[i], &samples[i], &kept[i]);
+            let (shaded, _) = judge.shaded(&rays[i], &samples[i]);
             let floaters: f64 = shaded.iter().zip(&likenesses[i]).map(|((weight, _), likeness)| weight * likeness).sum();
-            let colour = judge.ray(&rays[i], &samples[i], &kept[i]);
+            let colour = judge.ray(&rays[i], &samples[i]);
             colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
                 + f64::from(regularisers.floater_loss) * floaters
         };
         (0..rays.len()).map(dot).sum()
     };
     for (i, sum) in chunk.sums.iter().enumerate() {
-        let exact = judge.ray(&rays[i], &samples[i], &kept[i]);
+        let exact = judge.ray(&rays[i], &samples[i]);
         for c in 0..3 {
             let ours = f64::from(sum.transmittance.mul_add(rays[i].background[c], sum.colour[c]));
             assert!((ours - exact[c]).abs() < 2e-6, "ray {i}: {ours} {}", exact[c]);
         }
     }
 
-    let mut transposed = vec![0.0; field.network.len()];
-    field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
-    let mut lanes = vec![0.0; field.network.len() * LANES];
-    let mut features = FeatureGradients::default();
     let backgrounds: Vec<[f32; 3]> = rays.iter().map(|r| r.background).collect();
-    chunk.backward(&field, &transposed, &g, &backgrounds, regularisers, &mut lanes, &mut features);
-    let mut network = vec![0.0; field.network.len()];
-    drain_lanes(&mut lanes, &mut network);
-    let mut grid = vec![0.0f32; field.grid.len()];
-    for (level, gradients) in field.levels.iter().zip(&features.levels) {
-        scatter(level, &mut grid[level.range()], &mut vec![0; level.blocks()], &features.positions, gradients);
-    }
+    let towards = RayGradients { colours: &g, backgrounds: &backgrounds, regularisers };
+    let (grid, network, _) = fused_gradients(&field, &mut chunk, towards, Roulette::default());
 
     let mut difference = |which: usize, index: usize| {
         const H: f64 = 1e-6;
@@ -218,6 +257,37 @@ fn fused_passes_equal_the_plain_ones() {
     }
 }
 
+/// Samples with short gradients are drawn, and the mean over evenly spaced draws is the gradient of all of them.
+#[test]
+fn roulette_keeps_the_expected_gradient() {
+    let (field, rays) = example();
+    let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
+    let mut rng = CounterRng::new(2, 1, 1);
+    let colours: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
+    let backgrounds = [[0.5; 3]; 20];
+    let towards = RayGradients { colours: &colours, backgrounds: &backgrounds, regularisers: Regularisers::default() };
+    let gradients = |roulette: Roulette| {
+        let mut chunk = Chunk::default();
+        chunk.forward(&field, &clipped, &[0.5; 20], Strides::ByCell);
+        fused_gradients(&field, &mut chunk, towards, roulette)
+    };
+    let (all_grid, all_network, all) = gradients(Roulette::default());
+    let all_gradients: Vec<f64> = all_grid.iter().chain(&all_network).map(|&g| f64::from(g)).collect();
+    const DRAWS: usize = 400;
+    let (mut mean, mut kept) = (vec![0.0f64; all_gradients.len()], 0);
+    for draw in 0..DRAWS {
+        let draw = (draw as f32 + 0.5) / DRAWS as f32;
+        let (grid, network, chosen) = gradients(Roulette { limit: 1.0, draw });
+        kept += chosen;
+        mean.iter_mut().zip(grid.iter().chain(&network)).for_each(|(sum, &g)| *sum += f64::from(g) / DRAWS as f64);
+    }
+    let norm = |of: &mut dyn Iterator<Item = f64>| of.map(|x| x * x).sum::<f64>().sqrt();
+    let error = norm(&mut mean.iter().zip(&all_gradients).map(|(a, b)| a - b)) / norm(&mut all_gradients.iter().copied());
+    let share = kept as f64 / (DRAWS * all) as f64;
+    println!("{share} of {all} samples are kept; the mean gradient is off by {error}");
+    assert!((0.1..0.8).contains(&share) && error < 0.01, "{share} {error}");
+}
+
 /// Rays that end where it is dark see what the whole rays would, but for the share of light that was left.
 #[test]
 fn stopping_early_loses_no_more_than_the_light_that_was_left() {
@@ -227,27 +297,14 @@ fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     field.network[second.range()].iter_mut().step_by(second.outputs).for_each(|w| *w = 6.0);
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut chunk = Chunk::default();
-    chunk.forward(&field, &clipped, &[0.5; 20]);
+    chunk.forward(&field, &clipped, &[0.5; 20], Strides::Even);
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
+    let samples = samples(&field, &clipped, &[0.5; 20], Strides::Even);
     let mut stopped = 0;
     for (r, sum) in chunk.sums.iter().enumerate() {
-        let (mut positions, mut next) = (Vec::new(), vec![0; rays.len()]);
-        let one = [r as u32];
-        march(
-            &field.occupancy,
-            &clipped,
-            &[0.5; 20],
-            field.step(),
-            999,
-            &one,
-            &mut next,
-            &mut vec![],
-            &mut positions,
-            &mut vec![],
-        );
         stopped += usize::from(sum.transmittance < 1e-4);
-        let exact = judge.ray(&rays[r], &positions, &vec![true; positions.len()]);
+        let exact = judge.ray(&rays[r], &samples[r]);
         for c in 0..3 {
             let ours = f64::from(sum.transmittance.mul_add(rays[r].background[c], sum.colour[c]));
             assert!((ours - exact[c]).abs() < 1e-3, "ray {r}: {ours} {}", exact[c]);
@@ -263,27 +320,13 @@ fn every_family_renders_and_trains_to_equal_bits() {
     let outcome = || {
         let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
         let mut chunk = Chunk::default();
-        chunk.forward(&field, &clipped, &[0.25; 20]);
+        chunk.forward(&field, &clipped, &[0.25; 20], Strides::ByCell);
         let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
-        let mut lanes = vec![0.0; field.network.len() * LANES];
-        let mut features = FeatureGradients::default();
-        let backgrounds = vec![[0.5; 3]; rays.len()];
         let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
-        chunk.backward(
-            &field,
-            &field.network,
-            &vec![[0.3, -0.2, 0.1]; rays.len()],
-            &backgrounds,
-            regularisers,
-            &mut lanes,
-            &mut features,
-        );
-        bits.extend(lanes.iter().map(|x| x.to_bits()));
-        for (level, gradients) in field.levels.iter().zip(&features.levels) {
-            let mut grid = vec![0.0f32; level.entries * FEATURES];
-            scatter(level, &mut grid, &mut vec![0; level.blocks()], &features.positions, gradients);
-            bits.extend(grid.iter().map(|x| x.to_bits()));
-        }
+        let towards = RayGradients { colours: &[[0.3, -0.2, 0.1]; 20], backgrounds: &[[0.5; 3]; 20], regularisers };
+        let roulette = Roulette { limit: 1.0, draw: 0.7 };
+        let (grid, network, _) = fused_gradients(&field, &mut chunk, towards, roulette);
+        bits.extend(grid.iter().chain(&network).map(|x| x.to_bits()));
         bits
     };
     let best = outcome();

@@ -1,5 +1,4 @@
-/// Number of basis functions: spherical harmonics up to degree 2.
-pub(crate) const BASIS: usize = 9;
+use crate::spec::BASIS;
 
 /// Real spherical harmonics up to degree 2 of a unit direction.
 pub(crate) fn spherical_harmonics([x, y, z]: [f32; 3]) -> [f32; BASIS] {

@@ -6,13 +6,15 @@ use rayon::prelude::*;
 use safetensors::SafeTensors;
 
 use crate::adam::{AdamStep, adam};
-use crate::chunk::{Chunk, FeatureGradients, densities};
+use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::composite::Regularisers;
 use crate::field::{CHUNK_RAYS, Field, FieldError, Tensor, read_f32, read_u8, write_tensors};
 use crate::grid::scatter;
 use crate::mlp::drain_lanes;
-use crate::occupancy::{CELLS, Occupancy};
+use crate::occupancy::{CELLS, Occupancy, Strides};
 use crate::ray::{NormalizedRay, Ray, clip};
+use crate::samples::DensityRows;
+use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 use crate::tally::Tally;
 
@@ -59,6 +61,9 @@ pub struct TrainingOptions {
     pub floater_loss: f32,
     /// Weight decay of the networks.
     pub network_decay: f32,
+    /// Samples whose gradient is shorter than so many times the mean of those around go back to the grid at random, as often as their share
+    /// of it says and lengthened by as much (Russian roulette): the expected gradient stays. 0 takes all back.
+    pub roulette: f32,
     /// Seed of everything that is drawn.
     pub seed: u64,
 }
@@ -79,6 +84,11 @@ impl TrainingOptions {
     /// Share of a step by which the samples of a ray are shifted, by its number in the training.
     pub fn offset(&self, ray: u64) -> f32 {
         uniform(self.seed, 4, ray)
+    }
+
+    /// The draw of a chunk, by the number of its first ray.
+    fn roulette(&self, ray: u64) -> Roulette {
+        Roulette { limit: self.roulette, draw: uniform(self.seed, 5, ray) }
     }
 
     /// Learning rate of a level, for a schedule.
@@ -233,13 +243,20 @@ impl Trainer {
             layer.transpose(&self.field.network, &mut self.transposed);
         }
 
-        let (field, options, transposed, workers) = (&self.field, &self.options, &self.transposed, &self.workers);
-        let (first_bundle, first_ray) = (self.tally.bundles, self.tally.rays);
-        let judge = &*supervision;
+        let first_bundle = self.tally.bundles;
+        let work = StepWork {
+            field: &self.field,
+            transposed: &self.transposed,
+            supervision: &*supervision,
+            options: &self.options,
+            first_bundle,
+            first_ray: self.tally.rays,
+            bundles,
+        };
+        let workers = &self.workers;
         self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
-            let range = bundles * i / SHARDS..bundles * (i + 1) / SHARDS;
             let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, field, transposed, judge, options, (first_bundle, first_ray), range, bundles);
+            shard.run(&mut worker, &work, bundles * i / SHARDS..bundles * (i + 1) / SHARDS);
             lock(workers).push(worker);
         });
 
@@ -302,7 +319,7 @@ impl Trainer {
         let mut grids =
             (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
         for ((i, level), touched) in self.field.levels.iter().enumerate().zip(&mut self.touched) {
-            let len = level.entries * crate::grid::FEATURES;
+            let len = level.range().len();
             let (w, rest_w) = grids.0.split_at_mut(len);
             let (g, rest_g) = grids.1.split_at_mut(len);
             let (m, rest_m) = grids.2.split_at_mut(len);
@@ -341,14 +358,17 @@ impl Trainer {
         let (field, seed, at) = (&self.field, self.options.seed, self.tally.steps);
         let cells = field.occupancy.cells_to_update(at);
         let found = cells.par_chunks(1024).map_init(
-            || (Chunk::default(), vec![0.0; 3 * 1024]),
-            |(chunk, positions), cells| {
+            || (DensityRows::default(), vec![0.0; 3 * 1024]),
+            |(rows, positions), cells| {
                 let n = cells.len().next_multiple_of(LANES);
                 for (k, &cell) in cells.iter().enumerate() {
                     let place = Occupancy::place_in(cell, seed, at);
                     (0..3).for_each(|axis| positions[axis * n + k] = place[axis]);
                 }
-                densities(chunk, field, &positions[..3 * n], n)[..cells.len()].to_vec()
+                let mut found = vec![0.0; n];
+                rows.densities(field, &positions[..3 * n], n, &mut found);
+                found.truncate(cells.len());
+                found
             },
         );
         let found: Vec<f32> = found.flatten_iter().collect();
@@ -432,75 +452,74 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
+/// What all shards of a step read.
+struct StepWork<'a, S> {
+    field: &'a Field,
+    /// The networks' weights output by output.
+    transposed: &'a [f32],
+    supervision: &'a S,
+    options: &'a TrainingOptions,
+    first_bundle: u64,
+    first_ray: u64,
+    /// Bundles of the step.
+    bundles: usize,
+}
+
 impl Shard {
-    #[allow(clippy::too_many_arguments, reason = "what a shard reads of the trainer, which is borrowed elsewhere")]
-    fn run(
-        &mut self,
-        worker: &mut Worker,
-        field: &Field,
-        transposed: &[f32],
-        supervision: &impl Supervisor,
-        options: &TrainingOptions,
-        (first_bundle, first_ray): (u64, u64),
-        range: std::ops::Range<usize>,
-        bundles: usize,
-    ) {
-        let bundle = supervision.rays_per_bundle();
+    /// Takes a range of the step's bundles forward and back.
+    fn run(&mut self, worker: &mut Worker, work: &StepWork<'_, impl Supervisor>, range: std::ops::Range<usize>) {
         self.colours.clear();
-        self.features.positions.clear();
-        self.features.levels.iter_mut().for_each(Vec::clear);
-        self.network.resize(field.network.len(), 0.0);
+        self.features.clear();
+        self.network.resize(work.field.network.len(), 0.0);
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
-        worker.lanes.resize(field.network.len() * LANES, 0.0);
-        let chunk_bundles = (CHUNK_RAYS / bundle).max(1);
-        let scale = 1.0 / bundles as f32;
-        let of_ray = |weight: f32| weight * scale / bundle as f32;
-        let regularisers = Regularisers { distortion: of_ray(options.distortion), floater_loss: of_ray(options.floater_loss) };
+        worker.lanes.resize(work.field.network.len() * LANES, 0.0);
+        let chunk_bundles = (CHUNK_RAYS / work.supervision.rays_per_bundle()).max(1);
         let mut next = range.start;
         while next < range.end {
             let here = next..(next + chunk_bundles).min(range.end);
-            let rays = here.len() * bundle;
-            worker.rays.resize(rays, Ray::default());
-            worker.colours.resize(rays, [0.0; 3]);
-            worker.gradients.resize(rays, [0.0; 3]);
-            for (k, g) in here.clone().enumerate() {
-                supervision.sample_rays(first_bundle + g as u64, &mut worker.rays[k * bundle..(k + 1) * bundle]);
-            }
-            worker.clipped.clear();
-            worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
-            worker.backgrounds.clear();
-            worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
-            let ray = first_ray + (here.start * bundle) as u64;
-            worker.offsets.clear();
-            worker.offsets.extend((0..rays as u64).map(|r| options.offset(ray + r)));
-            worker.chunk.forward(field, &worker.clipped, &worker.offsets);
-            self.samples += worker.chunk.samples();
-            for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
-                *colour = std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
-            }
-            for (k, g) in here.clone().enumerate() {
-                let part = k * bundle..(k + 1) * bundle;
-                self.loss += supervision.loss_and_gradient(
-                    first_bundle + g as u64,
-                    &worker.colours[part.clone()],
-                    &mut worker.gradients[part],
-                );
-            }
-            self.colours.extend_from_slice(&worker.colours);
-            worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
-            worker.chunk.backward(
-                field,
-                transposed,
-                &worker.gradients,
-                &worker.backgrounds,
-                regularisers,
-                &mut worker.lanes,
-                &mut self.features,
-            );
             next = here.end;
+            self.run_chunk(worker, work, here);
         }
         drain_lanes(&mut worker.lanes, &mut self.network);
+    }
+
+    /// Takes a few bundles forward and back.
+    fn run_chunk(&mut self, worker: &mut Worker, work: &StepWork<'_, impl Supervisor>, here: std::ops::Range<usize>) {
+        let StepWork { field, supervision, options, .. } = *work;
+        let bundle = supervision.rays_per_bundle();
+        let rays = here.len() * bundle;
+        worker.rays.resize(rays, Ray::default());
+        worker.colours.resize(rays, [0.0; 3]);
+        worker.gradients.resize(rays, [0.0; 3]);
+        let numbers = here.clone().map(|g| work.first_bundle + g as u64);
+        for (number, rays) in numbers.clone().zip(worker.rays.chunks_exact_mut(bundle)) {
+            supervision.sample_rays(number, rays);
+        }
+        worker.clipped.clear();
+        worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
+        worker.backgrounds.clear();
+        worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
+        let first_ray = work.first_ray + (here.start * bundle) as u64;
+        worker.offsets.clear();
+        worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
+        worker.chunk.forward(field, &worker.clipped, &worker.offsets, Strides::ByCell);
+        self.samples += worker.chunk.samples();
+        for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
+            *colour = std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
+        }
+        let judged = worker.colours.chunks_exact(bundle).zip(worker.gradients.chunks_exact_mut(bundle));
+        for (number, (colours, gradients)) in numbers.zip(judged) {
+            self.loss += supervision.loss_and_gradient(number, colours, gradients);
+        }
+        self.colours.extend_from_slice(&worker.colours);
+        let scale = 1.0 / work.bundles as f32;
+        worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
+        let of_ray = |weight: f32| weight * scale / bundle as f32;
+        let regularisers = Regularisers { distortion: of_ray(options.distortion), floater_loss: of_ray(options.floater_loss) };
+        let towards = RayGradients { colours: &worker.gradients, backgrounds: &worker.backgrounds, regularisers };
+        let mut network = NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };
+        worker.chunk.backward(field, towards, options.roulette(first_ray), &mut network, &mut self.features);
     }
 }
 
@@ -539,9 +558,9 @@ mod tests {
         let architecture =
             Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
         let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
-        let trained = |field: Field, background: f32, floater_loss: f32| {
+        let trained = |field: Field, background: f32, floater_loss: f32, steps: u64| {
             let options = TrainingOptions {
-                rays: 80 * 256,
+                rays: steps * 256,
                 max_rays_per_step: 256,
                 samples_per_step: 1 << 20,
                 learning_rate: 1e-2,
@@ -553,6 +572,7 @@ mod tests {
                 distortion: 0.0,
                 floater_loss,
                 network_decay: 0.0,
+                roulette: 1.0,
                 seed: 9,
             };
             let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
@@ -563,8 +583,8 @@ mod tests {
             let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
             (field, opacity)
         };
-        let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0);
-        let ((_, without), (_, with)) = (trained(floater.clone(), 1.0, 0.0), trained(floater, 1.0, 1e-3));
+        let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0, 40);
+        let ((_, without), (_, with)) = (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));
         println!("opacity {opacity} before black, then before white {without}, with the floater loss {with}");
         assert!(opacity > 0.5 && without > 0.5 * opacity && with < 0.1 * without);
     }

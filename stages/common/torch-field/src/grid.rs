@@ -1,4 +1,8 @@
-use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField};
+use radiance::spec::{
+    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS, RAW_COLOUR, VIEW_FEATURE,
+    VIEW_FEATURES,
+};
+use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, Strides};
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
@@ -18,8 +22,8 @@ pub struct TorchGrid {
     pub(crate) table: Tensor,
     /// Five layers, each inputs × outputs.
     pub(crate) layers: [Tensor; 5],
-    /// 128³, x fastest; bool.
-    pub(crate) occupied: Tensor,
+    /// What each of 128³ cells holds, x fastest: 0 is empty, 1 thin, 2 dense.
+    pub(crate) cells: Tensor,
 }
 
 /// One level of the grid: Müller et al. 2022, "Instant neural graphics primitives".
@@ -27,20 +31,12 @@ pub struct TorchGrid {
 pub(crate) struct TorchLevel {
     /// Cells along each axis.
     resolution: [i64; 3],
+    /// Bricks of 2³ vertices along each axis.
+    bricks: [i64; 3],
     pub(crate) first: i64,
     pub(crate) entries: i64,
     hashed: bool,
 }
-
-/// Features of an entry, cells along an axis of the occupancy, raw outputs of the density network, spherical harmonics.
-const FEATURES: i64 = 4;
-const CELLS: i64 = 128;
-const RAW: i64 = 16;
-const HARMONICS: i64 = 9;
-/// Samples behind this transmittance, and those of less weight, have no colour and no gradient.
-const FAINT: f64 = 1e-4;
-/// Density stops growing at e^15.
-const MOST_RAW: f64 = 15.0;
 
 /// What rays see.
 pub(crate) struct GridSeen {
@@ -69,19 +65,22 @@ fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
     let level = |i: u32| {
         let cells = (coarsest * ratio.powi(i as i32)).round() as i64;
         let resolution = [cells, cells, cells.min(i64::from(architecture.finest_z))];
-        let vertices: i64 = resolution.iter().map(|n| n + 1).product();
+        let bricks = resolution.map(|n| n / 2 + 1);
+        let vertices = bricks.iter().product::<i64>() * BRICK as i64;
         let hashed = vertices > 1 << architecture.log2_entries;
-        // Dense levels end with whole cache lines.
-        let entries = if hashed { 1 << architecture.log2_entries } else { (vertices + 15) / 16 * 16 };
+        let entries = if hashed { 1 << architecture.log2_entries } else { vertices };
         first += entries;
-        TorchLevel { resolution, first: first - entries, entries, hashed }
+        TorchLevel { resolution, bricks, first: first - entries, entries, hashed }
     };
     (0..architecture.levels).map(level).collect()
 }
 
+/// Outputs of the density network.
+const OUTPUTS: i64 = DENSITY_OUTPUTS as i64;
+
 fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
-    let (features, hidden) = (FEATURES * i64::from(architecture.levels), i64::from(architecture.hidden));
-    [(features, hidden), (hidden, RAW), (RAW - 1 + HARMONICS, hidden), (hidden, hidden), (hidden, 3)]
+    let (features, hidden) = (FEATURES as i64 * i64::from(architecture.levels), i64::from(architecture.hidden));
+    [(features, hidden), (hidden, OUTPUTS), ((VIEW_FEATURES + BASIS) as i64, hidden), (hidden, hidden), (hidden, 3)]
 }
 
 /// Real spherical harmonics up to degree 2 of unit directions (n × 3): n × 9.
@@ -127,17 +126,17 @@ impl TorchGrid {
             bounds: field.bounds,
             device,
             levels,
-            table: own(grid, [entries, FEATURES])?,
+            table: own(grid, [entries, FEATURES as i64])?,
             layers: layers.try_into().expect("five layers"),
-            occupied: Tensor::new(),
+            cells: Tensor::new(),
         };
         made.set_occupancy(occupancy)?;
         Ok(made)
     }
 
-    /// Takes over where there may be something.
+    /// Takes over what cells hold.
     pub(crate) fn set_occupancy(&mut self, occupancy: &Occupancy) -> Result<(), TchError> {
-        self.occupied = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?.f_ne(0)?;
+        self.cells = Tensor::f_from_slice(&occupancy.to_bytes())?.f_to_device(self.device)?;
         Ok(())
     }
 
@@ -153,11 +152,11 @@ impl TorchGrid {
 
     /// Density for a cube side at positions in the unit cube (n × 3).
     pub(crate) fn densities(&self, positions: &Tensor) -> Result<Tensor, TchError> {
-        no_grad(|| self.raw(positions)?.i((.., 0)).f_clamp_max(MOST_RAW)?.f_exp())
+        no_grad(|| self.outputs(positions)?.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp())
     }
 
-    /// Raw density and what the colour network gets, at positions (n × 3): n × 16.
-    fn raw(&self, positions: &Tensor) -> Result<Tensor, TchError> {
+    /// Outputs of the density network at positions (n × 3): n × 16.
+    fn outputs(&self, positions: &Tensor) -> Result<Tensor, TchError> {
         self.encode(positions)?.f_matmul(&self.layers[0])?.f_relu()?.f_matmul(&self.layers[1])
     }
 
@@ -187,15 +186,20 @@ impl TorchGrid {
                     });
                     index.push(cell.f_add_scalar(d)?);
                 }
-                let index = if level.hashed {
-                    let mixed = index[0]
-                        .f_bitwise_xor_tensor(&index[1].f_mul_scalar(2_654_435_761i64)?)?
-                        .f_bitwise_xor_tensor(&index[2].f_mul_scalar(805_459_861i64)?)?;
-                    mixed.f_bitwise_and(level.entries - 1)?
+                let half = |axis: usize| index[axis].f_floor_divide_scalar(2);
+                let brick = if level.hashed {
+                    let [y, z] = HASH_FACTORS.map(i64::from);
+                    let mixed = half(0)?
+                        .f_bitwise_xor_tensor(&half(1)?.f_mul_scalar(y)?)?
+                        .f_bitwise_xor_tensor(&half(2)?.f_mul_scalar(z)?)?;
+                    mixed.f_bitwise_and(level.entries / BRICK as i64 - 1)?
                 } else {
-                    let [across, down, _] = level.resolution.map(|n| n + 1);
-                    index[2].f_mul_scalar(down)?.f_add(&index[1])?.f_mul_scalar(across)?.f_add(&index[0])?
+                    let [across, down, _] = level.bricks;
+                    half(2)?.f_mul_scalar(down)?.f_add(&half(1)?)?.f_mul_scalar(across)?.f_add(&half(0)?)?
                 };
+                let odd = |axis: usize| index[axis].f_bitwise_and(1);
+                let within = odd(2)?.f_mul_scalar(2)?.f_add(&odd(1)?)?.f_mul_scalar(2)?.f_add(&odd(0)?)?;
+                let index = brick.f_mul_scalar(BRICK as i64)?.f_add(&within)?;
                 let entry = self.table.f_index_select(0, &index.f_add_scalar(level.first)?)?;
                 let part = entry.f_mul(&share.expect("three axes").f_unsqueeze(-1)?)?;
                 sum = Some(match sum {
@@ -209,25 +213,34 @@ impl TorchGrid {
     }
 
     /// What rays see, with samples `offsets` (n) of a step along.
-    pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor) -> Result<GridSeen, TchError> {
+    pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor, strides: Strides) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
         let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
         let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
         let count = ((longest / self.step()).ceil() as i64).max(1);
-        let k = Tensor::f_arange(count, (Kind::Float, self.device))?.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let t = fused(&k, &k.f_full_like(self.step())?, &maps.enter)?;
+        let steps = Tensor::f_arange(count, (Kind::Float, self.device))?;
+        let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
+        let at = |k: &Tensor| fused(k, &k.f_full_like(self.step())?, &maps.enter);
+        let t = at(&k)?;
+        let held = self.held(&maps.positions(&t)?)?.f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
+        // Every other step of a thin cell is one sample, in the middle of both.
+        let thin = match strides {
+            // Nowhere.
+            Strides::Even => held.f_lt(0.0)?,
+            Strides::ByCell => held.f_eq(1.0)?,
+        };
+        let middle = at(&k.f_add_scalar(0.5)?)?;
+        let (t, length) = (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
         let positions = maps.positions(&t)?;
-        let cell =
-            positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?.f_clamp(0.0, CELLS as f64 - 1.0)?;
-        let cell = cell.f_to_kind(Kind::Int64)?;
-        let [x, y, z] = [0, 1, 2].map(|i| cell.i((.., .., i)));
-        let cell = z.f_mul_scalar(CELLS)?.f_add(&y)?.f_mul_scalar(CELLS)?.f_add(&x)?;
-        let inside = t.f_lt_tensor(&maps.leave)?.f_logical_and(&self.occupied.f_take(&cell)?)?;
+        let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
+        let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
+        let inside = inside.f_logical_and(&thin.f_logical_and(&odd)?.f_logical_not()?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = positions.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
 
-        let raw = self.raw(&positions)?;
-        let density = raw.i((.., 0)).f_clamp_max(MOST_RAW)?.f_exp()?.f_mul_scalar(self.step())?;
+        let outputs = self.outputs(&positions)?;
+        let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
+        let density = outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
         let spread = |of: &Tensor, like: &Tensor| like.f_index_put(&[Some(&kept)], of, false)?.f_reshape([n, count]);
         let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
         let optical = |density: &Tensor| -> Result<[Tensor; 3], TchError> {
@@ -240,7 +253,7 @@ impl TorchGrid {
         // What counts is found first; the rest gets no gradient.
         let counted = no_grad(|| -> Result<Tensor, TchError> {
             let [_, transmittance, weights] = optical(&density)?;
-            transmittance.f_gt(FAINT)?.f_logical_and(&weights.f_gt(FAINT)?)
+            transmittance.f_gt(f64::from(FAINT))?.f_logical_and(&weights.f_gt(f64::from(FAINT))?)
         })?;
         let counts = counted.f_reshape([-1])?.f_index_select(0, &kept)?;
         let [through, _, weights] = optical(&density.f_where_self(&counts, &density.f_detach()?)?)?;
@@ -248,13 +261,15 @@ impl TorchGrid {
         let shaded = counts.f_nonzero()?.f_squeeze_dim(-1)?;
         let at = kept.f_index_select(0, &shaded)?;
         let ray = at.f_div_scalar_mode(count, "floor")?;
-        let basis = harmonics(&maps.view)?.f_index_select(0, &ray)?;
-        let input = Tensor::f_cat(&[&raw.f_index_select(0, &shaded)?.f_narrow(1, 1, RAW - 1)?, &basis], -1)?;
-        let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
-        let colour = hidden.f_matmul(&self.layers[4])?.f_sigmoid()?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
-        let blank = Tensor::f_zeros([n, 3], (Kind::Float, self.device))?;
-        let premultiplied = blank.f_index_add(0, &ray, &weight.f_mul(&colour)?)?;
+        let outputs = outputs.f_index_select(0, &shaded)?;
+        let sum = |of: &Tensor| Tensor::f_zeros([n, of.size()[1]], (Kind::Float, self.device))?.f_index_add(0, &ray, of);
+        let features = sum(&weight.f_mul(&outputs.f_narrow(1, VIEW_FEATURE as i64, VIEW_FEATURES as i64)?)?)?;
+        let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
+        let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
+        let added = hidden.f_matmul(&self.layers[4])?.f_index_select(0, &ray)?;
+        let colour = outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&added)?.f_sigmoid()?;
+        let premultiplied = sum(&weight.f_mul(&colour)?)?;
         let transmittance = through.i((.., count - 1)).f_neg()?.f_exp()?;
         Ok(GridSeen {
             premultiplied,
@@ -268,6 +283,16 @@ impl TorchGrid {
             samples: kept.numel(),
             maps,
         })
+    }
+
+    /// What the cells at positions (… × 3) hold, as numbers.
+    fn held(&self, positions: &Tensor) -> Result<Tensor, TchError> {
+        const CELLS: i64 = OCCUPANCY_CELLS as i64;
+        let cell = positions.f_nan_to_num(0.0, 0.0, 0.0)?.f_mul_scalar(CELLS as f64)?.f_floor()?;
+        let cell = cell.f_clamp(0.0, CELLS as f64 - 1.0)?.f_to_kind(Kind::Int64)?;
+        let [x, y, z] = [0, 1, 2].map(|i| cell.i((.., .., i)));
+        let cell = z.f_mul_scalar(CELLS)?.f_add(&y)?.f_mul_scalar(CELLS)?.f_add(&x)?;
+        self.cells.f_take(&cell)?.f_to_kind(Kind::Float)
     }
 
     /// Colour, opacity and depth of each ray, in pieces as large as memory allows.
@@ -287,7 +312,7 @@ impl TorchGrid {
 
     fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
-        let seen = self.see(rays, &offsets)?;
+        let seen = self.see(rays, &offsets, Strides::Even)?;
         let weights = seen.weights.f_mul(&seen.counted)?;
         let distances = seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
         let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
@@ -373,7 +398,7 @@ mod tests {
             let own = field.render(&rays);
             for &device in &devices {
                 let judge = TorchGrid::new(&field, device).unwrap();
-                let seen = judge.see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device))).unwrap();
+                let seen = judge.see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even).unwrap();
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
                     &[(seen.premultiplied + background).sum(Kind::Float)],

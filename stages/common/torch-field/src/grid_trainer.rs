@@ -1,7 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
+use radiance::{Field, LIKE_BACKGROUND, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -10,7 +10,8 @@ use crate::mlp::host;
 use crate::step::Step;
 
 /// Trains a [`radiance::Field`] as [`radiance::Trainer`] does, by libtorch's operations and autograd: the same draws, steps, rates and
-/// looks at the occupancy. On the CPU in one thread, to judge that trainer by; on CUDA to be fast.
+/// looks at the occupancy. Only [`TrainingOptions::roulette`] is left out: gradients of all samples go back. On the CPU in one thread, to
+/// judge that trainer by; on CUDA to be fast.
 pub struct GridTrainer {
     grid: TorchGrid,
     options: TrainingOptions,
@@ -125,7 +126,8 @@ impl GridTrainer {
         let rays = step.sample_rays(supervision, &range);
         let first = step.first_ray(&range);
         let offsets: Vec<f32> = (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
-        let seen = self.grid.see(&rays, &Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?)?;
+        let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?;
+        let seen = self.grid.see(&rays, &offsets, Strides::ByCell)?;
         let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
         let backgrounds = Tensor::f_from_slice(&backgrounds)?.f_reshape([-1, 3])?.f_to_device(self.grid.device)?;
         let colour = seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
@@ -364,6 +366,7 @@ mod tests {
             distortion: 0.02,
             floater_loss: 0.01,
             network_decay: 1e-4,
+            roulette: 0.0,
             seed: 9,
         }
     }

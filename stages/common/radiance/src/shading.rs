@@ -1,0 +1,274 @@
+//! Deferred shading (Hedman et al. 2021, "Baking neural radiance fields", SNeRG): view features are composited along a ray, one small
+//! network makes of them and the direction what is added to the raw colours of all the ray's samples. So colours cost a network a ray.
+
+use crate::composite::{Regularisers, add_distortion_gradients, likeness, optical_depth_gradients};
+use crate::field::{Field, Layers};
+use crate::math::sigmoid;
+use crate::mlp::{After, Layer, add_outer, multiply};
+use crate::ray::NormalizedRay;
+use crate::samples::{Counted, RaySum, Samples, fit};
+use crate::simd::{LANES, kernel};
+use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
+use crate::spherical::spherical_harmonics;
+
+/// Buffers of the view network, a column a ray that has samples, and of the samples' colours.
+#[derive(Debug, Default)]
+pub(crate) struct Shading {
+    input: Vec<f32>,
+    hidden: [Vec<f32>; 2],
+    /// What is added to the raw colours: three rows.
+    added: Vec<f32>,
+    /// Colours: three rows, a column a sample that counts.
+    pub(crate) colour: Vec<f32>,
+    gradient: [Vec<f32>; 2],
+    along: AlongRay,
+}
+
+/// One ray's samples from front to back.
+#[derive(Debug, Default)]
+struct AlongRay {
+    transmittance: Vec<f32>,
+    weight: Vec<f32>,
+    t: Vec<f32>,
+    by_weight: Vec<f32>,
+    by_depth: Vec<f32>,
+}
+
+/// What a backward pass starts from, an entry a ray.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct RayGradients<'a> {
+    /// By the colour over the background.
+    pub(crate) colours: &'a [[f32; 3]],
+    pub(crate) backgrounds: &'a [[f32; 3]],
+    pub(crate) regularisers: Regularisers,
+}
+
+/// The networks' weights output by output, and where their gradients are added: 16 partial sums a weight.
+pub(crate) struct NetworkGradients<'a> {
+    pub(crate) transposed: &'a [f32],
+    pub(crate) lanes: &'a mut [f32],
+}
+
+impl NetworkGradients<'_> {
+    /// Goes back through a layer from `dy`, whose input was `x`, to `dx`: rows of n.
+    pub(crate) fn back(&mut self, layer: Layer, x: &[f32], after: After<'_>, n: usize, dy: &[f32], dx: &mut [f32]) {
+        let dy = &dy[..layer.outputs * n];
+        let lanes = &mut self.lanes[layer.offset * LANES..layer.range().end * LANES];
+        add_outer(x, dy, lanes, layer.inputs, layer.outputs, n);
+        multiply(&self.transposed[layer.range()], dy, &mut dx[..layer.inputs * n], layer.outputs, layer.inputs, n, after);
+    }
+}
+
+kernel! {
+    fn sigmoids<L>(values: &mut [f32]) {
+        for v in values {
+            *v = sigmoid(*v);
+        }
+    }
+}
+
+kernel! {
+    /// Composites view features into the view network's `input`, a column a ray, and adds weights and distances to the rays' sums.
+    fn composite<L>(samples: &Samples, counted: &Counted, rays: &[NormalizedRay], sums: &mut [RaySum], input: &mut [f32], n: usize) {
+        for (column, &r) in counted.rays.iter().enumerate() {
+            let (ray, sum) = (&rays[r as usize], &mut sums[r as usize]);
+            let mut outputs = [0.0f32; DENSITY_OUTPUTS];
+            for &k in counted.of_ray(r) {
+                let i = counted.sample[k as usize] as usize;
+                let w = samples.weight[i];
+                for (sum, value) in outputs.iter_mut().zip(&counted.outputs[k as usize]) {
+                    *sum = w.mul_add(*value, *sum);
+                }
+                sum.weight += w;
+                sum.distance = w.mul_add(ray.distance(samples.marched.t[i]), sum.distance);
+            }
+            let inputs = outputs[VIEW_FEATURE..].iter().copied().chain(spherical_harmonics(ray.view));
+            for (row, value) in inputs.enumerate() {
+                input[row * n + column] = value;
+            }
+        }
+    }
+}
+
+kernel! {
+    /// Adds each ray's part to its samples' raw colours: `colour` has three rows of m, `added` three of n.
+    fn raw_colours<L>(counted: &Counted, added: &[f32], n: usize, colour: &mut [f32], m: usize) {
+        for (column, &r) in counted.rays.iter().enumerate() {
+            let added = [0, 1, 2].map(|c| added[c * n + column]);
+            for &k in counted.of_ray(r) {
+                let k = k as usize;
+                for c in 0..3 {
+                    colour[c * m + k] = counted.outputs[k][RAW_COLOUR + c] + added[c];
+                }
+            }
+        }
+    }
+}
+
+kernel! {
+    /// Adds the samples' colours to their rays'.
+    fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], m: usize, sums: &mut [RaySum]) {
+        for &r in &counted.rays {
+            let sum = &mut sums[r as usize].colour;
+            for &k in counted.of_ray(r) {
+                let w = samples.weight[counted.sample[k as usize] as usize];
+                for c in 0..3 {
+                    sum[c] = w.mul_add(colour[c * m + k as usize], sum[c]);
+                }
+            }
+        }
+    }
+}
+
+kernel! {
+    /// Gradient by what was added to each ray's raw colours: `gradient` has three rows of n.
+    fn gradients_by_added<L>(
+        samples: &Samples, counted: &Counted, colour: &[f32], m: usize, colours: &[[f32; 3]], gradient: &mut [f32], n: usize,
+    ) {
+        for (column, &r) in counted.rays.iter().enumerate() {
+            let g = colours[r as usize];
+            let mut sum = [0.0f32; 3];
+            for &k in counted.of_ray(r) {
+                let w = samples.weight[counted.sample[k as usize] as usize];
+                for c in 0..3 {
+                    let colour = colour[c * m + k as usize];
+                    sum[c] = (g[c] * w).mul_add(colour * (1.0 - colour), sum[c]);
+                }
+            }
+            for c in 0..3 {
+                gradient[c * n + column] = sum[c];
+            }
+        }
+    }
+}
+
+/// Sum of products, in one order on every machine.
+#[inline(always)]
+pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32 {
+    let mut products: [f32; DENSITY_OUTPUTS] = std::array::from_fn(|o| a[o] * b[o]);
+    let mut width = DENSITY_OUTPUTS / 2;
+    while width > 0 {
+        for o in 0..width {
+            products[o] += products[o + width];
+        }
+        width /= 2;
+    }
+    products[0]
+}
+
+kernel! {
+    /// Gradients of one ray's samples by the density network's outputs, but for that by the raw density; `along` gets transmittances,
+    /// weights, places and the gradient by each weight.
+    fn gradients_along<L>(
+        samples: &Samples, counted: &Counted, places: &[u32], colour: &[f32], m: usize, g: [f32; 3],
+        composited: &[f32; DENSITY_OUTPUTS], along: &mut AlongRay, gradients: &mut [[f32; DENSITY_OUTPUTS]],
+    ) {
+        for (j, &k) in places.iter().enumerate() {
+            let (k, i) = (k as usize, counted.sample[k as usize] as usize);
+            let w = samples.weight[i];
+            (along.transmittance[j], along.weight[j], along.t[j]) = (samples.transmittance[i], w, samples.marched.t[i]);
+            let mut by_weight = dot(composited, &counted.outputs[k]);
+            let gradient = &mut gradients[k];
+            *gradient = composited.map(|c| w * c);
+            for c in 0..3 {
+                let colour = colour[c * m + k];
+                by_weight = g[c].mul_add(colour, by_weight);
+                gradient[RAW_COLOUR + c] = g[c] * w * colour * (1.0 - colour);
+            }
+            along.by_weight[j] = by_weight;
+        }
+    }
+}
+
+impl AlongRay {
+    fn fit(&mut self, longest: usize) {
+        for buffer in [&mut self.transmittance, &mut self.weight, &mut self.t, &mut self.by_weight, &mut self.by_depth] {
+            fit(buffer, longest);
+        }
+    }
+}
+
+impl Shading {
+    /// Colours of the samples that count, and each ray's sums.
+    pub(crate) fn forward(
+        &mut self,
+        field: &Field,
+        rays: &[NormalizedRay],
+        samples: &Samples,
+        counted: &Counted,
+        sums: &mut [RaySum],
+    ) {
+        let (m, n) = (counted.sample.len(), counted.rays.len().next_multiple_of(LANES));
+        let input = fit(&mut self.input, VIEW_INPUTS * n);
+        for row in input.chunks_exact_mut(n.max(1)) {
+            row[counted.rays.len()..].fill(0.0);
+        }
+        composite(samples, counted, rays, sums, input, n);
+        let Layers { view: [first, second, third], .. } = field.layers;
+        let [hidden1, hidden2] = &mut self.hidden;
+        let (hidden1, hidden2) = (fit(hidden1, first.outputs * n), fit(hidden2, second.outputs * n));
+        multiply(&field.network[first.range()], input, hidden1, first.inputs, first.outputs, n, After::Relu);
+        multiply(&field.network[second.range()], hidden1, hidden2, second.inputs, second.outputs, n, After::Relu);
+        let added = fit(&mut self.added, third.outputs * n);
+        multiply(&field.network[third.range()], hidden2, added, third.inputs, third.outputs, n, After::Linear);
+        let colour = fit(&mut self.colour, 3 * m);
+        raw_colours(counted, added, n, colour, m);
+        sigmoids(colour);
+        sum_colours(samples, counted, colour, m, sums);
+    }
+
+    /// Goes back from rays to the density network's outputs of every sample that counts, and adds the view network's gradients.
+    pub(crate) fn backward(
+        &mut self,
+        field: &Field,
+        (samples, counted, sums): (&Samples, &Counted, &[RaySum]),
+        towards: RayGradients<'_>,
+        network: &mut NetworkGradients<'_>,
+        gradients: &mut Vec<[f32; DENSITY_OUTPUTS]>,
+    ) {
+        let (m, n) = (counted.sample.len(), counted.rays.len().next_multiple_of(LANES));
+        let colour = &self.colour[..3 * m];
+        let Layers { view: [first, second, third], .. } = field.layers;
+        let widest = first.outputs.max(second.outputs).max(VIEW_INPUTS);
+        let [a, b] = &mut self.gradient;
+        let (a, b) = (fit(a, widest * n), fit(b, widest * n));
+        for row in a[..3 * n].chunks_exact_mut(n) {
+            row[counted.rays.len()..].fill(0.0);
+        }
+        gradients_by_added(samples, counted, colour, m, towards.colours, a, n);
+        let [hidden1, hidden2] = &self.hidden;
+        let (hidden1, hidden2) = (&hidden1[..first.outputs * n], &hidden2[..second.outputs * n]);
+        network.back(third, hidden2, After::Gate(hidden2), n, a, b);
+        network.back(second, hidden1, After::Gate(hidden1), n, b, a);
+        network.back(first, &self.input[..VIEW_INPUTS * n], After::Linear, n, a, b);
+
+        gradients.clear();
+        gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
+        let along = &mut self.along;
+        along.fit(counted.longest());
+        for (column, &r) in counted.rays.iter().enumerate() {
+            let (g, background) = (towards.colours[r as usize], towards.backgrounds[r as usize]);
+            let (places, transmittance) = (counted.of_ray(r), sums[r as usize].transmittance);
+            let len = places.len();
+            let mut composited = [0.0; DENSITY_OUTPUTS];
+            (0..VIEW_FEATURES).for_each(|f| composited[VIEW_FEATURE + f] = b[f * n + column]);
+            gradients_along(samples, counted, places, colour, m, g, &composited, along, gradients);
+            let floater = towards.regularisers.floater_loss * transmittance;
+            if floater > 0.0 {
+                for (by_weight, &k) in along.by_weight.iter_mut().zip(places) {
+                    let colour = std::array::from_fn(|c| colour[c * m + k as usize]);
+                    *by_weight = floater.mul_add(likeness(colour, background), *by_weight);
+                }
+            }
+            let (t, weight, by_weight) = (&along.t[..len], &along.weight[..len], &mut along.by_weight[..len]);
+            if towards.regularisers.distortion > 0.0 {
+                add_distortion_gradients(t, weight, field.step(), towards.regularisers.distortion, by_weight);
+            }
+            let behind = transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>();
+            optical_depth_gradients(by_weight, &along.transmittance[..len], weight, behind, &mut along.by_depth[..len]);
+            for (&k, &by_depth) in places.iter().zip(&along.by_depth) {
+                gradients[k as usize][0] = by_depth * counted.outputs[k as usize][0];
+            }
+        }
+    }
+}
