@@ -153,8 +153,8 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
 	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
-compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout: PSNR, seconds, memory
-	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA)
+compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS=FACTOR
+	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS))
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py && .venv/bin/python scripts/make-goldens-refiner.py
