@@ -30,6 +30,6 @@ pub const DARK: f32 = 9.210_34;
 /// Cells of the occupancy along each axis of the unit cube.
 pub const OCCUPANCY_CELLS: usize = 128;
 /// Optical depth of a step below which a cell is thin: in training, rays take a sample of double length at every other step.
-pub const THIN: f32 = 0.15;
+pub const THIN: f32 = 0.05;
 /// Optical depth of a step below which a cell is empty, once the mean is above it.
 pub const EMPTY: f32 = 0.01;
