@@ -144,14 +144,16 @@ bench-runner: build ## What the runner costs beside DVC and Snakemake, which thi
 	@python3 scripts/bench-runner.py
 
 BENCH_SCENE := out/bench/scene
+# Said to both builds: what an older one takes by itself differs.
+BENCH_RAYS := $(or $(RAYS),3000000)
 bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA, else the demo scene); SIMD=avx2|portable; AGAINST=FILE of an earlier run or the folder of another checkout
 	@rm -rf out/bench && mkdir -p out/bench
 	@if [ -d $(DATA)/nerf_synthetic/lego ]; then ln -s $(abspath $(DATA))/nerf_synthetic/lego out/bench/data; \
 	  else target/release/demo-scene --output out/bench/data; fi
 	@echo '{"lr_width": 100, "scale": 2, "test_views": 10}' > out/bench/prep.json
 	@target/release/prep --params out/bench/prep.json --input dataset=out/bench/data --output $(BENCH_SCENE)
-	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
-	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
+	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= RAYS=$(BENCH_RAYS) DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
+	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) RAYS=$(BENCH_RAYS) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
 compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS=FACTOR
 	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS))
