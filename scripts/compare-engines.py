@@ -51,16 +51,16 @@ def prepare(options: argparse.Namespace, folder: pathlib.Path, name: str) -> Non
     run(options.old, "prep", folder, "scene", {"dataset": "dataset"}, {"lr_width": width, "scale": scale, "test_views": 12})
 
 
-def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, tree: pathlib.Path, seed: int) -> str:
+def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int) -> str:
     _, _, scale, rays = SCENES[name]
     params = {"field": {"grid": {"rays": int(rays * options.rays)}}, "supersample": scale, "seed": seed}
-    at = f"{tree.resolve().name}-{seed}"
+    tree, at = getattr(options, build), f"{build}-{seed}"
     training, memory = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
     rendering, most = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
     run(options.old, "eval", folder, f"{at}/eval", {"views": f"{at}/views", "truth": "scene/truth"}, {})
     mean = json.loads((folder / at / "eval/metrics.json").read_text())["mean"]
     figures = f"{mean['psnr']:.3f} | {mean['ssim']:.4f} | {training:.1f} s | {rendering:.1f} s | {max(memory, most)} MiB"
-    return f"| {name} | {tree.resolve().name} | {seed} | {figures} | {os.getloadavg()[0]:.1f} |"
+    return f"| {name} | {build} | {seed} | {figures} | {os.getloadavg()[0]:.1f} |"
 
 
 def main() -> None:
@@ -77,8 +77,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             prepare(options, pathlib.Path(folder), name)
             for seed in range(1, options.seeds + 1):
-                for tree in (options.old, options.new):
-                    print(measure(options, pathlib.Path(folder), name, tree, seed), flush=True)
+                for build in ("old", "new"):
+                    print(measure(options, pathlib.Path(folder), name, build, seed), flush=True)
 
 
 if __name__ == "__main__":
