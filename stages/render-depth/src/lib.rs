@@ -30,8 +30,8 @@ pub struct Params {
     /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
-    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The error is found from the pixel's neighbours and
-    /// exact where the view is quadratic. 0 casts all rays everywhere.
+    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The estimate is made from the pixel's neighbours
+    /// and bounds the error where the view is quadratic. 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
     /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the surface and floaters before it.
@@ -150,7 +150,7 @@ impl RenderJob<'_> {
     }
 
     /// Renders some rows. `centres` is kept from one band to the next.
-    fn band(&self, centres: &mut Centres, rows: Range<usize>) -> anyhow::Result<Vec<Shown>> {
+    fn band(&self, centres: &mut Centres, rows: Range<usize>) -> anyhow::Result<Vec<ViewPixel>> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let n = self.params.samples_per_axis as usize;
@@ -178,7 +178,7 @@ impl RenderJob<'_> {
     }
 
     /// Casts n × n rays through each pixel `[x, y]`.
-    fn cast(&self, pixels: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<Shown>> {
+    fn cast(&self, pixels: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
         let background = [self.background.shown(); 3];
         let within = |k: usize| (k as f64 + 0.5) / n as f64;
         let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
@@ -203,12 +203,12 @@ impl RenderJob<'_> {
     }
 
     /// What a pixel shows of its rays, each with its z-depth per distance.
-    fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> Shown {
+    fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
         let share = 1.0 / subs.len() as f32;
         let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share;
         let [r, g, b] = std::array::from_fn(|c| mean(&|p| p.premultiplied[c]));
         let (distance, to_z) = middle(&mut subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect::<Vec<_>>());
-        Shown {
+        ViewPixel {
             channels: [r, g, b, mean(&|p| p.opacity), distance * to_z, distance],
             colour: std::array::from_fn(|c| mean(&|p| p.colour[c])),
         }
@@ -224,7 +224,7 @@ impl RenderJob<'_> {
 
 /// What a pixel shows.
 #[derive(Clone, Copy)]
-struct Shown {
+struct ViewPixel {
     /// Premultiplied colour, opacity, z-depth and distance: channels of the EXR.
     channels: [f32; 6],
     /// Colour over the background, for the preview.
@@ -236,7 +236,7 @@ struct Shown {
 struct Centres {
     /// First row.
     first: usize,
-    pixels: Vec<Shown>,
+    pixels: Vec<ViewPixel>,
 }
 
 impl Centres {
@@ -317,7 +317,7 @@ mod tests {
         let job = RenderJob { params: &params, members: &members, background: Background::White, camera: &camera };
         let mut centres = Centres::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
-        let shown: Vec<Shown> = bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
+        let shown: Vec<ViewPixel> = bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
         (shown.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
     }
 

@@ -19,7 +19,7 @@ pub(crate) struct Shading {
     /// What is added to the raw colours: three rows.
     added: Vec<f32>,
     /// Colours: three rows, a column a sample that counts.
-    pub(crate) colour: Vec<f32>,
+    colour: Vec<f32>,
     gradient: [Vec<f32>; 2],
     along: AlongRay,
 }
