@@ -110,6 +110,8 @@ fn main() -> anyhow::Result<()> {
     passes(&mut rows);
     if let Some(scene) = variable("SCENE") {
         let rays = variable("RAYS").map_or(Ok(3_000_000), |r| r.parse())?;
+        // Young fields are slower: only runs of equal length compare.
+        rows.add("rays", rays as f64, "rays");
         training(&mut rows, Path::new(&scene), rays)?;
     } else {
         println!("skipped: no SCENE, so nothing was trained or rendered");
