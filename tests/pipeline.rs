@@ -200,7 +200,6 @@ fn every_option_goes_through() {
         &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
         &["-p", "lr_width=20", "-p", "scale=1.5", "-p", "prep.hr_references=2", "-p", "test_views=2"],
         &["-p", "lr_width=24", "-p", "scale=1", "-p", "supersample=1"],
-        &["-p", "supervision=refiltered"],
         &["-p", "supervision=kernel"],
         &["-p", "lr_width=32", "-p", "scale=1.5", "-p", "supersample=1.5", "-p", "supervision=kernel"],
         &["-p", "lr_width=16", "-p", "scale=3", "-p", "supersample=3", "-p", "kernel=bicubic", "-p", "supervision=kernel"],

@@ -369,12 +369,6 @@ fn mask_name(frame: &Frame) -> Option<String> {
     frame.mask.as_ref().map(|_| format!("masks/{}.png", frame.name))
 }
 
-/// What is made of a frame to train on.
-struct TrainingImage {
-    image: LrImage,
-    mask: Option<Mask>,
-}
-
 /// Everything the steps of one run share.
 struct Job<'a> {
     context: &'a Context,
@@ -436,23 +430,14 @@ impl Job<'_> {
 
         let count = if self.making.has_truth { self.params.hr_references as usize } else { 0 };
         let references = references::choose(train_cameras.iter().map(Camera::centre), count);
-        let train_images = train
+        let alphas = train
             .par_iter()
             .enumerate()
-            .map(|(i, frame)| -> anyhow::Result<TrainingImage> {
+            .map(|(i, frame)| {
                 self.context.check_interrupt()?;
-                let (hr, lr) = self.images(frame)?;
-                self.write_lr("train/images", &frame.name, &lr)?;
-                let mask = frame.mask().bad_input(frame_name(frame))?;
-                let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
-                lr_mask.iter().try_for_each(|mask| self.write_mask("train", &frame.name, mask))?;
-                if let Some(hr) = hr.filter(|_| references.contains(&i)) {
-                    self.write_hr("references", &frame.name, &hr)?;
-                    mask.iter()
-                        .try_for_each(|m| self.write_mask("references", &frame.name, &m.resized((hr.width, hr.height), 0)))?;
-                }
+                let alpha = self.write_training_images(frame, references.contains(&i))?;
                 progress.add(1);
-                Ok(TrainingImage { image: lr, mask: lr_mask })
+                Ok(alpha)
             })
             .collect::<anyhow::Result<Vec<_>>>()?;
         let lr_name = |name: &str| format!("images/{name}.{}", degrade::extension(self.making.kernel));
@@ -468,7 +453,7 @@ impl Job<'_> {
             .collect();
         if self.params.hull == HullSource::Alpha {
             let cameras: Vec<Camera> = views.views.iter().map(|v| v.camera.clone()).collect();
-            let alphas: Vec<Vec<f32>> = train_images.iter().map(|p| p.image.alpha()).collect();
+            let alphas: Vec<Vec<f32>> = alphas.into_iter().flatten().collect();
             let footprint = degrade::footprint(self.making.kernel);
             bounds = hull::tightened(&bounds, &cameras, &alphas, footprint).bad_input("hull: alpha")?;
             if self.params.near.is_none() && self.params.far.is_none() {
@@ -483,8 +468,7 @@ impl Job<'_> {
             views.hull = Some("hull.safetensors".to_owned());
         }
         self.context.write_json(&format!("train/{VIEWS_FILE}"), &views)?;
-        self.write_downscaled(&views, &train_images)?;
-        drop(train_images);
+        self.write_downscaled_views(&views)?;
         let degradation = Degradation { kernel: self.making.kernel, hr: self.sizes.hr.into() };
         for subtree in ["train", "truth"] {
             self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &degradation)?;
@@ -545,26 +529,47 @@ impl Job<'_> {
         self.summarise(set, notes, train, test, bounds, background)
     }
 
-    /// The same task one size down, where its solution is known: LR images shrunk as HR ones were to make them.
-    fn write_downscaled(&self, train: &Views, images: &[TrainingImage]) -> anyhow::Result<()> {
+    /// Writes all that is made of a frame to train on: LR image, the same one size down, HR reference, and their masks. Returns the LR
+    /// image's alpha, where a hull is carved of it: no more images than threads are held at once.
+    fn write_training_images(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<Option<Vec<f32>>> {
+        let (hr, lr) = self.images(frame)?;
+        let name = &frame.name;
+        self.write_lr("train/images", name, &lr)?;
+        let mask = frame.mask().bad_input(frame_name(frame))?;
+        let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
+        lr_mask.iter().try_for_each(|mask| self.write_mask("train", name, mask))?;
+        if let Some(hr) = hr.filter(|_| is_reference) {
+            self.write_hr("references", name, &hr)?;
+            mask.iter().try_for_each(|m| self.write_mask("references", name, &m.resized((hr.width, hr.height), 0)))?;
+        }
+        let lr_size = self.sizes_of(&frame.intrinsics()).lr;
+        let (width, height) = self.one_size_down(lr_size);
+        let downscaled = lr.shrunk((width as usize, height as usize), self.making.kernel);
+        self.write_lr("downscaled/images", name, &downscaled)?;
+        let downscaled_mask = lr_mask.map(|mask| self.lr_mask(&mask, &downscaled));
+        downscaled_mask.iter().try_for_each(|mask| self.write_mask("downscaled", name, mask))?;
+        Ok((self.params.hull == HullSource::Alpha).then(|| lr.alpha()))
+    }
+
+    /// Size of an LR image shrunk as HR images were to make LR ones.
+    fn one_size_down(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let Sizes { lr, hr } = self.sizes;
         let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
-        let kernel = self.making.kernel;
-        let make = |(view, TrainingImage { image, mask }): (&View, &TrainingImage)| -> anyhow::Result<View> {
-            self.context.check_interrupt()?;
+        (shrunk(width, lr.0, hr.0), shrunk(height, lr.1, hr.1))
+    }
+
+    /// Writes the views of the same task one size down, where its solution is known.
+    fn write_downscaled_views(&self, train: &Views) -> anyhow::Result<()> {
+        let make = |view: &View| {
             let k = &view.camera.intrinsics;
-            let (width, height) = (shrunk(k.width, lr.0, hr.0), shrunk(k.height, lr.1, hr.1));
-            let downscaled = image.shrunk((width as usize, height as usize), kernel);
-            self.write_lr("downscaled/images", &view.camera.name, &downscaled)?;
-            let mask = mask.as_ref().map(|mask| self.lr_mask(mask, &downscaled));
-            mask.iter().try_for_each(|mask| self.write_mask("downscaled", &view.camera.name, mask))?;
-            Ok(View { camera: view.camera.resized(width, height), ..view.clone() })
+            let (width, height) = self.one_size_down((k.width, k.height));
+            View { camera: view.camera.resized(width, height), ..view.clone() }
         };
-        let views = train.views.par_iter().zip(images).map(make).collect::<anyhow::Result<Vec<_>>>()?;
+        let views = train.views.iter().map(make).collect();
         self.context.write_json(&format!("downscaled/{VIEWS_FILE}"), &Views::new(train.background, train.bounds, views))?;
         // LR images that weren't rounded are shrunk by the box: the same, and for any size.
-        let kernel = if kernel == Kernel::Average { Kernel::Box } else { kernel };
-        self.context.write_json(&format!("downscaled/{DEGRADATION_FILE}"), &Degradation { kernel, hr: lr.into() })
+        let kernel = if self.making.kernel == Kernel::Average { Kernel::Box } else { self.making.kernel };
+        self.context.write_json(&format!("downscaled/{DEGRADATION_FILE}"), &Degradation { kernel, hr: self.sizes.lr.into() })
     }
 
     /// LR and HR size of a view: other shapes are shrunk as much as the first view is.

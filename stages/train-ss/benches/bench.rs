@@ -15,7 +15,7 @@ use scene::{Bounds, Camera, Views};
 use serde::{Deserialize, Serialize};
 #[cfg(feature = "torch")]
 use train_ss::MlpParams;
-use train_ss::{FieldParams, GridParams, Params, Photographs, ResolvedField, SceneFacts};
+use train_ss::{FieldParams, GridParams, Params, ResolvedField, SceneFacts};
 
 #[derive(Serialize, Deserialize)]
 struct Row {
@@ -245,7 +245,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let params = params.resolve(&SceneFacts::of(&views, true));
-        let mut supervision = train_ss::supervision(&input, &params, Photographs::read(&input)?, None, &|_| ())?;
+        let mut supervision = train_ss::supervision(&input, &params, None, &std::env::temp_dir(), &|_| ())?;
         let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
@@ -313,7 +313,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
         anyhow::bail!("MLPs are measured here");
     };
     nets::deterministic();
-    let mut supervision = train_ss::supervision(input, &params, Photographs::read(input)?, None, &|_| ())?;
+    let mut supervision = train_ss::supervision(input, &params, None, &std::env::temp_dir(), &|_| ())?;
     let field = torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;
     let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?;

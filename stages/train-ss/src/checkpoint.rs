@@ -1,4 +1,3 @@
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -7,7 +6,8 @@ use radiance::StepReport;
 use serde::{Deserialize, Serialize};
 
 use crate::field_trainer::FieldTrainer;
-use crate::{CurvePoint, Supersampling, TrainingLog};
+use crate::supervision::Supersampling;
+use crate::training_log::{CurvePoint, TrainingLog};
 
 /// The training curve while it grows. Everything in it is saved, so that a resumed training writes the same one.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -103,7 +103,7 @@ impl Checkpoints {
         let own = [curve_name(step), kept_name(step)];
         artifact::write_json(&folder.join(&own[0]), curve)?;
         let mut file = std::fs::File::create(folder.join(&own[1]))?;
-        supervision.kept().try_for_each(|part| file.write_all(&part))?;
+        supervision.write(&mut file)?;
         trainer.write_checkpoint(&temporary)?;
         std::fs::rename(&temporary, &name)?;
         for entry in std::fs::read_dir(folder)? {
@@ -132,10 +132,8 @@ fn kept_name(step: u64) -> String {
 fn restored(folder: &Path, checkpoint: &Path, trainer: &mut dyn FieldTrainer, supervision: &mut Supersampling) -> Option<Curve> {
     let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
-    let kept = std::fs::read(folder.join(kept_name(step))).ok()?;
+    let mut kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
+    let is_whole = kept.metadata().ok()?.len() == supervision.written_len() as u64;
     // A trainer that can't resume is as it was.
-    (kept.len() == supervision.kept_len() && trainer.resume(checkpoint)).then(|| {
-        supervision.restore(&kept);
-        curve
-    })
+    (is_whole && trainer.resume(checkpoint) && supervision.restore(&mut kept).is_ok()).then_some(curve)
 }

@@ -5,7 +5,8 @@ use artifact::{Failure, FailureExt as _};
 use radiance::{Field, FieldModel, RayField, StepReport, Trainer, TrainingError, TrainingOptions};
 use scene::Bounds;
 
-use crate::{Resolved, ResolvedField, Supersampling};
+use crate::resolve::{Resolved, ResolvedField};
+use crate::supervision::Supersampling;
 
 /// Whatever is trained: a step at a time, with checkpoints.
 pub(crate) trait FieldTrainer {

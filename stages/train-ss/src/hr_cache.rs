@@ -1,6 +1,11 @@
+use std::cell::RefCell;
+use std::io;
+use std::ops::Range;
 use std::sync::Arc;
 
-use pixels::{Image, Resampling, to_u8};
+use pixels::{AxisTaps, Filter, Image, Resampling, to_u8};
+
+use crate::packed::{Bytes, PackedPhotograph, PixelMemory};
 
 /// The field's HR pixels of every training view as they were last rendered, in 8 bits, and the operators that make LR pixels
 /// of them. Before a pixel is first rendered it is the enlarged LR image's.
@@ -16,10 +21,7 @@ struct CachedView {
     width: usize,
     height: usize,
     /// RGB, row by row.
-    rendered: Vec<u8>,
-    /// RGB of the LR pixels that the kernel makes of those, in levels of 1/[`ONE`]². It follows every change: whole numbers add up to the
-    /// same whatever the order, so it is what the kernel makes of them anew, to the last bit.
-    projected: Vec<[i64; 3]>,
+    rendered: Bytes,
     kernel: Arc<KernelOperator>,
 }
 
@@ -32,23 +34,50 @@ pub(crate) struct KernelOperator {
 }
 
 impl KernelOperator {
-    pub(crate) fn new(operator: Resampling) -> Self {
+    /// The filter that makes LR images of HR ones; sizes are (width, height).
+    pub(crate) fn new(filter: Filter, hr: (usize, usize), lr: (usize, usize)) -> Self {
+        let operator = Resampling::new(filter, hr, lr);
         let inverse = operator.inverse(HrCache::REACH);
         Self { operator, inverse }
     }
 }
 
+/// Buffers of a thread.
+#[derive(Default)]
+struct Rows {
+    /// 8-bit levels of a row, as read from a file.
+    read: Vec<u8>,
+    /// Levels of a row in floats.
+    levels: Vec<[f32; 3]>,
+}
+
+thread_local! {
+    static ROWS: RefCell<Rows> = RefCell::default();
+}
+
+/// LR pixels on each side of one whose residuals count.
+const NEAR: usize = 2 * HrCache::REACH + 1;
+
 impl HrCache {
+    /// How far, in LR pixels, the kernels reach to either side of a block.
+    const REACH: usize = 3;
+
     pub(crate) fn new(side: [usize; 2]) -> Self {
         Self { side, views: Vec::new() }
     }
 
+    /// Whether a filter's footprint is the block of an LR pixel alone: then residuals need no other HR pixels than the fresh ones, and
+    /// are those of the mean.
+    pub(crate) fn is_needed(filter: Filter, hr: (usize, usize), lr: (usize, usize)) -> bool {
+        let is_whole = hr.0.is_multiple_of(lr.0) && hr.1.is_multiple_of(lr.1);
+        !(filter == Filter::Box && is_whole)
+    }
+
     /// Adds the next view: an RGB image at HR size to begin with, and what makes it an LR image.
-    pub(crate) fn add(&mut self, image: &Image, kernel: Arc<KernelOperator>) {
-        let rendered = image.data.iter().map(|&v| to_u8(v)).collect();
-        let mut view = CachedView { width: image.width, height: image.height, rendered, projected: Vec::new(), kernel };
-        view.project();
-        self.views.push(view);
+    pub(crate) fn add(&mut self, image: &Image, kernel: Arc<KernelOperator>, memory: &mut PixelMemory) -> io::Result<()> {
+        let rendered = memory.keep(image.data.iter().map(|&v| to_u8(v)).collect())?;
+        self.views.push(CachedView { width: image.width, height: image.height, rendered, kernel });
+        Ok(())
     }
 
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
@@ -73,9 +102,6 @@ impl HrCache {
         ([i as f64 * apart[0], j as f64 * apart[1]], apart)
     }
 
-    /// How far, in LR pixels, the kernels reach to either side of a block.
-    const REACH: usize = 3;
-
     /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else as cached, and what they
     /// ask of the block: writes P·residual for each colour, where P = Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse but for the factor s², and
     /// returns the residual of the pixel itself. `judge` gets a channel, a prediction and its target, and
@@ -85,158 +111,131 @@ impl HrCache {
         view: usize,
         [x, y]: [usize; 2],
         colours: &[[f32; 3]],
-        targets: &Image,
+        targets: &PackedPhotograph,
         judge: impl Fn(usize, f32, f32) -> f32,
         back_projected: &mut [[f32; 3]],
     ) -> [f32; 3] {
-        const MOST: usize = 2 * HrCache::REACH + 1;
-        let [left, top] = self.block(view, x, y);
-        let [columns, rows] = self.side;
+        let block = Block { at: self.block(view, x, y), columns: self.side[0], colours };
         let view = &self.views[view];
         let (operator, inverse) = (&view.kernel.operator, &view.kernel.inverse);
-        let (xs, ys) = (near(x, Self::REACH, operator.x.outputs()), near(y, Self::REACH, operator.y.outputs()));
-        // What the fresh block changes in what the kernel made, and then the residuals.
-        let mut residuals = [[[0.0f32; 3]; MOST]; MOST];
-        for b in 0..rows {
-            let mut change = [[0.0f32; 3]; MOST];
-            let cached = &view.rendered[3 * ((top + b) * view.width + left)..].as_chunks::<3>().0[..columns];
-            for (a, (fresh, old)) in colours[b * columns..][..columns].iter().zip(cached).enumerate() {
-                let news: [f32; 3] = std::array::from_fn(|c| 255.0 * fresh[c] - f32::from(old[c]));
-                for (qx, sum) in xs.clone().zip(&mut change) {
-                    let w = operator.x.weight(qx, left + a);
-                    (0..3).for_each(|c| sum[c] += w * news[c]);
-                }
-            }
-            for (qy, sums) in ys.clone().zip(&mut residuals) {
-                let w = operator.y.weight(qy, top + b);
-                sums.as_flattened_mut().iter_mut().zip(change.as_flattened()).for_each(|(sum, v)| *sum += w * v);
-            }
-        }
-        let mut own = [0.0; 3];
+        let (xs, ys) = (near(x, operator.x.outputs()), near(y, operator.y.outputs()));
+        // What the kernel makes of it, and then the residuals.
+        let mut residuals = view.projected(&block, xs.clone(), ys.clone());
         for (qy, row) in ys.clone().zip(&mut residuals) {
-            for (qx, residual) in xs.clone().zip(row) {
-                let at = qy * targets.width + qx;
-                let (projected, target) = (&view.projected[at], &targets.data[3 * at..]);
-                *residual = std::array::from_fn(|c| {
-                    let prediction = (projected[c] as f32).mul_add(1.0 / (ONE * ONE), residual[c]);
-                    judge(c, prediction / 255.0, target[c])
-                });
-                if [qx, qy] == [x, y] {
-                    own = *residual;
-                }
+            let mut target = [[0.0; 4]; NEAR];
+            targets.row(qy * targets.width() + xs.start..qy * targets.width() + xs.end, &mut target[..xs.len()]);
+            for (residual, target) in row.iter_mut().zip(&target) {
+                *residual = std::array::from_fn(|c| judge(c, residual[c], target[c]));
             }
         }
-        for b in 0..rows {
-            let mut projected_rows = [[0.0f32; 3]; MOST];
+        let [left, top] = block.at;
+        for (b, back_projected) in back_projected.chunks_exact_mut(block.columns).enumerate() {
+            let mut narrow = [[0.0f32; 3]; NEAR];
             for (qy, row) in ys.clone().zip(&residuals) {
                 let w = inverse.y.weight(qy, top + b);
-                projected_rows.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, r)| *sum += w * r);
+                narrow.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, r)| *sum += w * r);
             }
-            for (a, projection) in back_projected[b * columns..][..columns].iter_mut().enumerate() {
+            for (a, projection) in back_projected.iter_mut().enumerate() {
                 *projection = [0.0; 3];
-                for (qx, column) in xs.clone().zip(&projected_rows) {
+                for (qx, column) in xs.clone().zip(&narrow) {
                     let w = inverse.x.weight(qx, left + a);
                     (0..3).for_each(|c| projection[c] += w * column[c]);
                 }
             }
         }
-        own
+        residuals[y - ys.start][x - xs.start]
     }
 
     /// Remembers the fresh sub-pixel rays of an LR pixel.
     pub(crate) fn remember(&mut self, view: usize, x: usize, y: usize, colours: &[[f32; 3]]) {
-        // A block at the edge may lie off its LR pixel's centre.
-        const REACH: usize = HrCache::REACH + 1;
         let [left, top] = self.block(view, x, y);
-        let columns = self.side[0];
         let view = &mut self.views[view];
-        let operator = &view.kernel.operator;
-        let (xs, ys) = (near(x, REACH, operator.x.outputs()), near(y, REACH, operator.y.outputs()));
-        for (b, colours) in colours.chunks_exact(columns).enumerate() {
-            let mut change = [[0i64; 3]; 2 * REACH + 1];
-            let cached = view.rendered[3 * ((top + b) * view.width + left)..].as_chunks_mut::<3>().0;
-            for (a, (pixel, fresh)) in cached.iter_mut().zip(colours).enumerate() {
-                let old = std::mem::replace(pixel, fresh.map(to_u8));
-                for (qx, sum) in xs.clone().zip(&mut change) {
-                    let w = whole(operator.x.weight(qx, left + a));
-                    (0..3).for_each(|c| sum[c] += w * (i64::from(pixel[c]) - i64::from(old[c])));
-                }
-            }
-            if change.as_flattened().iter().all(|d| *d == 0) {
-                continue;
-            }
-            for qy in ys.clone() {
-                let w = whole(operator.y.weight(qy, top + b));
-                for (projected, change) in view.projected[qy * operator.x.outputs()..][xs.clone()].iter_mut().zip(&change) {
-                    (0..3).for_each(|c| projected[c] += w * change[c]);
-                }
-            }
+        for (row, colours) in (top..).zip(colours.chunks_exact(self.side[0])) {
+            ROWS.with_borrow_mut(|rows| {
+                rows.read.clear();
+                rows.read.extend(colours.as_flattened().iter().map(|&v| to_u8(v)));
+                view.rendered.write(3 * (row * view.width + left), &rows.read);
+            });
         }
     }
 
-    /// The cached bytes of all views, one after the other.
-    pub(crate) fn parts(&self) -> impl Iterator<Item = &[u8]> {
-        self.views.iter().map(|v| &v.rendered[..])
+    /// Gives the cached bytes of all views, one view after the other.
+    pub(crate) fn write(&self, to: &mut impl io::Write) -> io::Result<()> {
+        let mut buffer = Vec::new();
+        self.views.iter().try_for_each(|view| to.write_all(view.rendered.read(0..view.rendered.len(), &mut buffer)))
     }
 
     /// Bytes cached.
     pub(crate) fn len(&self) -> usize {
-        self.parts().map(<[u8]>::len).sum()
+        self.views.iter().map(|view| view.rendered.len()).sum()
     }
 
-    /// Restores what [`HrCache::parts`] gave, [`HrCache::len`] bytes.
-    pub(crate) fn restore(&mut self, bytes: &[u8]) {
-        let mut rest = bytes;
+    /// Restores what [`HrCache::write`] gave, [`HrCache::len`] bytes.
+    pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
         for view in &mut self.views {
-            let (own, after) = rest.split_at(view.rendered.len());
-            view.rendered.copy_from_slice(own);
-            view.project();
-            rest = after;
+            let mut bytes = vec![0; view.rendered.len()];
+            from.read_exact(&mut bytes)?;
+            view.rendered.write(0, &bytes);
         }
+        Ok(())
     }
+}
+
+/// HR pixels that were rendered just now.
+struct Block<'a> {
+    /// Its first column and row.
+    at: [usize; 2],
+    columns: usize,
+    colours: &'a [[f32; 3]],
 }
 
 impl CachedView {
-    /// Applies the kernel to all of it.
-    fn project(&mut self) {
+    /// What the kernel makes of it at some LR columns and rows, at most [`NEAR`] of each, with a block as freshly rendered.
+    fn projected(&self, block: &Block<'_>, xs: Range<usize>, ys: Range<usize>) -> [[[f32; 3]; NEAR]; NEAR] {
         let (across, down) = (&self.kernel.operator.x, &self.kernel.operator.y);
-        let mut narrow = vec![[0i64; 3]; across.outputs() * self.height];
-        for (row, sums) in self.rendered.chunks_exact(3 * self.width).zip(narrow.chunks_exact_mut(across.outputs())) {
-            for (i, sum) in sums.iter_mut().enumerate() {
-                let (first, weights) = across.run(i);
-                for (pixel, &w) in row[3 * first..].as_chunks::<3>().0.iter().zip(weights) {
-                    (0..3).for_each(|c| sum[c] += whole(w) * i64::from(pixel[c]));
+        let (columns, lines) = (footprint(across, xs.clone()), footprint(down, ys.clone()));
+        let [left, top] = block.at;
+        let mut projected = [[[0.0f32; 3]; NEAR]; NEAR];
+        ROWS.with_borrow_mut(|rows| {
+            for line in lines {
+                let start = line * self.width;
+                let read = self.rendered.read(3 * (start + columns.start)..3 * (start + columns.end), &mut rows.read);
+                rows.levels.clear();
+                rows.levels.extend(read.as_chunks::<3>().0.iter().map(|pixel| pixel.map(|v| f32::from(v) / 255.0)));
+                if let Some(fresh) = line.checked_sub(top).and_then(|b| block.colours.chunks_exact(block.columns).nth(b)) {
+                    rows.levels[left - columns.start..][..fresh.len()].copy_from_slice(fresh);
+                }
+                let mut narrow = [[0.0f32; 3]; NEAR];
+                for (qx, sum) in xs.clone().zip(&mut narrow) {
+                    let (first, weights) = across.run(qx);
+                    for (level, w) in rows.levels[first - columns.start..].iter().zip(weights) {
+                        (0..3).for_each(|c| sum[c] += w * level[c]);
+                    }
+                }
+                for (qy, sums) in ys.clone().zip(&mut projected) {
+                    let w = down.weight(qy, line);
+                    sums.as_flattened_mut().iter_mut().zip(narrow.as_flattened()).for_each(|(sum, v)| *sum += w * v);
                 }
             }
-        }
-        self.projected.clear();
-        self.projected.resize(across.outputs() * down.outputs(), [0; 3]);
-        for (j, sums) in self.projected.chunks_exact_mut(across.outputs()).enumerate() {
-            let (first, weights) = down.run(j);
-            for (row, &w) in narrow[first * across.outputs()..].chunks_exact(across.outputs()).zip(weights) {
-                sums.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, v)| *sum += whole(w) * v);
-            }
-        }
+        });
+        projected
     }
 }
 
-/// Outputs up to `reach` beside one, of so many.
-fn near(at: usize, reach: usize, end: usize) -> std::ops::Range<usize> {
-    at.saturating_sub(reach)..(at + reach + 1).min(end)
+/// Inputs from the first to the last that outputs are made from.
+fn footprint(taps: &AxisTaps, outputs: Range<usize>) -> Range<usize> {
+    let (first, _) = taps.run(outputs.start);
+    let (last, weights) = taps.run(outputs.end - 1);
+    first..last + weights.len()
 }
 
-/// What weights of 1 are in fixed point.
-const ONE: f32 = (1 << 20) as f32;
-
-/// A weight in fixed point.
-fn whole(weight: f32) -> i64 {
-    (weight * ONE + 0.5f32.copysign(weight)) as i64
+/// LR pixels beside one whose residuals count, of so many.
+fn near(at: usize, end: usize) -> Range<usize> {
+    at.saturating_sub(HrCache::REACH)..(at + HrCache::REACH + 1).min(end)
 }
 
 #[cfg(test)]
 mod tests {
-    use pixels::{Filter, Resampling};
-
     use super::*;
 
     fn pattern(width: usize, height: usize) -> Image {
@@ -245,18 +244,45 @@ mod tests {
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
+    fn cache(side: [usize; 2], image: &Image, kernel: Arc<KernelOperator>) -> HrCache {
+        let mut cache = HrCache::new(side);
+        cache.add(image, kernel, &mut PixelMemory::unlimited()).unwrap();
+        cache
+    }
+
+    /// Where a filter's footprint is the pixel's own block, the residual asks of every HR pixel what the mean's does.
+    #[test]
+    fn a_whole_box_is_the_mean() {
+        let (hr, lr) = ((12, 8), (6, 4));
+        assert!(!HrCache::is_needed(Filter::Box, hr, lr) && HrCache::is_needed(Filter::Lanczos, hr, lr));
+        assert!(HrCache::is_needed(Filter::Box, (11, 8), lr));
+        let cache = cache([2, 2], &pattern(12, 8), Arc::new(KernelOperator::new(Filter::Box, hr, lr)));
+        let targets = PackedPhotograph::new(&pattern(6, 4).into(), &mut PixelMemory::unlimited()).unwrap();
+        let colours = [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9], [0.2, 0.1, 0.0]];
+        let mut back_projected = [[9.0; 3]; 4];
+        let own = cache.back_project(0, [2, 1], &colours, &targets, |_, p, t| p - t, &mut back_projected);
+        for c in 0..3 {
+            let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() / 4.0;
+            assert!((own[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
+            assert!(
+                back_projected.iter().all(|p| (p[c] - own[c] / 4.0).abs() < 0.02 * own[c].abs() + 1e-6),
+                "{back_projected:?}"
+            );
+        }
+    }
+
     /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any scale, also where the block
     /// is news.
     #[test]
     fn back_projections_are_the_operators_own() {
         for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
             let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
-            let operator = Resampling::new(Filter::Lanczos, hr, lr);
-            let inverse = operator.inverse(HrCache::REACH);
+            let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, hr, lr));
+            let KernelOperator { operator, inverse } = &*kernel;
             let image = pattern(hr.0, hr.1);
             let targets = pattern(lr.0, lr.1);
-            let mut cache = HrCache::new(side);
-            cache.add(&image, Arc::new(KernelOperator::new(operator.clone())));
+            let packed = PackedPhotograph::new(&targets.clone().into(), &mut PixelMemory::unlimited()).unwrap();
+            let cache = cache(side, &image, kernel.clone());
             for y in 0..lr.1 {
                 for x in 0..lr.0 {
                     let [i, j] = cache.block(0, x, y);
@@ -269,7 +295,7 @@ mod tests {
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
                     let expected = inverse.adjoint(&residual);
                     let mut back_projected = vec![[9.0; 3]; fresh.len()];
-                    let own = cache.back_project(0, [x, y], &fresh, &targets, |_, p, t| p - t, &mut back_projected);
+                    let own = cache.back_project(0, [x, y], &fresh, &packed, |_, p, t| p - t, &mut back_projected);
                     for c in 0..3 {
                         assert!((own[c] - residual.data[3 * (y * lr.0 + x) + c]).abs() < 1e-5, "{lr:?} {hr:?} ({x}, {y})");
                         for (k, projection) in back_projected.iter().enumerate() {
@@ -283,35 +309,21 @@ mod tests {
 
     #[test]
     fn remembers_what_it_is_told() {
-        let mut cache = HrCache::new([2, 2]);
-        cache.add(&pattern(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
-        cache.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
-        let bytes: Vec<u8> = cache.parts().flatten().copied().collect();
-        assert_eq!(cache.len(), bytes.len());
-        assert_eq!(bytes[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
-        let mut other = HrCache::new([2, 2]);
-        other.add(&pattern(8, 6), Arc::new(KernelOperator::new(Resampling::new(Filter::Box, (8, 6), (4, 3)))));
-        other.restore(&bytes);
-        assert!(other.parts().eq(cache.parts()));
-    }
-
-    /// What the kernel makes follows what is cached, at any scale and also at the edges.
-    #[test]
-    fn projected_pixels_follow() {
-        for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((20, 13), (21, 14))] {
-            for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
-                let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
-                let mut cache = HrCache::new(side);
-                cache.add(&pattern(hr.0, hr.1), Arc::new(KernelOperator::new(Resampling::new(filter, hr, lr))));
-                for k in 0..lr.0 * lr.1 {
-                    let colours: Vec<[f32; 3]> = (0..side[0] * side[1]).map(|i| [(i * 7 + k) as f32 % 1.0, 0.3, 1.0]).collect();
-                    cache.remember(0, k % lr.0, k / lr.0, &colours);
-                }
-                let followed = cache.views[0].projected.clone();
-                cache.views[0].project();
-                assert_eq!(cache.views[0].projected, followed, "{filter:?} {lr:?} {hr:?}");
-            }
-        }
+        let kernel = Arc::new(KernelOperator::new(Filter::Box, (8, 6), (4, 3)));
+        let mut first = cache([2, 2], &pattern(8, 6), kernel.clone());
+        first.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
+        let bytes = |cache: &HrCache| {
+            let mut bytes = Vec::new();
+            cache.write(&mut bytes).unwrap();
+            bytes
+        };
+        let kept = bytes(&first);
+        assert_eq!(first.len(), kept.len());
+        assert_eq!(kept[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
+        let mut other = cache([2, 2], &pattern(8, 6), kernel);
+        other.restore(&mut &kept[..]).unwrap();
+        assert_eq!(bytes(&other), kept);
+        assert!(other.restore(&mut &kept[1..]).is_err(), "a byte is missing");
     }
 
     /// Every HR pixel belongs to some block, so none is left unseen.
@@ -319,9 +331,8 @@ mod tests {
     fn blocks_cover_the_image() {
         for (lr, hr) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
             let side = (hr as f64 / lr as f64).ceil() as usize;
-            let mut cache = HrCache::new([side, side]);
-            let operator = Resampling::new(Filter::Lanczos, (hr, hr), (lr, lr));
-            cache.add(&pattern(hr, hr), Arc::new(KernelOperator::new(operator)));
+            let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (hr, hr), (lr, lr)));
+            let cache = cache([side, side], &pattern(hr, hr), kernel);
             let mut seen = vec![false; hr];
             (0..lr).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
             assert!(seen.iter().all(|s| *s), "{lr} {hr}");

@@ -1,13 +1,26 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure};
+use artifact::{Context, Failure, GivenInput, Progress};
 use poses::Moved;
 use radiance::{FieldFile, FieldModel};
+use scene::Views;
 
 use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
-use crate::{Combine, Photographs, Resolved, TrainingData, TrainingLog, read_hull, supervision};
+use crate::params::Combine;
+use crate::resolve::Resolved;
+use crate::setup::{read_hull, supervision};
+use crate::training_log::TrainingLog;
+
+/// What a training learns from, and where it says how far it is.
+#[derive(Clone, Copy)]
+pub(crate) struct TrainingData<'a> {
+    pub(crate) input: &'a GivenInput,
+    pub(crate) references: Option<&'a GivenInput>,
+    pub(crate) views: &'a Views,
+    pub(crate) progress: &'a Progress,
+}
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
 pub(crate) struct Member<'a> {
@@ -113,8 +126,11 @@ impl<'a> Member<'a> {
     /// Trains to the end, with checkpoints, progress and a curve.
     fn train(&self, params: &Resolved, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
-        let references = data.references.map(|input| Photographs::read_first(input, params.max_references)).transpose()?;
-        let mut supervision = supervision(input, params, Photographs::read(input)?, references, &|text| context.say(text))?;
+        let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
+        if let Some(work) = work {
+            std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
+        }
+        let mut supervision = supervision(input, params, data.references, folder, &|text| context.say(text))?;
         let (total, bundle) = (params.rays, supervision.full_side().iter().product::<usize>());
         if total < bundle as u64 {
             let message = format!("parameter rays: {total} for a field is less than the {bundle} of one pixel");
@@ -123,9 +139,6 @@ impl<'a> Member<'a> {
         let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
         let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
         let mut trainer = start(params, from, views.bounds, &context.device, hull)?;
-        if let Some(work) = work {
-            std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
-        }
         let mut checkpoints = Checkpoints::new(work);
         let mut curve = checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
         loop {
@@ -134,6 +147,9 @@ impl<'a> Member<'a> {
                 return Err(Failure::Interrupted.into());
             }
             let Some(report) = trainer.step(&mut supervision)? else { break };
+            if let Some(fault) = supervision.fault() {
+                anyhow::bail!("the file that keeps pixels can't be read or written: {fault}");
+            }
             if report.skipped {
                 context.say(format!(
                     "step {}: something wasn't finite; the step was thrown away and the rate halved",

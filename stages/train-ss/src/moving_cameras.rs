@@ -27,9 +27,13 @@ const RENDERINGS: u32 = 3;
 const SMALLER: u32 = 3;
 
 impl MovingCameras {
-    /// Cameras, and their RGB photographs, NaN where nothing is known.
-    pub(crate) fn new<'a>(cameras: Vec<Camera>, photographs: impl Iterator<Item = &'a Image>) -> Self {
-        let photographs = photographs.map(|image| Pyramid::new(image, SMALLER)).collect();
+    /// An RGB photograph, NaN where nothing is known, at all sizes that it is compared at.
+    pub(crate) fn pyramid(photograph: &Image) -> Pyramid {
+        Pyramid::new(photograph, SMALLER)
+    }
+
+    /// Cameras, and their photographs.
+    pub(crate) fn new(cameras: Vec<Camera>, photographs: Vec<Pyramid>) -> Self {
         Self { were: cameras.clone(), now: cameras, photographs, rounds: 0 }
     }
 
@@ -115,7 +119,8 @@ mod tests {
             camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
         let image = Image::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
-        let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], [&image, &image].into_iter());
+        let pyramids = || (0..2).map(|_| MovingCameras::pyramid(&image)).collect();
+        let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], pyramids());
         let mut moving = new();
         assert!(!moving.are_due(0.01) && moving.are_due(0.02));
         moving.step(&field, 0.02, 1.0, |_| [1.0; 3]).unwrap();

@@ -2,7 +2,8 @@ use radiance::{Architecture, MlpArchitecture};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Order, Supervision};
+use crate::pixel_sampler::Order;
+use crate::supervision::Supervision;
 
 /// Parameters of `train-ss`. Those that stay unset get a default from the scene ([`Params::resolve`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -6,8 +6,10 @@ use poses::{Shot, photometric_error};
 use scene::Camera;
 
 use crate::field_trainer::read;
-use crate::member::Member;
-use crate::{Photographs, TrainingData, TrainingLog};
+use crate::member::{Member, TrainingData};
+use crate::packed::{PackedPhotograph, PixelMemory};
+use crate::photographs::Photographs;
+use crate::training_log::TrainingLog;
 
 /// Trains a member. Where poses are to be refined it is trained twice, with refined poses and with the given ones, and the given ones stay unless
 /// photographs are met better with the refined.
@@ -55,9 +57,9 @@ struct Judge<'a> {
 
 impl<'a> Judge<'a> {
     fn new(member: &'a Member<'a>, data: &'a TrainingData<'a>) -> anyhow::Result<Self> {
-        let photographs = Photographs::read(data.input)?.over_background();
+        let photographs = Photographs::read(data.input, usize::MAX, &mut PixelMemory::unlimited())?.over_background();
         let background = photographs.views.background.shown();
-        Ok(Self { member, data, photographs: photographs.images.into_iter().map(scene::Photograph::known).collect(), background })
+        Ok(Self { member, data, photographs: photographs.images.iter().map(PackedPhotograph::known).collect(), background })
     }
 
     /// How far photographs are from their neighbours by what a training found; none where there is nothing to compare.

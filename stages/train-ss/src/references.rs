@@ -1,7 +1,9 @@
+use anyhow::Context as _;
 use pixels::{Exposure, Image, Kernel, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
 use scene::Camera;
 
-use crate::Photographs;
+use crate::packed::{PackedPhotograph, PixelMemory};
+use crate::photographs::{NO_PLACE, Photographs};
 
 /// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else where it differs by more than this, in dB.
 const ALIKE: f64 = 25.0;
@@ -18,34 +20,46 @@ pub(crate) fn checked(
     mut references: Photographs,
     photographs: &Photographs,
     kernel: Kernel,
+    memory: &mut PixelMemory,
     say: &dyn Fn(String),
-) -> Photographs {
-    let pairs = references.views.views.into_iter().zip(references.images);
-    let kept = pairs.filter_map(|(view, mut photograph)| {
-        let Some(own) = own_photograph(photographs, &view.camera) else { return Some((view, photograph)) };
+) -> anyhow::Result<Photographs> {
+    let (mut views, mut images) = (Vec::new(), Vec::new());
+    for (view, mut packed) in references.views.views.into_iter().zip(references.images) {
+        let Some(own) = own_photograph(photographs, &view.camera) else {
+            views.push(view);
+            images.push(packed);
+            continue;
+        };
+        let mut photograph = packed.unpacked();
         let (name, reference) = (&view.camera.name, &mut photograph.image);
-        let [mut shrunk, own] = compared(reference, own, kernel);
+        let [mut shrunk, own] = compared(reference, &own, kernel);
         if let Some(exposure) = Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none()) {
             let [r, g, b] = exposure.gain;
             say(format!("reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"));
             exposure.take_back(reference);
             exposure.take_back(&mut shrunk);
+            packed = PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?;
         }
         let alike = alikeness(&shrunk, &own);
         if alike < ALIKE {
-            say(format!("reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and is left out: another view, or something that moved?"));
+            say(format!(
+                "reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and is left out: another view, or something that moved?"
+            ));
         }
-        (alike >= ALIKE).then_some((view, photograph))
-    });
-    (references.views.views, references.images) = kept.unzip();
-    references
+        if alike >= ALIKE {
+            views.push(view);
+            images.push(packed);
+        }
+    }
+    (references.views.views, references.images) = (views, images);
+    Ok(references)
 }
 
 /// The LR photograph that a camera took, where there is one.
-fn own_photograph<'a>(photographs: &'a Photographs, camera: &Camera) -> Option<&'a Image> {
+fn own_photograph(photographs: &Photographs, camera: &Camera) -> Option<Image> {
     let view = photographs.views.taken_by(camera)?;
     let place = photographs.views.views.iter().position(|other| std::ptr::eq(other, view))?;
-    Some(&photographs.images[place].image)
+    Some(photographs.images[place].whole())
 }
 
 /// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as `prep` does it, from 8 bits to 8 bits.
@@ -91,7 +105,7 @@ fn alikeness(one: &Image, other: &Image) -> f64 {
 #[cfg(test)]
 mod tests {
     use pixels::Filter;
-    use scene::{Background, Bounds, Camera, Intrinsics, View, Views};
+    use scene::{Camera, Intrinsics};
 
     use super::*;
 
@@ -101,8 +115,7 @@ mod tests {
         let intrinsics = Intrinsics { width, height, fx: 20.0, fy: 20.0, cx: 8.0, cy: 8.0, distortion: Default::default() };
         let camera_to_world = [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]];
         let camera = Camera { name: name.into(), intrinsics, camera_to_world };
-        let views = Views::new(Background::White, Bounds::default(), vec![View::camera_only(camera)]);
-        Photographs { views, images: vec![image.into()] }
+        Photographs::taken_by(camera, image)
     }
 
     fn hr() -> Image {
@@ -120,8 +133,9 @@ mod tests {
             let said = std::cell::RefCell::new(String::new());
             let mut image = hr();
             image.data.iter_mut().for_each(|v| *v = change(*v));
-            let kept = checked(photographs(name, image), &lr(), Kernel::Lanczos, &|text| said.borrow_mut().push_str(&text));
-            (kept.images.into_iter().next().map(|p| p.image), kept.views.views.len(), said.into_inner())
+            let say = |text: String| said.borrow_mut().push_str(&text);
+            let kept = checked(photographs(name, image), &lr(), Kernel::Lanczos, &mut PixelMemory::unlimited(), &say).unwrap();
+            (kept.images.first().map(|packed| packed.whole().over(0.0)), kept.views.views.len(), said.into_inner())
         };
         let (same, views, said) = checked("a", &|v| v);
         assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
@@ -157,9 +171,11 @@ mod tests {
                 let hr = Image::premultiplied(&hr);
                 let said = std::cell::RefCell::new(String::new());
                 let given = photographs("a", lr.clone());
-                let kept = checked(photographs("a", hr.clone()), &given, kernel, &|text| said.borrow_mut().push_str(&text));
+                let say = |text: String| said.borrow_mut().push_str(&text);
+                let memory = &mut PixelMemory::unlimited();
+                let kept = checked(photographs("a", hr.clone()), &given, kernel, memory, &say).unwrap();
                 assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
-                assert_eq!(kept.images[0].image, hr);
+                assert_eq!(kept.images[0].whole(), hr);
                 let [shrunk, own] = compared(&hr, &lr, kernel);
                 assert_eq!(alikeness(&shrunk, &own), 100.0, "{size} {kernel:?}");
             }

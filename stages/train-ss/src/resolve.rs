@@ -7,8 +7,8 @@ use scene::{Background, Intrinsics, Space, View, Views};
 use serde_json::{Value, json};
 
 use crate::params::{Combine, FieldParams, GridParams, MlpParams, Params};
-use crate::supervision::warmup_stages;
-use crate::{Order, Supervision};
+use crate::pixel_sampler::Order;
+use crate::supervision::{Supervision, warmup_stages};
 
 /// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
 const EPOCHS: u64 = 20;

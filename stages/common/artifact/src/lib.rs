@@ -77,7 +77,7 @@ pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
 pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path};
-pub use memory::{MEMORY_REMEDY, machine_memory, out_of_memory};
+pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
 pub use nearest::{known_names, nearest};
 pub use panics::install_panic_hook;
 pub use parameters::{ParameterProblem, Schema};

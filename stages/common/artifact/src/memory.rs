@@ -1,5 +1,6 @@
 use sysinfo::{MemoryRefreshKind, System};
 
+use crate::Failure;
 use crate::amounts::sized;
 
 /// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
@@ -24,6 +25,28 @@ pub fn machine_memory() -> Option<u64> {
     Some(system.cgroup_limits().map_or(system.total_memory(), |limits| limits.total_memory))
 }
 
+/// The variable that says how many bytes of memory a stage may take.
+pub const MEMORY_VARIABLE: &str = "NERF_SR_MEMORY";
+
+/// Bytes of memory that a stage may take: those that are free on this machine and in its container, no more than
+/// [`MEMORY_VARIABLE`] says; none where neither is known.
+pub fn available_memory() -> Result<Option<u64>, Failure> {
+    let most = std::env::var(MEMORY_VARIABLE).ok().map(|text| in_bytes(&text)).transpose()?;
+    Ok(free_memory().into_iter().chain(most).min())
+}
+
+fn in_bytes(text: &str) -> Result<u64, Failure> {
+    text.parse()
+        .map_err(|_| Failure::Usage(format!("{MEMORY_VARIABLE}: {text:?} is no number of bytes; for 4 GB write 4000000000")))
+}
+
+fn free_memory() -> Option<u64> {
+    let mut system = System::new().ok()?;
+    system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
+    let container = system.cgroup_limits().map(|limits| limits.total_memory.saturating_sub(limits.rss));
+    Some(container.map_or(system.available_memory(), |left| left.min(system.available_memory())))
+}
+
 /// What helps where memory is short.
 pub const MEMORY_REMEDY: &str =
     "end other programs, run one stage at a time (`nerf-sr run --jobs 1`), or give it fewer or smaller images";
@@ -46,6 +69,15 @@ mod tests {
     #[test]
     fn a_machine_has_some_memory() {
         assert!(machine_memory().is_some_and(|bytes| (1 << 28..1 << 50).contains(&bytes)), "{:?}", machine_memory());
+    }
+
+    #[test]
+    fn some_of_it_is_free() {
+        let free = free_memory().unwrap();
+        assert!(free > 1 << 26 && free <= machine_memory().unwrap(), "{free}");
+        assert_eq!(in_bytes("4000000000").unwrap(), 4_000_000_000);
+        let said = in_bytes("4GB").unwrap_err().to_string();
+        assert_eq!(said, "NERF_SR_MEMORY: \"4GB\" is no number of bytes; for 4 GB write 4000000000");
     }
 
     #[test]

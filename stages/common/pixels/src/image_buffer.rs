@@ -46,11 +46,12 @@ impl Image {
     /// 8-bit RGBA in [0, 1] with premultiplied alpha.
     pub fn premultiplied(image: &Rgba8) -> Self {
         let level = |v: u8| f32::from(v) / 255.0;
-        let pixel = |p: &[u8]| {
-            let alpha = level(p[3]);
-            [level(p[0]) * alpha, level(p[1]) * alpha, level(p[2]) * alpha, alpha]
-        };
-        Self::new(image.width, image.height, 4, image.data.chunks_exact(4).flat_map(pixel).collect())
+        let mut data = vec![0.0; image.data.len()];
+        for (out, [r, g, b, a]) in data.as_chunks_mut::<4>().0.iter_mut().zip(image.data.as_chunks::<4>().0) {
+            let alpha = level(*a);
+            *out = [level(*r) * alpha, level(*g) * alpha, level(*b) * alpha, alpha];
+        }
+        Self::new(image.width, image.height, 4, data)
     }
 
     /// RGBA with premultiplied alpha over a grey level, in floating point as the paper does: rgb + (1-a)·background.
@@ -60,8 +61,11 @@ impl Image {
     #[must_use]
     pub fn over(&self, background: f32) -> Self {
         assert_eq!(self.channels, 4, "only an image with alpha can lie over something");
-        let over = |p: &[f32]| [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
-        Self::new(self.width, self.height, 3, self.data.chunks_exact(4).flat_map(over).collect())
+        let mut data = vec![0.0; self.data.len() / 4 * 3];
+        for (out, p) in data.as_chunks_mut::<3>().0.iter_mut().zip(self.data.as_chunks::<4>().0) {
+            *out = [0, 1, 2].map(|c| p[c] + (1.0 - p[3]) * background);
+        }
+        Self::new(self.width, self.height, 3, data)
     }
 
     /// One channel, alone.

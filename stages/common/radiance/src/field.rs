@@ -1,8 +1,9 @@
+use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use counter_rng::CounterRng;
 use rayon::prelude::*;
-use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, SafeTensors, View};
 use scene::Bounds;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -57,6 +58,11 @@ impl Architecture {
             ("steps", self.steps, 16, 8192),
         ];
         in_ranges(&ranges)
+    }
+
+    /// Numbers in the grid of a field with this architecture.
+    pub fn grid_len(&self) -> usize {
+        levels(self).last().map_or(0, |level| level.range().end)
     }
 
     /// Samples of a ray through all of the cube, more or less: what a training expects before it has seen any.
@@ -189,7 +195,7 @@ impl Field {
     fn empty(architecture: Architecture, bounds: Bounds) -> Self {
         let levels = levels(&architecture);
         let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
-        let grid = vec![0.0; levels.last().map_or(0, |l| l.range().end)];
+        let grid = vec![0.0; architecture.grid_len()];
         // Whole vectors, for the optimiser.
         let network = vec![0.0; layers.len().next_multiple_of(crate::simd::LANES)];
         Self { architecture, bounds, levels, layers, grid, network, occupancy: Occupancy::full() }
@@ -309,17 +315,47 @@ pub(crate) enum Tensor<'a> {
     U8(&'a [u8]),
 }
 
+/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest tensor at a time.
+struct Written<'a>(&'a Tensor<'a>, [usize; 1]);
+
+impl View for Written<'_> {
+    fn dtype(&self) -> Dtype {
+        match self.0 {
+            Tensor::F32(_) => Dtype::F32,
+            Tensor::U8(_) => Dtype::U8,
+        }
+    }
+
+    fn shape(&self) -> &[usize] {
+        &self.1
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        match self.0 {
+            Tensor::F32(numbers) => Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Tensor::U8(bytes) => Cow::Borrowed(bytes),
+        }
+    }
+
+    fn data_len(&self) -> usize {
+        match self.0 {
+            Tensor::F32(numbers) => size_of_val(*numbers),
+            Tensor::U8(bytes) => bytes.len(),
+        }
+    }
+}
+
+impl Tensor<'_> {
+    fn len(&self) -> usize {
+        match self {
+            Self::F32(numbers) => numbers.len(),
+            Self::U8(bytes) => bytes.len(),
+        }
+    }
+}
+
 pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
-    let bytes: Vec<(String, Dtype, usize, Vec<u8>)> = tensors
-        .iter()
-        .map(|(name, tensor)| match tensor {
-            Tensor::F32(v) => ((*name).to_owned(), Dtype::F32, v.len(), v.iter().flat_map(|x| x.to_le_bytes()).collect()),
-            Tensor::U8(v) => ((*name).to_owned(), Dtype::U8, v.len(), v.to_vec()),
-        })
-        .collect();
-    let views = bytes.iter().map(|(name, dtype, len, data)| {
-        (name.as_str(), TensorView::new(*dtype, vec![*len], data).expect("the length is that of the data"))
-    });
+    let views = tensors.iter().map(|(name, tensor)| (*name, Written(tensor, [tensor.len()])));
     let io = |source| FieldError::Io { path: path.to_path_buf(), source };
     let whole = safetensors::serialize(views, None).map_err(|e| io(std::io::Error::other(e.to_string())))?;
     std::fs::write(path, whole).map_err(io)

@@ -17,7 +17,8 @@ use crate::log::{StageLog, Tenths};
 use crate::verdict::{End, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
-const ENVIRONMENT: [&str; 10] = [
+const ENVIRONMENT: [&str; 11] = [
+    artifact::MEMORY_VARIABLE,
     "PATH",
     "HOME",
     "LANG",
