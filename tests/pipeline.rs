@@ -195,7 +195,6 @@ fn every_option_goes_through() {
     for options in [
         &["-p", "background=alpha"][..],
         &["-p", "background=black", "-p", "kernel=bicubic"],
-        &["-p", "hull=alpha"],
         &["-p", "kernel=average", "-p", "supersample_warmup=0.2"],
         &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
         &["-p", "lr_width=20", "-p", "scale=1.5", "-p", "prep.hr_references=2", "-p", "test_views=2"],

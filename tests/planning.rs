@@ -130,7 +130,6 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
         (&["upsample"][..], "stage upsample: input weights is missing: methods imdn, liif and swinir"),
         (&["upsample", "-p", "method=bicubic,liif"], "stage upsample [method=liif]: input weights is missing"),
         (&["-p", "prep.scale=2.7", "-p", "kernel=average"], "stage prep: parameter kernel: average needs a whole scale"),
-        (&["-p", "hull=alpha", "-p", "space=ndc"], "stage prep: parameter hull: alpha carves a box"),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
             "stage train-ss: parameter supervision: kernel needs a background",

@@ -2,8 +2,13 @@
 
 use std::fmt::{self, Display, Formatter};
 
+use artifact::FailureExt as _;
+use dataset::Frame;
 use pixels::Rgba8;
+use rayon::prelude::*;
 use scene::Background;
+
+use crate::frame_name;
 
 /// Views that are looked at, spread evenly: enough to tell nine of ten.
 pub(crate) const LOOKED_AT: usize = 20;
@@ -114,6 +119,18 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
         values.sort_unstable();
         values.get(values.len() / 2).copied().unwrap_or(0)
     })
+}
+
+/// Looks at the borders of training views, spread evenly; where the first has alpha, at no other. No more images than threads are
+/// held at once.
+pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
+    let look = |frame: &Frame| -> anyhow::Result<Border> { Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?)) };
+    let count = frames.len().min(LOOKED_AT);
+    if count > 0 && look(frames[0])? == Border::Transparent {
+        return Ok(Borders::new(&[Border::Transparent]));
+    }
+    let chosen = (0..count).into_par_iter().map(|i| look(frames[i * frames.len() / count]));
+    Ok(Borders::new(&chosen.collect::<anyhow::Result<Vec<Border>>>()?))
 }
 
 #[cfg(test)]

@@ -7,15 +7,6 @@ pub(crate) fn extension(kernel: Kernel) -> &'static str {
     if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
-/// How far, in LR pixels, an LR pixel reads to each side.
-pub(crate) fn footprint(kernel: Kernel) -> usize {
-    match kernel {
-        Kernel::Lanczos => 3,
-        Kernel::Bicubic => 2,
-        Kernel::Box | Kernel::Average => 1,
-    }
-}
-
 /// LR pixels beside one that its mask has to be clear of, too: beyond them lie a kernel's last lobe and less than a tenth of its weight.
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
@@ -50,14 +41,6 @@ impl LrImage {
         match self {
             Self::Bytes(image) => (image.width, image.height),
             Self::Floats(image) => (image.width, image.height),
-        }
-    }
-
-    /// Alpha, row by row.
-    pub(crate) fn alpha(&self) -> Vec<f32> {
-        match self {
-            Self::Bytes(image) => image.data.iter().skip(3).step_by(4).map(|&a| f32::from(a) / 255.0).collect(),
-            Self::Floats(image) => image.channel(3),
         }
     }
 }

@@ -79,7 +79,7 @@ impl Stage for Register {
         let (summary, warning) = summary(&found);
         warning.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
         let views = found.into_iter().map(|registered| View::camera_only(registered.to)).collect();
-        context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(given.background, given.bounds, views) })?;
+        context.write_json(VIEWS_FILE, &Views::new(given.background, given.bounds, views))?;
         context.write_summary(&with_warnings(&summary, warning.as_slice()))
     }
 }

@@ -93,7 +93,7 @@ impl Stage for RenderDepth {
             views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
         }
         let count = views.len();
-        context.write_json(VIEWS_FILE, &Views { hull: None, ..Views::new(file.background, cameras.bounds, views) })?;
+        context.write_json(VIEWS_FILE, &Views::new(file.background, cameras.bounds, views))?;
         let pixels = amount(pixels_of(&cameras, params.size));
         context.write_summary(&format!("{}, {pixels} pixels", counted(count, "view")))
     }

@@ -40,14 +40,12 @@ impl std::fmt::Display for Collapsed {
 
 impl std::error::Error for Collapsed {}
 
-/// A training that hasn't begun, from semi-transparent space or from weights that another training wrote (`from`). `hull` are 128³ cells
-/// that alone may hold something.
+/// A training that hasn't begun, from semi-transparent space or from weights that another training wrote (`from`).
 pub(crate) fn start(
     params: &Resolved,
     from: Option<&Path>,
     bounds: Bounds,
     device: &str,
-    hull: Option<Vec<u8>>,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     match &params.field {
         ResolvedField::Grid { architecture, distortion, floater_loss, given } => {
@@ -61,20 +59,12 @@ pub(crate) fn start(
             };
             let options = params.grid_training(given, *distortion, *floater_loss);
             if device != "cpu" {
-                return start_grid_on(device, &field, options, hull);
+                return start_grid_on(device, &field, options);
             }
-            let mut trainer = Trainer::new(field, options);
-            if let Some(hull) = hull {
-                trainer.limit_to_hull(&hull);
-            }
-            Ok(Box::new(trainer))
+            Ok(Box::new(Trainer::new(field, options)))
         }
         #[cfg(feature = "torch")]
         ResolvedField::Mlp { architecture, density_noise_std, given } => {
-            if hull.is_some() {
-                let message = "parameter field: mlp can't make use of a visual hull; choose prep.hull none";
-                return Err(Failure::Usage(message.to_owned()).into());
-            }
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
             let field = match from {
@@ -129,23 +119,14 @@ pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &
 
 /// The same grid and the same training through libtorch.
 #[cfg(feature = "torch")]
-fn start_grid_on(
-    device: &str,
-    field: &Field,
-    options: TrainingOptions,
-    hull: Option<Vec<u8>>,
-) -> anyhow::Result<Box<dyn FieldTrainer>> {
+fn start_grid_on(device: &str, field: &Field, options: TrainingOptions) -> anyhow::Result<Box<dyn FieldTrainer>> {
     let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
     nets::deterministic();
-    let mut trainer = torch_field::GridTrainer::new(field, options, device)?;
-    if let Some(hull) = hull {
-        trainer.limit_to_hull(&hull)?;
-    }
-    Ok(Box::new(trainer))
+    Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
 }
 
 #[cfg(not(feature = "torch"))]
-fn start_grid_on(device: &str, _: &Field, _: TrainingOptions, _: Option<Vec<u8>>) -> anyhow::Result<Box<dyn FieldTrainer>> {
+fn start_grid_on(device: &str, _: &Field, _: TrainingOptions) -> anyhow::Result<Box<dyn FieldTrainer>> {
     let message = format!("--device {device}: it needs libtorch, and train-ss was built without it; build with --features torch");
     Err(Failure::Usage(message).into())
 }

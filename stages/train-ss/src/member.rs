@@ -10,7 +10,7 @@ use crate::checkpoint::Checkpoints;
 use crate::field_trainer::{Collapsed, average, start};
 use crate::params::Combine;
 use crate::resolve::Resolved;
-use crate::setup::{read_hull, supervision};
+use crate::setup::supervision;
 use crate::training_log::TrainingLog;
 
 /// What a training learns from, and where it says how far it is.
@@ -136,9 +136,8 @@ impl<'a> Member<'a> {
             let message = format!("parameter rays: {total} for a field is less than the {bundle} of one pixel");
             return Err(Failure::Usage(message).into());
         }
-        let hull = views.hull.as_ref().map(|hull| read_hull(&input.path(hull))).transpose()?;
         let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
-        let mut trainer = start(params, from, views.bounds, &context.device, hull)?;
+        let mut trainer = start(params, from, views.bounds, &context.device)?;
         let mut checkpoints = Checkpoints::new(work);
         let mut curve = checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
         loop {

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, FailureExt as _, GivenInput, available_memory};
+use artifact::{Failure, GivenInput, available_memory};
 use pixels::{DEGRADATION_FILE, Degradation, Kernel};
 use scene::{Background, Views};
 
@@ -82,14 +82,4 @@ fn kernel(input: &GivenInput, params: &Resolved, background: Background) -> anyh
         return Err(Failure::Usage(open_background(parameter)).into());
     }
     Ok(made.map_or(Kernel::Lanczos, |made| made.kernel))
-}
-
-pub(crate) fn read_hull(path: &std::path::Path) -> anyhow::Result<Vec<u8>> {
-    let bytes = std::fs::read(path).bad_input(path.display())?;
-    let tensors = safetensors::SafeTensors::deserialize(&bytes).bad_input(path.display())?;
-    let hull = tensors.tensor("hull").bad_input(path.display())?;
-    if hull.data().len() != 128 * 128 * 128 {
-        return Err(Failure::BadInput(format!("{}: a hull of 128³ cells is expected", path.display())).into());
-    }
-    Ok(hull.data().to_vec())
 }

@@ -112,7 +112,7 @@ impl Stage for Upsample {
             let image = Some(format!("images/{}.exr", camera.name));
             View { image, mask: view.mask.as_ref().map(|_| mask_file(&camera.name)), ..View::camera_only((*camera).clone()) }
         });
-        let hr = Views { hull: None, ..Views::new(views.background, views.bounds, hr.collect()) };
+        let hr = Views::new(views.background, views.bounds, hr.collect());
         context.write_json(VIEWS_FILE, &hr)?;
         let name = format!("{:?}", params.method).to_lowercase();
         context.write_summary(&format!("{}, by {name}", artifact::counted(hr.views.len(), "view")))

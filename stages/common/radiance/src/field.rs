@@ -274,6 +274,15 @@ impl Field {
         self.occupancy.limit_to_occupied();
     }
 
+    /// Keeps a training that starts from this field to some cells of the occupancy, 128³ over the unit cube, x fastest.
+    ///
+    /// # Panics
+    /// When there aren't so many.
+    pub fn limit_to(&mut self, cells: Vec<bool>) {
+        assert_eq!(cells.len(), CELLS, "a cell of the occupancy each");
+        self.occupancy.limit_to(cells);
+    }
+
     /// Whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())

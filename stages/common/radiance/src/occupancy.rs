@@ -2,7 +2,6 @@
 
 use counter_rng::CounterRng;
 use rayon::prelude::*;
-use scene::Bounds;
 
 use crate::ray::{FASTEST, NormalizedRay, RayMap};
 use crate::simd::kernel;
@@ -77,7 +76,7 @@ impl Cell {
 pub struct Occupancy {
     density: Vec<f32>,
     /// Cells that may be occupied at all.
-    hull: Option<Vec<bool>>,
+    allowed: Option<Vec<bool>>,
     /// A bit a cell that isn't empty, and a bit a brick that isn't.
     bricks: Vec<u64>,
     blocks: Vec<u64>,
@@ -89,27 +88,9 @@ impl Occupancy {
     /// Everything may be occupied.
     pub fn full() -> Self {
         let mut full =
-            Self { density: vec![UNKNOWN; CELLS], hull: None, bricks: Vec::new(), blocks: Vec::new(), dense: Vec::new() };
+            Self { density: vec![UNKNOWN; CELLS], allowed: None, bricks: Vec::new(), blocks: Vec::new(), dense: Vec::new() };
         full.set(|_| Cell::Dense);
         full
-    }
-
-    /// Limits it to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
-    pub fn limit_to_hull(&mut self, bounds: &Bounds, hull: &[u8]) {
-        let side = bounds.longest_side();
-        // The occupancy covers the cube of the longest side, the hull the box.
-        let covered = |axis: usize, cell: usize| {
-            let scale = side / (bounds.max[axis] - bounds.min[axis]);
-            let low = (cell as f64 * scale) as usize;
-            let high = ((cell + 1) as f64 * scale).ceil() as usize;
-            low.min(GRID)..high.min(GRID)
-        };
-        let kept = |cell: usize| {
-            let [x, y, z] = corner(cell);
-            covered(2, z).any(|k| covered(1, y).any(|j| covered(0, x).any(|i| hull[i + GRID * (j + GRID * k)] != 0)))
-        };
-        let mask = (0..CELLS).into_par_iter().map(kept).collect();
-        self.limit_to(mask);
     }
 
     /// Limits it to the cells that are occupied and those around them: for a training that goes on where the rest is known to be empty.
@@ -124,12 +105,12 @@ impl Occupancy {
     }
 
     /// Limits it to cells, besides what limits it already; all that is left may be occupied.
-    fn limit_to(&mut self, mut mask: Vec<bool>) {
-        if let Some(hull) = &self.hull {
-            mask.iter_mut().zip(hull).for_each(|(kept, hull)| *kept &= hull);
+    pub(crate) fn limit_to(&mut self, mut mask: Vec<bool>) {
+        if let Some(allowed) = &self.allowed {
+            mask.iter_mut().zip(allowed).for_each(|(kept, allowed)| *kept &= allowed);
         }
         self.set(|cell| if mask[cell] { Cell::Dense } else { Cell::Empty });
-        self.hull = Some(mask);
+        self.allowed = Some(mask);
     }
 
     /// Cells to look at, at a step of a training: none at most of them.
@@ -140,7 +121,7 @@ impl Occupancy {
         let turn = (step / EVERY) as usize;
         let is_looked_at = |&cell: &u32| {
             let cell = cell as usize;
-            let allowed = self.hull.as_ref().is_none_or(|h| h[cell]);
+            let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
             let [.., z] = corner(cell);
             let turns = if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
             let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
@@ -169,7 +150,7 @@ impl Occupancy {
         let mean = (sum / f64::from(count.max(1))) as f32;
         // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what is denser than the mean.
         let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
-        let allowed = |cell: usize| self.hull.as_ref().is_none_or(|h| h[cell]);
+        let allowed = |cell: usize| self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
         let held = |(cell, &density): (usize, &f32)| match density {
             _ if !allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
@@ -415,7 +396,7 @@ mod tests {
         }
     }
 
-    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is found elsewhere, and within a visual hull.
+    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is found elsewhere, and within a mask.
     #[test]
     fn going_on_stays_where_something_was() {
         let mut occupancy = Occupancy::full();
@@ -424,9 +405,9 @@ mod tests {
         occupancy.set(|c| if c == inside || c == corner { Cell::Thin } else { Cell::Empty });
         occupancy.limit_to_occupied();
         assert_eq!(occupancy.cells().count(), 27 + 8);
-        let mut hull = vec![1; CELLS];
-        hull[cell(6, 61, 71)] = 0;
-        occupancy.limit_to_hull(&Bounds { max: [1.0; 3], ..Bounds::default() }, &hull);
+        let mut mask = vec![true; CELLS];
+        mask[cell(6, 61, 71)] = false;
+        occupancy.limit_to(mask);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
         let updates = (1..=OCCUPIED_TURNS as u64).map(|turn| occupancy.cells_to_update(turn * EVERY).len());

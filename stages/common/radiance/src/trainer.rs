@@ -203,11 +203,6 @@ impl Trainer {
         }
     }
 
-    /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
-    pub fn limit_to_hull(&mut self, hull: &[u8]) {
-        self.field.occupancy.limit_to_hull(&self.field.bounds, hull);
-    }
-
     /// The trained field: with the average of its weights, where one was kept.
     pub fn finish(self) -> Field {
         let mut field = self.field;

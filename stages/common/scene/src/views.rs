@@ -21,9 +21,6 @@ pub struct Views {
     pub background: Background,
     /// Where the scene is.
     pub bounds: Bounds,
-    /// Visual hull on a 128³ grid over the bounds (safetensors, tensor `hull`, u8, x fastest), where it was asked for.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub hull: Option<String>,
     /// The views, in the data set's order.
     pub views: Vec<View>,
 }
@@ -226,7 +223,7 @@ pub enum ViewsError {
 impl Views {
     /// Views without files.
     pub fn new(background: Background, bounds: Bounds, views: Vec<View>) -> Self {
-        Self { conventions: Conventions::default(), background, bounds, hull: None, views }
+        Self { conventions: Conventions::default(), background, bounds, views }
     }
 
     /// The view that has a camera's name and pose. Names alone say little: Blender's training and test views have the same.
@@ -272,7 +269,7 @@ impl Views {
                 check_path(path)?;
             }
         }
-        self.hull.iter().try_for_each(|path| check_path(path))
+        Ok(())
     }
 }
 

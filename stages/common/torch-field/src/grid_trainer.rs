@@ -56,12 +56,6 @@ impl GridTrainer {
         })
     }
 
-    /// Limits the field to a visual hull: 128³ cells over the field's box, x fastest, 0 where nothing can be.
-    pub fn limit_to_hull(&mut self, hull: &[u8]) -> Result<(), TorchFieldError> {
-        self.occupancy.limit_to_hull(&self.grid.bounds, hull);
-        Ok(self.grid.set_occupancy(&self.occupancy)?)
-    }
-
     /// Steps taken.
     pub fn steps(&self) -> u64 {
         self.tally.steps
@@ -386,13 +380,11 @@ mod tests {
     fn field(space: Space) -> Field {
         let architecture =
             Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
-        Field::new(architecture, bounds(space), 5)
-    }
-
-    /// The middle of the cube alone: looks are slow on a CPU.
-    fn hull() -> Vec<u8> {
+        // The middle of the cube alone: looks are slow on a CPU.
         let middle = |cell: usize| [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c));
-        (0..128 * 128 * 128).map(|cell| u8::from(middle(cell))).collect()
+        let mut field = Field::new(architecture, bounds(space), 5);
+        field.limit_to((0..128 * 128 * 128).map(middle).collect());
+        field
     }
 
     fn devices() -> Vec<Device> {
@@ -409,8 +401,6 @@ mod tests {
                 let start = field(space);
                 let mut ours = Trainer::new(start.clone(), options());
                 let mut judge = GridTrainer::new(&start, options(), device).unwrap();
-                ours.limit_to_hull(&hull());
-                judge.limit_to_hull(&hull()).unwrap();
                 let (mut mine, mut its) = (Painted { seen: Vec::new() }, Painted { seen: Vec::new() });
                 let mut losses = Vec::new();
                 while let Some(report) = ours.step(&mut mine).unwrap() {
@@ -444,12 +434,12 @@ mod tests {
         }
     }
 
-    /// A hull that holds nothing leaves the background, and nothing to learn.
+    /// Where nothing may be there is the background, and nothing to learn.
     #[test]
-    fn nothing_outside_a_hull_is_learnt() {
-        let start = field(Space::Box);
+    fn nothing_is_learnt_where_nothing_may_be() {
+        let mut start = field(Space::Box);
+        start.limit_to(vec![false; 128 * 128 * 128]);
         let mut judge = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
-        judge.limit_to_hull(&vec![0; 128 * 128 * 128]).unwrap();
         let report = judge.step(&mut Painted { seen: Vec::new() }).unwrap().unwrap();
         assert_eq!((report.samples, report.skipped), (0, false));
         assert_eq!(judge.field().unwrap().parts().0, start.parts().0);
@@ -462,11 +452,7 @@ mod tests {
             while judge.steps() < steps && judge.step(&mut Painted { seen: Vec::new() }).unwrap().is_some() {}
             judge
         };
-        let new = || {
-            let mut new = GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();
-            new.limit_to_hull(&hull()).unwrap();
-            new
-        };
+        let new = || GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();
         let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
         for at in [3, 33] {
             run(new(), at).write_checkpoint(&path).unwrap();

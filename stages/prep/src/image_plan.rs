@@ -1,0 +1,105 @@
+use artifact::counted;
+use dataset::{Dataset, Format, Split};
+use pixels::Kernel;
+use scene::{Camera, Intrinsics};
+
+use crate::params::{LrSource, Params};
+use crate::sizes::{Sizes, enlarged, sizes};
+
+/// Which images are made of photographs: whether there is HR truth, at which sizes, by which kernel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct ImagePlan {
+    /// Whether LR images are made from HR ones.
+    pub(crate) has_truth: bool,
+    /// The kernel that makes LR images, or is taken to have made them.
+    pub(crate) kernel: Kernel,
+    /// Sizes of the first training view, and its own.
+    pub(crate) sizes: Sizes,
+    pub(crate) native: (u32, u32),
+}
+
+impl ImagePlan {
+    /// Of a data set's training and test views. What parameters can't have is said.
+    pub(crate) fn new(set: &Dataset, split: &Split, params: &Params) -> Result<Self, String> {
+        let is_benchmark = matches!(set.format, Format::Blender | Format::Llff);
+        let has_truth = match params.lr_source {
+            Some(source) => source == LrSource::Downscaled,
+            None => is_benchmark || params.lr_width.is_some(),
+        };
+        if !has_truth && params.lr_width.is_some() {
+            return Err(
+                "parameter lr_width: with lr_source photographs their own width is the LR width; leave lr_width out".to_owned()
+            );
+        }
+        if !has_truth && params.kernel == Some(Kernel::Average) {
+            return Err("parameter kernel: average makes LR images and can't be assumed; choose box".to_owned());
+        }
+        let kernel = params.kernel.unwrap_or(if has_truth { Kernel::Lanczos } else { Kernel::Box });
+        let first = set.frames[split.train[0]].intrinsics();
+        let native = (first.width, first.height);
+        let sizes = if has_truth {
+            sizes(native, params.lr_width, params.hr_width, params.scale)
+        } else {
+            enlarged(native, params.hr_width, params.scale)
+        };
+        let plan = Self { has_truth, kernel, sizes: sizes.map_err(|e| format!("parameters: {e}"))?, native };
+        if kernel == Kernel::Average {
+            let mut all = split.train.iter().chain(&split.test).map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
+            if let Some(odd) = all.find(|sizes| !sizes.is_integer()) {
+                return Err(format!(
+                    "parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box",
+                    odd.hr, odd.lr
+                ));
+            }
+        }
+        Ok(plan)
+    }
+
+    /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
+    pub(crate) fn sizes_of(&self, native: &Intrinsics) -> Sizes {
+        let of = |length: u32, first: u32, target: u32| {
+            ((f64::from(length) * f64::from(target) / f64::from(first)).round() as u32).max(1)
+        };
+        let size = |target: (u32, u32)| (of(native.width, self.native.0, target.0), of(native.height, self.native.1, target.1));
+        Sizes { lr: size(self.sizes.lr), hr: size(self.sizes.hr) }
+    }
+
+    /// A camera at LR size.
+    pub(crate) fn at_lr(&self, camera: &Camera) -> Camera {
+        let (width, height) = self.sizes_of(&camera.intrinsics).lr;
+        camera.resized(width, height)
+    }
+
+    /// A camera at HR size.
+    pub(crate) fn at_hr(&self, camera: &Camera) -> Camera {
+        let (width, height) = self.sizes_of(&camera.intrinsics).hr;
+        camera.resized(width, height)
+    }
+
+    /// Size of an LR image shrunk as HR images were to make LR ones.
+    pub(crate) fn one_size_down(&self, (width, height): (u32, u32)) -> (u32, u32) {
+        let Sizes { lr, hr } = self.sizes;
+        let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
+        (shrunk(width, lr.0, hr.0), shrunk(height, lr.1, hr.1))
+    }
+
+    /// What was chosen, in a line.
+    pub(crate) fn choice(&self, split: &Split) -> String {
+        let Sizes { lr, hr } = self.sizes;
+        let kernel = format!("{:?}", self.kernel).to_lowercase();
+        let both = split.train.iter().filter(|i| split.test.contains(i)).count();
+        let (train, test) = (counted(split.train.len(), "view"), split.test.len());
+        let parts = match both {
+            0 => format!("{train} to train on, {} for testing", counted(test, "other")),
+            _ => format!("{train} to train on, {test} for testing, {both} of them for both"),
+        };
+        if self.has_truth {
+            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
+        } else {
+            format!(
+                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR is {}×{}",
+                lr.0, lr.1, hr.0, hr.1
+            )
+        }
+    }
+}

@@ -1,0 +1,240 @@
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{Context, FailureExt as _, Progress, printable};
+use dataset::Frame;
+use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
+use rayon::prelude::*;
+use scene::{VIEWS_FILE, View, Views};
+
+use crate::degrade::{self, LrImage, degrade};
+use crate::frame_name;
+use crate::scene_plan::ScenePlan;
+
+/// Writes a scene's subtrees. No more images than threads are held at once.
+pub(crate) struct SceneWriter<'a> {
+    context: &'a Context,
+    plan: &'a ScenePlan<'a>,
+    progress: Progress,
+}
+
+impl<'a> SceneWriter<'a> {
+    pub(crate) fn new(context: &'a Context, plan: &'a ScenePlan<'a>) -> Self {
+        let progress = context.progress("preparing", (plan.train.len() + plan.test.len()) as u64);
+        Self { context, plan, progress }
+    }
+
+    /// Writes everything.
+    pub(crate) fn write(&self) -> anyhow::Result<()> {
+        self.write_training_images()?;
+        self.write_train_and_downscaled()?;
+        self.write_train_cameras()?;
+        self.write_references()?;
+        self.write_truth_images()?;
+        self.write_truth_and_cameras()
+    }
+
+    fn write_views(&self, subtree: &str, views: Vec<View>) -> anyhow::Result<()> {
+        let views = Views::new(self.plan.background, self.plan.bounds, views);
+        self.context.write_json(&format!("{subtree}/{VIEWS_FILE}"), &views)
+    }
+
+    fn write_degradation(&self, subtree: &str, kernel: Kernel, hr: (u32, u32)) -> anyhow::Result<()> {
+        self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &Degradation { kernel, hr: hr.into() })
+    }
+
+    /// `train`: LR images; `downscaled`: the same task one size down, where its solution is known.
+    fn write_train_and_downscaled(&self) -> anyhow::Result<()> {
+        let images = &self.plan.images;
+        let train = |frame: &&Frame| View {
+            image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
+            mask: mask_name(frame),
+            ..View::camera_only(images.at_lr(&frame.camera()))
+        };
+        let train: Vec<View> = self.plan.train.iter().map(train).collect();
+        let downscaled = |view: &View| {
+            let k = &view.camera.intrinsics;
+            let (width, height) = images.one_size_down((k.width, k.height));
+            View { camera: view.camera.resized(width, height), ..view.clone() }
+        };
+        self.write_views("downscaled", train.iter().map(downscaled).collect())?;
+        self.write_views("train", train)?;
+        self.write_degradation("train", images.kernel, images.sizes.hr)?;
+        // LR images that weren't rounded are shrunk by the box: the same, and for any size.
+        let kernel = if images.kernel == Kernel::Average { Kernel::Box } else { images.kernel };
+        self.write_degradation("downscaled", kernel, images.sizes.lr)
+    }
+
+    /// `train-cameras`: the training cameras at HR size.
+    fn write_train_cameras(&self) -> anyhow::Result<()> {
+        let views = self.plan.train.iter().map(|frame| View::camera_only(self.plan.images.at_hr(&frame.camera())));
+        self.write_views("train-cameras", views.collect())
+    }
+
+    /// `references`: training views at HR size, where there are any.
+    fn write_references(&self) -> anyhow::Result<()> {
+        if self.plan.references.is_empty() {
+            return Ok(());
+        }
+        let view = |&i: &usize| {
+            let frame = self.plan.train[i];
+            View {
+                image: Some(format!("images/{}.png", frame.name)),
+                mask: mask_name(frame),
+                ..View::camera_only(self.plan.images.at_hr(&frame.camera()))
+            }
+        };
+        self.write_views("references", self.plan.references.iter().map(view).collect())
+    }
+
+    /// `truth`: test views at HR size, with their LR photographs; `cameras`: their cameras alone.
+    fn write_truth_and_cameras(&self) -> anyhow::Result<()> {
+        let images = &self.plan.images;
+        let view = |frame: &&Frame| View {
+            image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
+            mask: mask_name(frame),
+            depth: frame.depth.as_ref().filter(|_| images.has_truth).map(|_| format!("depth/{}.exr", frame.name)),
+            low_resolution: Some(format!("low/{}.{}", frame.name, degrade::extension(images.kernel))),
+            ..View::camera_only(images.at_hr(&frame.camera()))
+        };
+        let truth: Vec<View> = self.plan.test.iter().map(view).collect();
+        self.write_views("cameras", truth.iter().map(|view| View::camera_only(view.camera.clone())).collect())?;
+        self.write_degradation("truth", images.kernel, images.sizes.hr)?;
+        self.write_views("truth", truth)
+    }
+
+    fn write_training_images(&self) -> anyhow::Result<()> {
+        self.plan.train.par_iter().enumerate().try_for_each(|(i, frame)| {
+            self.context.check_interrupt()?;
+            self.write_training_image(frame, self.plan.references.contains(&i))?;
+            self.progress.add(1);
+            Ok(())
+        })
+    }
+
+    fn write_truth_images(&self) -> anyhow::Result<()> {
+        self.plan.test.par_iter().try_for_each(|frame| {
+            self.context.check_interrupt()?;
+            self.write_test_image(frame)?;
+            self.progress.add(1);
+            Ok(())
+        })
+    }
+
+    /// Writes all that is made of a frame to train on: LR image, the same one size down, HR reference, and their masks.
+    fn write_training_image(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<()> {
+        let (hr, lr) = self.images(frame)?;
+        let name = &frame.name;
+        self.write_lr("train/images", name, &lr)?;
+        let mask = frame.mask().bad_input(frame_name(frame))?;
+        let lr_mask = mask.as_ref().map(|mask| self.lr_mask(mask, &lr));
+        lr_mask.iter().try_for_each(|mask| self.write_mask("train", name, mask))?;
+        if let Some(hr) = hr.filter(|_| is_reference) {
+            self.write_hr("references", name, &hr)?;
+            mask.iter().try_for_each(|m| self.write_mask("references", name, &m.resized((hr.width, hr.height), 0)))?;
+        }
+        let lr_size = self.plan.images.sizes_of(&frame.intrinsics()).lr;
+        let (width, height) = self.plan.images.one_size_down(lr_size);
+        let downscaled = lr.shrunk((width as usize, height as usize), self.plan.images.kernel);
+        self.write_lr("downscaled/images", name, &downscaled)?;
+        let downscaled_mask = lr_mask.map(|mask| self.lr_mask(&mask, &downscaled));
+        downscaled_mask.iter().try_for_each(|mask| self.write_mask("downscaled", name, mask))
+    }
+
+    /// Writes all that is made of a frame to test by: HR image, LR image, mask and depth.
+    fn write_test_image(&self, frame: &Frame) -> anyhow::Result<()> {
+        let (hr, lr) = self.images(frame)?;
+        if let Some(hr) = &hr {
+            self.write_hr("truth", &frame.name, hr)?;
+        }
+        self.write_lr("truth/low", &frame.name, &lr)?;
+        if let Some(mask) = frame.mask().bad_input(frame_name(frame))? {
+            let mask = match &hr {
+                Some(hr) => mask.resized((hr.width, hr.height), 0),
+                None => self.lr_mask(&mask, &lr),
+            };
+            self.write_mask("truth", &frame.name, &mask)?;
+        }
+        if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
+            self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(frame_name(frame))?;
+        }
+        Ok(())
+    }
+
+    /// The HR image, where there is one, and the LR image.
+    fn images(&self, frame: &Frame) -> anyhow::Result<(Option<Rgba8>, LrImage)> {
+        let image = frame.photograph().bad_input(frame_name(frame))?;
+        if !self.plan.images.has_truth {
+            return Ok((None, LrImage::Bytes(image)));
+        }
+        let (hr, lr) = degrade(&image, &self.plan.images.sizes_of(&frame.intrinsics()), self.plan.images.kernel);
+        Ok((Some(hr), lr))
+    }
+
+    fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
+        write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image).map_err(Into::into)
+    }
+
+    fn write_mask(&self, subtree: &str, name: &str, mask: &Mask) -> anyhow::Result<()> {
+        write_png(&self.context.output_path(&format!("{subtree}/masks/{name}.png"))?, &mask.to_rgba8()).map_err(Into::into)
+    }
+
+    /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
+    fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
+        let size = image.size();
+        let around = if size == (mask.width, mask.height) { 0 } else { degrade::mask_reach(self.plan.images.kernel) };
+        mask.resized(size, around)
+    }
+
+    fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
+        let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.plan.images.kernel)))?;
+        match image {
+            LrImage::Bytes(image) => write_png(&path, image)?,
+            LrImage::Floats(image) => {
+                let channels = ["R", "G", "B", "A"].map(|name| Channel { name, sample_type: SampleType::Float });
+                write_exr(
+                    &path,
+                    (image.width, image.height),
+                    &channels,
+                    "display-encoded sRGB, premultiplied",
+                    |first, rows, samples| {
+                        samples.copy_from_slice(&image.data[first * image.width * 4..(first + rows) * image.width * 4]);
+                        Ok::<(), pixels::PixelError>(())
+                    },
+                )?;
+            }
+        }
+        Ok(())
+    }
+
+    /// True depth at HR size: that of the nearest native pixel centre, since averaging depths across an edge invents surfaces.
+    fn write_depth(&self, source: &Path, name: &str, (width, height): (usize, usize)) -> anyhow::Result<()> {
+        let native = read_exr(source)?;
+        let shown = source.display().to_string();
+        let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", printable(&shown)));
+        let (depth, opacity) = (channel("Z")?, channel("A")?);
+        let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
+        let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
+        let channels =
+            [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+        write_exr(
+            &path,
+            (width, height),
+            &channels,
+            "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen",
+            |first, _, samples| {
+                for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
+                    let (x, y) = (nearest(i % width, native.width, width), nearest(first + i / width, native.height, height));
+                    let at = y * native.width + x;
+                    sample.copy_from_slice(&[opacity[at], depth[at]]);
+                }
+                Ok(())
+            },
+        )
+    }
+}
+
+/// A mask's file, where a frame has one.
+fn mask_name(frame: &Frame) -> Option<String> {
+    frame.mask.as_ref().map(|_| format!("masks/{}.png", frame.name))
+}
