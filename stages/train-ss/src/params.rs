@@ -164,7 +164,7 @@ impl Default for GridParams {
         Self {
             rays: 30_000_000,
             max_rays_per_step: 4_096,
-            samples_per_step: 32_768,
+            samples_per_step: 16_384,
             order: Order::Random,
             pixel_importance: None,
             supersample_warmup: 0.3,

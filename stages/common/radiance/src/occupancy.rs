@@ -23,12 +23,12 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 }
 
 /// Steps of a training between updates of the occupancy.
-const EVERY: u64 = 16;
+const EVERY: u64 = 32;
 /// An update looks at one occupied cell in so many, and at one empty cell in so many.
 const OCCUPIED_TURNS: usize = 4;
 const EMPTY_TURNS: usize = 16;
 /// Until this step empty cells are looked at as often as occupied ones.
-const WARM_UP: u64 = 256;
+const WARM_UP: u64 = 512;
 /// Share of a density that is left when its cell is looked at again.
 const DECAY: f32 = 0.7;
 
