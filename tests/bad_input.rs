@@ -1,4 +1,5 @@
-//! Bad input: one line that says what and where, the right exit code, nothing half-written in the store.
+//! Bad input: one line that says what and where, the right exit code, nothing half-written in the
+//! store.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -10,7 +11,13 @@ use common::{Project, TINY, stage};
 /// A data set made once, copied and damaged by each test.
 fn dataset(project: &Project) -> std::path::PathBuf {
     let folder = project.path("data");
-    let made = stage("demo-scene", r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#, &[], &folder, &[]);
+    let made = stage(
+        "demo-scene",
+        r#"{"size": 32, "train": 4, "test": 2, "samples_per_axis": 1}"#,
+        &[],
+        &folder,
+        &[],
+    );
     assert_eq!(made.code, 0, "{}", made.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
     folder
@@ -42,7 +49,12 @@ fn edit(file: &Path, from: &str, to: &str) {
 
 #[test]
 fn datasets_that_cannot_be_used() {
-    refused(|_, d| std::fs::remove_dir_all(d).unwrap(), &[], 3, &["input dataset", "data", "name a folder that is there"]);
+    refused(
+        |_, d| std::fs::remove_dir_all(d).unwrap(),
+        &[],
+        3,
+        &["input dataset", "data", "name a folder that is there"],
+    );
     refused(
         |_, d| std::fs::remove_file(d.join("transforms_test.json")).unwrap(),
         &["-p", "split=given"],
@@ -68,7 +80,12 @@ fn datasets_that_cannot_be_used() {
         let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
         let at = text.find("\"transform_matrix\"").unwrap();
         let rest = &text[at..];
-        rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..].split(',').next().unwrap().trim().to_owned()
+        rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..]
+            .split(',')
+            .next()
+            .unwrap()
+            .trim()
+            .to_owned()
     };
     refused(
         |_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"),
@@ -76,9 +93,20 @@ fn datasets_that_cannot_be_used() {
         3,
         &["transforms_train.json: frame 0", "is NaN"],
     );
-    refused(|_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"), &[], 3, &["camera_angle_x is 3.2", "focal length"]);
     refused(
-        |_, d| std::fs::write(d.join("transforms_train.json"), r#"{"camera_angle_x": 0.7, "frames": []}"#).unwrap(),
+        |_, d| edit(&d.join("transforms_test.json"), "0.6911112", "3.2"),
+        &[],
+        3,
+        &["camera_angle_x is 3.2", "focal length"],
+    );
+    refused(
+        |_, d| {
+            std::fs::write(
+                d.join("transforms_train.json"),
+                r#"{"camera_angle_x": 0.7, "frames": []}"#,
+            )
+            .unwrap()
+        },
         &[],
         3,
         &["transforms_train.json", "`frames` is empty"],
@@ -87,7 +115,12 @@ fn datasets_that_cannot_be_used() {
 
 #[test]
 fn sizes_that_cannot_be() {
-    refused(|_, _| {}, &["-p", "lr_width=64", "-p", "scale=1"], 2, &["lr_width = 64", "larger than", "32"]);
+    refused(
+        |_, _| {},
+        &["-p", "lr_width=64", "-p", "scale=1"],
+        2,
+        &["lr_width = 64", "larger than", "32"],
+    );
     refused(|_, _| {}, &["-p", "lr_width=0"], 2, &["stage prep", "parameter lr_width", "minimum"]);
     refused(|_, _| {}, &["-p", "kernel=gauss"], 2, &["parameter kernel", "lanczos"]);
     refused(|_, _| {}, &["-p", "near=5", "-p", "far=3"], 2, &["near", "far = 3"]);
@@ -101,7 +134,8 @@ fn output_that_cannot_be_written() {
     project.write("taken", "");
     project.run(&["run", "--store", "taken/store"]).fails(1, &["cannot open the store", "--store"]);
     let inputs = [("dataset", folder.as_path())];
-    stage("prep", r#"{"lr_width": 16}"#, &inputs, &project.path("taken/out"), &[]).fails(2, &["--params"]);
+    stage("prep", r#"{"lr_width": 16}"#, &inputs, &project.path("taken/out"), &[])
+        .fails(2, &["--params"]);
     project.write("p.json", r#"{"lr_width": 16}"#);
     let output = std::process::Command::new(common::bin("prep"))
         .args(["--params", "p.json", "--output", "taken/out", "--input", "dataset=data"])
@@ -117,7 +151,10 @@ fn a_full_disk() {
     let project = Project::new(TINY);
     let disk = project.path("disk");
     std::fs::create_dir(&disk).unwrap();
-    let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", "size=120k", "tmpfs"]).arg(&disk).output();
+    let mounted = std::process::Command::new("mount")
+        .args(["-t", "tmpfs", "-o", "size=120k", "tmpfs"])
+        .arg(&disk)
+        .output();
     if !mounted.is_ok_and(|m| m.status.success()) {
         eprintln!("skipped: a tmpfs can't be mounted here (it needs root)");
         return;
@@ -131,7 +168,11 @@ fn a_full_disk() {
     let staged = count("partial");
     std::process::Command::new("umount").arg(&disk).status().unwrap();
     finished.fails(1, &["No space left on device"]);
-    assert!(verified.stdout.contains(&format!("{objects} artifacts, 0 damaged")), "{}", verified.stdout);
+    assert!(
+        verified.stdout.contains(&format!("{objects} artifacts, 0 damaged")),
+        "{}",
+        verified.stdout
+    );
     assert!(objects < 3 && actions <= 2 * objects && staged <= 1, "{objects} {actions} {staged}");
 }
 
@@ -170,7 +211,12 @@ impl common::Finished {
 #[test]
 fn pipelines_that_cannot_be_used() {
     for (from, to, line, words) in [
-        ("    inputs: {dataset: demo-scene}", "    inputs: {dataset: demo-scene}\n    imputs: {}", 8, "imputs"),
+        (
+            "    inputs: {dataset: demo-scene}",
+            "    inputs: {dataset: demo-scene}\n    imputs: {}",
+            8,
+            "imputs",
+        ),
         ("  eval:\n", "  eval: {}\n  eval:\n", 15, "duplicate entry"),
         ("{dataset: demo-scene}", "{dataset: demo}", 7, "no stage \"demo\""),
         ("{dataset: demo-scene}", "{}", 6, "input dataset is missing"),
@@ -179,10 +225,16 @@ fn pipelines_that_cannot_be_used() {
             "prep/train}",
             "prep/test}",
             10,
-            "no folder \"test\"; known: cameras, downscaled, references, train, train-cameras, truth",
+            "no folder \"test\"; known: cameras, downscaled, references, train, train-cameras, \
+            truth",
         ),
         ("prep/train}", "prep/truth}", 10, "takes scene/train, but prep/truth is scene/truth"),
-        ("{dataset: demo-scene}", "{dataset: render-depth}", 7, "takes dataset, but render-depth is views"),
+        (
+            "{dataset: demo-scene}",
+            "{dataset: render-depth}",
+            7,
+            "takes dataset, but render-depth is views",
+        ),
         ("lr_width: 24", "lr_width: twenty", 8, "parameter lr_width"),
         ("lr_width: 24", "lr_width: -3", 8, "parameter lr_width"),
         ("lr_width: 24", "lr_widht: 24", 8, "parameter lr_widht: unknown"),
@@ -191,7 +243,8 @@ fn pipelines_that_cannot_be_used() {
         ("default: [eval]", "default: [eval", 0, ""),
     ] {
         let project = Project::new(&TINY.replacen(from, to, 1));
-        let place = if line == 0 { "pipeline.yaml".to_owned() } else { format!("pipeline.yaml:{line}") };
+        let place =
+            if line == 0 { "pipeline.yaml".to_owned() } else { format!("pipeline.yaml:{line}") };
         project.run(&["run"]).fails(2, &[&place, words]);
         assert_eq!(project.store_listing(), Vec::<String>::new());
     }
@@ -199,13 +252,17 @@ fn pipelines_that_cannot_be_used() {
 
 #[test]
 fn a_cycle_is_named() {
-    let script = "#!/bin/sh\necho '{\"name\":\"x\",\"version\":\"1\",\"code\":\"1\",\"summary\":\"\",\"parameters\":{\"type\":\"object\"},\"inputs\":{\"a\":{\"kinds\":[\"k\"],\"summary\":\"\"}},\"output\":{\"kind\":\"k\"}}'\n";
+    let script = "#!/bin/sh\necho \
+        '{\"name\":\"x\",\"version\":\"1\",\"code\":\"1\",\"summary\":\"\",\"parameters\":{\"type\":\"object\"},\"inputs\":{\"a\":{\"kinds\":[\"k\"],\"summary\":\"\"}},\"output\":{\"kind\":\"k\"}}'\n";
     let project = Project::new(
-        "default: [one]\nstages:\n  one: {run: ./x, inputs: {a: two}}\n  two: {run: ./x, inputs: {a: three}}\n  three: {run: ./x, inputs: {a: one}}\n",
+        "default: [one]\nstages:\n  one: {run: ./x, inputs: {a: two}}\n  two: \
+        {run: ./x, inputs: {a: three}}\n  three: {run: ./x, inputs: {a: one}}\n",
     );
     project.write("x", script);
     std::process::Command::new("chmod").arg("+x").arg(project.path("x")).status().unwrap();
-    project.run(&["run"]).fails(2, &["pipeline.yaml:", "lead back to it", "one ← two ← three ← one"]);
+    project
+        .run(&["run"])
+        .fails(2, &["pipeline.yaml:", "lead back to it", "one ← two ← three ← one"]);
 }
 
 #[test]
@@ -221,14 +278,23 @@ fn command_lines_that_cannot_be_used() {
     ] {
         project.run(arguments).fails(2, &[words]);
     }
-    stage("prep", r#"{"lr_width": 16, "x": 1}"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
-        .fails(2, &["parameter x", "unknown"]);
+    stage(
+        "prep",
+        r#"{"lr_width": 16, "x": 1}"#,
+        &[("dataset", Path::new("."))],
+        &project.path("o"),
+        &[],
+    )
+    .fails(2, &["parameter x", "unknown"]);
     stage("prep", r#"{"lr_width": 16"#, &[("dataset", Path::new("."))], &project.path("o"), &[])
         .fails(2, &["--params", "line 1"]);
     stage("prep", "{}", &[], &project.path("o"), &[]).fails(2, &["input dataset is missing"]);
-    stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[]).fails(2, &["--input data", "known: dataset"]);
-    stage("prep", "{}", &[("dataset", Path::new("/nowhere"))], &project.path("o"), &[]).fails(3, &["/nowhere", "no such folder"]);
-    stage("prep", "{}", &[("dataset", Path::new("."))], &project.path("."), &[]).fails(2, &["--output"]);
+    stage("prep", "{}", &[("data", Path::new("."))], &project.path("o"), &[])
+        .fails(2, &["--input data", "known: dataset"]);
+    stage("prep", "{}", &[("dataset", Path::new("/nowhere"))], &project.path("o"), &[])
+        .fails(3, &["/nowhere", "no such folder"]);
+    stage("prep", "{}", &[("dataset", Path::new("."))], &project.path("."), &[])
+        .fails(2, &["--output"]);
 }
 
 #[test]

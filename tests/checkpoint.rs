@@ -1,4 +1,5 @@
-//! Checkpoints of the reference implementation, written by PyTorch itself (`make goldens`), become a field that is rendered.
+//! Checkpoints of the reference implementation, written by PyTorch itself (`make goldens`), become
+//! a field that is rendered.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -30,21 +31,33 @@ fn a_checkpoint_of_the_reference_is_rendered() {
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     assert_eq!(tensors.len(), 40);
     for network in ["coarse", "fine"] {
-        for (layer, shape, first) in
-            [("xyz_encoding_5.0", vec![8, 23], 4.0f32), ("sigma", vec![1, 8], 6.0), ("rgb.0", vec![3, 4], 9.0)]
-        {
+        for (layer, shape, first) in [
+            ("xyz_encoding_5.0", vec![8, 23], 4.0f32),
+            ("sigma", vec![1, 8], 6.0),
+            ("rgb.0", vec![3, 4], 9.0),
+        ] {
             let weight = tensors.tensor(&format!("{network}.{layer}.weight")).unwrap();
             assert_eq!(weight.shape(), shape);
             let (numbers, _) = weight.data().as_chunks::<4>();
             for (i, number) in numbers.iter().enumerate() {
-                assert_eq!(f32::from_le_bytes(*number), first + i as f32 / 8.0, "{network}.{layer} {i}");
+                assert_eq!(
+                    f32::from_le_bytes(*number),
+                    first + i as f32 / 8.0,
+                    "{network}.{layer} {i}"
+                );
             }
         }
     }
 
     demo_train(&project, 6);
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
-    let rendered = stage("render-depth", r#"{"size": 8}"#, &[("field", &field), ("cameras", &cameras)], &views, &[]);
+    let rendered = stage(
+        "render-depth",
+        r#"{"size": 8}"#,
+        &[("field", &field), ("cameras", &cameras)],
+        &views,
+        &[],
+    );
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
     assert_eq!(views.join("images").read_dir().unwrap().count(), 1);
 }
@@ -71,28 +84,41 @@ fn what_is_no_checkpoint_is_one_line() {
     // A pickle that would run something.
     let hostile = project.path("hostile.pth");
     let write = "import os, pickle, sys, zipfile\n\
-                 class Run:\n    def __reduce__(self): return os.system, ('touch ' + sys.argv[1] + '.ran',)\n\
+                 class Run:\n    def __reduce__(self): return os.system, ('touch ' + sys.argv[1] \
+                 + '.ran',)\n\
                  zipfile.ZipFile(sys.argv[1], 'w').writestr('x/data.pkl', pickle.dumps(Run()))\n";
     assert!(Command::new("python3").args(["-c", write]).arg(&hostile).status().unwrap().success());
     fails(&hostile, &["hostile.pth", "system"]);
     assert!(!hostile.with_extension("pth.ran").exists());
 }
 
-/// Weights as their projects release them become files that hold the same tensors; those of another network, or of none, are refused.
+/// Weights as their projects release them become files that hold the same tensors; those of another
+/// network, or of none, are refused.
 #[test]
 fn released_weights_become_what_upsample_reads() {
     let project = Project::tiny();
     let convert = |network: &str, from: &str, out: &Path| {
         let script = here("scripts/convert-weights.py");
-        Finished::of(Command::new("python3").arg(script).arg(network).arg(here(from)).arg(out).output().unwrap())
+        Finished::of(
+            Command::new("python3")
+                .arg(script)
+                .arg(network)
+                .arg(here(from))
+                .arg(out)
+                .output()
+                .unwrap(),
+        )
     };
     for (network, golden) in [("imdn", "imdn"), ("liif", "liif"), ("swinir", "swinir_light")] {
         let out = project.path(&format!("{network}.safetensors"));
         let done = convert(network, &format!("tests/data/{network}.pth"), &out);
         assert_eq!(done.code, 0, "{}", done.stderr);
-        let expected = std::fs::read(here(&format!("stages/upsample/tests/data/{golden}.safetensors"))).unwrap();
+        let expected =
+            std::fs::read(here(&format!("stages/upsample/tests/data/{golden}.safetensors")))
+                .unwrap();
         let (found, expected) = (std::fs::read(&out).unwrap(), expected);
-        let [found, expected] = [&found, &expected].map(|bytes| safetensors::SafeTensors::deserialize(bytes).unwrap());
+        let [found, expected] =
+            [&found, &expected].map(|bytes| safetensors::SafeTensors::deserialize(bytes).unwrap());
         let names = || expected.names().into_iter().filter(|name| !name.starts_with("golden."));
         assert_eq!(found.len(), names().count(), "{network}");
         for name in names() {

@@ -6,7 +6,8 @@ mod common;
 use common::Project;
 use serde_json::{Value, json};
 
-/// A stage in shell. It writes so many text files, what the scene decided, and metrics; a part of the key is an environment variable.
+/// A stage in shell. It writes so many text files, what the scene decided, and metrics; a part of
+/// the key is an environment variable.
 const PROGRAM: &str = r#"#!/bin/sh
 if [ "$1" = describe ]; then
     text='{"kinds": ["text"], "summary": "a text", "optional": true}'
@@ -55,7 +56,11 @@ fn said(project: &Project, arguments: &[&str]) -> Vec<String> {
 fn plain(line: &str) -> String {
     let is_hash = |word: &str| word.len() == 10 && word.bytes().all(|b| b.is_ascii_hexdigit());
     let hidden = |word: &str| {
-        if is_hash(word.trim_end_matches(';')) { word.replace(|c: char| c.is_ascii_hexdigit(), "#") } else { word.to_owned() }
+        if is_hash(word.trim_end_matches(';')) {
+            word.replace(|c: char| c.is_ascii_hexdigit(), "#")
+        } else {
+            word.to_owned()
+        }
     };
     let line = line.split(' ').map(hidden).collect::<Vec<_>>().join(" ");
     match line.split_once("cached (") {
@@ -64,15 +69,22 @@ fn plain(line: &str) -> String {
     }
 }
 
-/// Changes the parts of a stage's key as another version would have written them; under its name as a file, the next run finds it no more.
+/// Changes the parts of a stage's key as another version would have written them; under its name as
+/// a file, the next run finds it no more.
 fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
-    let actions = std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap().map(|entry| entry.unwrap().path());
+    let actions = std::fs::read_dir(project.path(".nerf-sr/actions"))
+        .unwrap()
+        .map(|entry| entry.unwrap().path());
     for path in actions.filter(|path| path.extension().is_some_and(|end| end == "json")) {
         let mut record: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
         if record["stage"] == stage {
             record["key_parts"][part].clone_from(value);
             std::fs::remove_file(&path).unwrap();
-            std::fs::write(path.with_file_name(format!("{}.json", "0".repeat(64))), record.to_string()).unwrap();
+            std::fs::write(
+                path.with_file_name(format!("{}.json", "0".repeat(64))),
+                record.to_string(),
+            )
+            .unwrap();
         }
     }
 }
@@ -83,18 +95,31 @@ fn why_tells_each_difference() {
     // Another block makes the program known.
     project.write("pipeline.yaml", &format!("{PIPELINE}  other: {{run: ./mix}}\n"));
     project.ok(&["run", "other", "--store", "empty"]);
-    assert_eq!(said(&project, &["why", "first", "--store", "empty"])[0], "first: will run: it never ran before");
+    assert_eq!(
+        said(&project, &["why", "first", "--store", "empty"])[0],
+        "first: will run: it never ran before"
+    );
     project.write("pipeline.yaml", PIPELINE);
     project.ok(&["run", "first"]);
-    assert_eq!(said(&project, &["why", "second"]), ["second: will run: it never ran before", "    by scene: steps"]);
+    assert_eq!(
+        said(&project, &["why", "second"]),
+        ["second: will run: it never ran before", "    by scene: steps"]
+    );
     project.ok(&["run"]);
     let why = |arguments: &[&str]| said(&project, &[&["why", "first"], arguments].concat());
     assert_eq!(why(&[]), ["first: cached (…)", "    by scene: steps=256"]);
-    let parameters =
-        [("count=2", "count: 1 → 2"), ("word=two words", "word: \"one\" → \"two words\""), ("flag=true", "flag: false → true")];
+    let parameters = [
+        ("count=2", "count: 1 → 2"),
+        ("word=two words", "word: \"one\" → \"two words\""),
+        ("flag=true", "flag: false → true"),
+    ];
     for (given, told) in parameters {
         let lines = why(&["-p", &format!("first.{given}")]);
-        assert_eq!(lines, [&format!("first: will run: parameter {told}"), "    by scene: steps"], "{given}");
+        assert_eq!(
+            lines,
+            [&format!("first: will run: parameter {told}"), "    by scene: steps"],
+            "{given}"
+        );
     }
     assert_eq!(why(&["-p", "first.steps=9"]), ["first: will run: parameter steps: null → 9"]);
     let both = why(&["-p", "first.count=2", "-p", "first.flag=true"]);
@@ -102,7 +127,10 @@ fn why_tells_each_difference() {
     assert_eq!(why(&["--device", "cuda:0"])[0], "first: will run: device: \"cpu\" → \"cuda\"");
     let mode = project.command(&["why", "first"]).env("MIX_MODE", "new").output().unwrap();
     let mode = String::from_utf8(mode.stdout).unwrap();
-    assert_eq!(mode.lines().next().unwrap(), "first: will run: environment MIX_MODE: null → \"new\"");
+    assert_eq!(
+        mode.lines().next().unwrap(),
+        "first: will run: environment MIX_MODE: null → \"new\""
+    );
     // Inputs: another content, one more, one less.
     project.write("source/in.txt", "other\n");
     assert_eq!(why(&[])[0], "first: will run: input a: ########## → ##########");
@@ -114,7 +142,8 @@ fn why_tells_each_difference() {
     ];
     assert_eq!(second, expected);
     project.write("source/in.txt", "text\n");
-    project.write("pipeline.yaml", &PIPELINE.replace("{a: ./source}", "{a: ./source, b: ./source}"));
+    project
+        .write("pipeline.yaml", &PIPELINE.replace("{a: ./source}", "{a: ./source, b: ./source}"));
     assert_eq!(why(&[])[0], "first: will run: input b: absent → ##########");
     project.write("pipeline.yaml", &PIPELINE.replace(", inputs: {a: ./source}", ""));
     assert_eq!(why(&[])[0], "first: will run: input a: ########## → absent");
@@ -135,7 +164,12 @@ fn why_tells_each_difference() {
     project.write("pipeline.yaml", &format!("{PIPELINE}  third: {{run: ./mix}}\n"));
     project.ok(&["run", "third"]);
     let code = why(&[]).remove(0);
-    assert!(code.starts_with("first: will run: code: \"") && code.contains("\" → \"") && !code.contains(';'), "{code}");
+    assert!(
+        code.starts_with("first: will run: code: \"")
+            && code.contains("\" → \"")
+            && !code.contains(';'),
+        "{code}"
+    );
 }
 
 #[test]
@@ -160,11 +194,25 @@ fn diff_tells_each_difference() {
     assert_eq!(diff("first", "first"), ["nothing differs"]);
     assert_eq!(diff("first", "second"), ["second: stage: absent → \"mix\""]);
     assert_eq!(diff("second", "first"), ["second: stage: \"mix\" → absent"]);
-    let told: Value = serde_json::from_str(&project.ok(&["diff", "--json", "first", "first -p first.count=6"])).unwrap();
-    let names: Vec<&str> = told[0]["changes"].as_array().unwrap().iter().map(|change| change["name"].as_str().unwrap()).collect();
-    let files = ["file 1.txt", "file 2.txt", "file 3.txt", "file 4.txt", "file 5.txt", "file 6.txt"];
-    assert_eq!(names, [&files[..], &["metric mean.psnr", "parameter count", "resolved steps"]].concat());
-    assert_eq!(told[0]["changes"][6], json!({"name": "metric mean.psnr", "before": 31.25, "now": 36.25}));
+    let told: Value =
+        serde_json::from_str(&project.ok(&["diff", "--json", "first", "first -p first.count=6"]))
+            .unwrap();
+    let names: Vec<&str> = told[0]["changes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|change| change["name"].as_str().unwrap())
+        .collect();
+    let files =
+        ["file 1.txt", "file 2.txt", "file 3.txt", "file 4.txt", "file 5.txt", "file 6.txt"];
+    assert_eq!(
+        names,
+        [&files[..], &["metric mean.psnr", "parameter count", "resolved steps"]].concat()
+    );
+    assert_eq!(
+        told[0]["changes"][6],
+        json!({"name": "metric mean.psnr", "before": 31.25, "now": 36.25})
+    );
     // Of an artifact that is gone, or a key of another version, what the records say is left.
     project.ok(&["pin", "one"]);
     project.ok(&["pin", "two", "-p", "first.count=2"]);
@@ -187,7 +235,13 @@ fn diff_tells_of_code_environment_and_sources() {
     project.program("mix", &format!("{PROGRAM}# changed\n"));
     pin("two", " ");
     let told = said(&project, &["diff", "one", "two"]);
-    let starts: Vec<&str> = told.iter().map(|line| line.split_once(": \"").map_or(line.as_str(), |(start, _)| start)).collect();
+    let starts: Vec<&str> = told
+        .iter()
+        .map(|line| line.split_once(": \"").map_or(line.as_str(), |(start, _)| start))
+        .collect();
     assert_eq!(starts[..2], ["first: code", "first: environment MIX_MODE"], "{told:?}");
-    assert_eq!(told[2..], ["first: input a: ########## → ##########", "first: file 1.txt: ########## → ##########"]);
+    assert_eq!(
+        told[2..],
+        ["first: input a: ########## → ##########", "first: file 1.txt: ########## → ##########"]
+    );
 }

@@ -1,4 +1,5 @@
-//! The shipped experiments at small budgets, over a tiny pipeline: their tables, selections, failures, and a second run that does nothing.
+//! The shipped experiments at small budgets, over a tiny pipeline: their tables, selections,
+//! failures, and a second run that does nothing.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -6,7 +7,8 @@ mod common;
 use common::{Project, data};
 use serde_json::Value;
 
-/// The tiny pipeline with the shipped pipelines and experiments, and its scene once more as a data set, `data/other`.
+/// The tiny pipeline with the shipped pipelines and experiments, and its scene once more as a data
+/// set, `data/other`.
 fn project() -> Project {
     let project = Project::experiments();
     project.demo_data("other");
@@ -32,7 +34,8 @@ fn column(rows: &[Value], key: &str) -> Vec<String> {
     rows.iter().map(|row| row[key].as_str().unwrap_or_default().to_owned()).collect()
 }
 
-/// Two data sets in one run, a product of scenes and supervision, rows with all figures; a second run starts nothing.
+/// Two data sets in one run, a product of scenes and supervision, rows with all figures; a second
+/// run starts nothing.
 #[test]
 fn quality_runs_scenes_and_sweeps() {
     let project = project();
@@ -44,18 +47,25 @@ fn quality_runs_scenes_and_sweeps() {
     assert_eq!(column(&made, "scene"), ["demo", "demo", "other", "other"]);
     assert_eq!(column(&made, "supervision"), ["average", "kernel", "average", "kernel"]);
     for row in &made {
-        for name in ["psnr", "ssim", "train_s", "render_s", "rays_per_s", "samples_per_ray", "views"] {
+        for name in
+            ["psnr", "ssim", "train_s", "render_s", "rays_per_s", "samples_per_ray", "views"]
+        {
             assert!(row[name].as_f64().is_some_and(|v| v > 0.0), "{name}: {row}");
         }
-        assert!(["protocol", "machine"].iter().all(|name| row[name].as_str().is_some_and(|word| !word.is_empty())), "{row}");
+        assert!(
+            ["protocol", "machine"]
+                .iter()
+                .all(|name| row[name].as_str().is_some_and(|word| !word.is_empty())),
+            "{row}"
+        );
     }
     // Both are one scene under two names: the results are equal.
     assert_eq!((&made[0]["psnr"], &made[1]["psnr"]), (&made[2]["psnr"], &made[3]["psnr"]));
     let csv = std::fs::read_to_string(project.path("out/quality/rows.csv")).unwrap();
     assert_eq!(csv.lines().count(), 5);
-    assert!(
-        table(&project, "quality").starts_with("# Quality by protocol\n\n| protocol | method | supervision | scene | PSNR |")
-    );
+    assert!(table(&project, "quality").starts_with(
+        "# Quality by protocol\n\n| protocol | method | supervision | scene | PSNR |"
+    ));
     let again = project.ok(&quality);
     assert!(!again.contains(": running"), "{again}");
     assert_eq!(rows(&project, "quality"), made);
@@ -70,7 +80,10 @@ fn variants_stand_beside_the_first() {
     let project = project();
     let first = ["--scene", "other", "--first-variants", "3"];
     project.ok(&[&["run", "ablation"][..], &first, &SMALL].concat());
-    assert_eq!(column(&rows(&project, "ablation"), "variant"), ["as it is", "supervision: average", "all pixels drawn alike"]);
+    assert_eq!(
+        column(&rows(&project, "ablation"), "variant"),
+        ["as it is", "supervision: average", "all pixels drawn alike"]
+    );
     let text = table(&project, "ablation");
     assert!(text.contains("against the first") && text.contains("| +0.00 |"), "{text}");
     project.ok(&[
@@ -87,7 +100,11 @@ fn variants_stand_beside_the_first() {
     ]);
     assert_eq!(column(&rows(&project, "tradeoff"), "rays"), ["30000", "60000"]);
     project.ok(&["run", "seeds", "-p", "train-ss.rays=30000", "-p", "train-ss.seed=3,4"]);
-    assert!(table(&project, "seeds").contains("\nPSNR over 2 results: "), "{}", table(&project, "seeds"));
+    assert!(
+        table(&project, "seeds").contains("\nPSNR over 2 results: "),
+        "{}",
+        table(&project, "seeds")
+    );
 }
 
 /// A point that fails is named; what else there is stands in the table.
@@ -116,29 +133,68 @@ stages:
     assert_eq!(rows(&project, "trial").len(), 1);
 }
 
-/// Rendered and refined views, without references and with some, are scored on the same views, with figures that need both.
+/// Rendered and refined views, without references and with some, are scored on the same views, with
+/// figures that need both.
 #[test]
 fn refinement_stands_beside_rendering() {
     let project = project();
-    let short = ["downscaled-field.rays=30000", "finetuned-field.rays=30000", "train-refine.steps=20", "train-refine.features=8"];
+    let short = [
+        "downscaled-field.rays=30000",
+        "finetuned-field.rays=30000",
+        "train-refine.steps=20",
+        "train-refine.features=8",
+    ];
     let short: Vec<&str> = short.into_iter().flat_map(|word| ["-p", word]).collect();
-    let numbers = ["--scene", "other", "--variant", "1", "--variant", "2", "-p", "prep.hr_references=2"];
+    let numbers =
+        ["--scene", "other", "--variant", "1", "--variant", "2", "-p", "prep.hr_references=2"];
     project.ok(&[&["run", "refine-table"][..], &numbers, &SMALL, &short].concat());
     let made = rows(&project, "refine-table");
     assert_eq!(column(&made, "method"), ["ss", "refine", "refine", "refine"]);
     let references: Vec<u64> = made.iter().map(|row| row["references"].as_u64().unwrap()).collect();
     assert_eq!(references, [0, 0, 1, 2]);
     for row in &made {
-        assert!(["near_psnr", "seconds_per_view"].iter().all(|name| row[*name].as_f64().is_some_and(|v| v > 0.0)), "{row}");
+        assert!(
+            ["near_psnr", "seconds_per_view"]
+                .iter()
+                .all(|name| row[*name].as_f64().is_some_and(|v| v > 0.0)),
+            "{row}"
+        );
         assert_eq!(row["least_gain"].is_null(), row["method"] == "ss", "{row}");
     }
-    project.ok(&[&["run", "quality-refined", "--scene", "other", "-p", "supervision=kernel"][..], &SMALL, &short].concat());
+    project.ok(&[
+        &["run", "quality-refined", "--scene", "other", "-p", "supervision=kernel"][..],
+        &SMALL,
+        &short,
+    ]
+    .concat());
     assert_eq!(column(&rows(&project, "quality-refined"), "method"), ["rendered", "refined"]);
-    assert!(rows(&project, "quality-refined").iter().all(|row| row["refined"] == (row["method"] == "refined")));
-    let parts =
-        ["--scene", "other", "--first-variants", "4", "--data", "data", "--protocol", "24x2", "-p", "train-refine.steps=20"];
-    project.ok(&[&["run", "refine-ablation", "-p", "downscaled-field.rays=30000"][..], &parts].concat());
+    assert!(
+        rows(&project, "quality-refined")
+            .iter()
+            .all(|row| row["refined"] == (row["method"] == "refined"))
+    );
+    let parts = [
+        "--scene",
+        "other",
+        "--first-variants",
+        "4",
+        "--data",
+        "data",
+        "--protocol",
+        "24x2",
+        "-p",
+        "train-refine.steps=20",
+    ];
+    project
+        .ok(&[&["run", "refine-ablation", "-p", "downscaled-field.rays=30000"][..], &parts]
+            .concat());
     let made = rows(&project, "refine-ablation");
     let gains: Vec<f64> = made.iter().map(|row| row["gain"].as_f64().unwrap()).collect();
-    assert!(gains.len() == 4 && gains[0] != gains[1] && gains[0] != gains[3] && gains.iter().all(|g| g.is_finite()), "{gains:?}");
+    assert!(
+        gains.len() == 4
+            && gains[0] != gains[1]
+            && gains[0] != gains[3]
+            && gains.iter().all(|g| g.is_finite()),
+        "{gains:?}"
+    );
 }

@@ -1,5 +1,5 @@
-//! Kills at random moments, with garbage collection at random moments beside: what was finished is whole, what a run needs stays,
-//! and the artifacts come out equal.
+//! Kills at random moments, with garbage collection at random moments beside: what was finished is
+//! whole, what a run needs stays, and the artifacts come out equal.
 //!
 //! NERF_SR_KILLS says how many kills (`make faults`: 200), NERF_SR_SEED which moments.
 
@@ -31,7 +31,9 @@ impl Random {
 }
 
 fn number(variable: &str) -> Option<u64> {
-    std::env::var(variable).ok().map(|text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}: not a number")))
+    std::env::var(variable)
+        .ok()
+        .map(|text| text.parse().unwrap_or_else(|_| panic!("{variable}={text}: not a number")))
 }
 
 fn point(number: u64) -> [String; 2] {
@@ -55,10 +57,12 @@ fn finished(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> 
 
 /// The processes that a process has started.
 fn children(pid: u32) -> Vec<String> {
-    let text = std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
+    let text =
+        std::fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap_or_default();
     // Threads start stages, too.
     let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).into_iter().flatten().flatten();
-    let of_threads = tasks.filter_map(|task| std::fs::read_to_string(task.path().join("children")).ok());
+    let of_threads =
+        tasks.filter_map(|task| std::fs::read_to_string(task.path().join("children")).ok());
     let all = of_threads.collect::<String>() + " " + &text;
     all.split_whitespace().map(str::to_owned).collect()
 }
@@ -122,7 +126,8 @@ fn kills_at_random_moments_lose_nothing() {
             project = Project::fast();
         }
         let mut command = project.command(&arguments("run", &point(seed)));
-        let runner = command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let runner =
+            command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let moment = Duration::from_millis(random.below(whole_run + 1));
         let collect_first = random.below(2) == 0;
         let collect = |project: &Project| project.spawn(&["gc", "--keep-days", "0"]);
@@ -137,8 +142,14 @@ fn kills_at_random_moments_lose_nothing() {
         let run = ended(runner, &place);
         let gc = ended(collector.unwrap(), &place);
         assert_eq!(gc.code, 0, "{place}: {}{}", gc.stdout, gc.stderr);
-        assert!(!run.stderr.contains("panicked") && !run.stderr.contains("damaged"), "{place}: {}", run.stderr);
-        wait_until(|| pids.iter().all(|pid| !std::path::Path::new(&format!("/proc/{pid}")).exists()));
+        assert!(
+            !run.stderr.contains("panicked") && !run.stderr.contains("damaged"),
+            "{place}: {}",
+            run.stderr
+        );
+        wait_until(|| {
+            pids.iter().all(|pid| !std::path::Path::new(&format!("/proc/{pid}")).exists())
+        });
         assert!(project.ok(&["verify"]).contains(", 0 damaged"), "{place}");
         for (stage, hash) in finished(&project, &point(seed)) {
             assert_eq!(hash, expected[seed as usize][&stage], "{place}: {stage}");
@@ -147,7 +158,9 @@ fn kills_at_random_moments_lose_nothing() {
         for stage in ["demo-scene", "prep"] {
             let now = finished(&project, &point(seed));
             assert!(
-                !before.contains_key(stage) || before.len() == STAGES.len() || now.contains_key(stage),
+                !before.contains_key(stage)
+                    || before.len() == STAGES.len()
+                    || now.contains_key(stage),
                 "{place}: {stage} is gone"
             );
         }

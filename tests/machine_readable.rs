@@ -1,4 +1,5 @@
-//! What programs read: `--json` of the looking verbs, `path`, and `diff`, with real scenes that `prep` makes.
+//! What programs read: `--json` of the looking verbs, `path`, and `diff`, with real scenes that
+//! `prep` makes.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -24,11 +25,19 @@ fn plan_status_and_why_say_the_same_to_programs() {
     let project = Project::new(PIPELINE);
     let before = read(&project, &["plan", "--json", "-p", "kernel=lanczos,box"]);
     let states = |report: &Value| -> Vec<String> {
-        report["nodes"].as_array().unwrap().iter().map(|node| node["state"].as_str().unwrap().to_owned()).collect()
+        report["nodes"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .map(|node| node["state"].as_str().unwrap().to_owned())
+            .collect()
     };
     assert_eq!(states(&before), ["will run", "waits", "waits"]);
     assert_eq!(before["nodes"][2]["point"], "kernel=box");
-    assert_eq!((&before["nodes"][1]["waits_on"], &before["nodes"][1]["key"]), (&json!([0]), &Value::Null));
+    assert_eq!(
+        (&before["nodes"][1]["waits_on"], &before["nodes"][1]["key"]),
+        (&json!([0]), &Value::Null)
+    );
     assert_eq!(before["nodes"][1]["inputs"]["dataset"]["node"], 0);
     assert_eq!(before["nodes"][1]["parameters"]["scale"], 2.0);
     project.ok(&["run"]);
@@ -40,7 +49,10 @@ fn plan_status_and_why_say_the_same_to_programs() {
     assert_eq!(prep["folder"], folder.trim());
     let why = read(&project, &["why", "prep", "--json", "-p", "kernel=box"]);
     assert_eq!(why["nodes"].as_array().unwrap().len(), 1);
-    assert_eq!(why["nodes"][0]["changes"], json!([{"name": "parameter kernel", "before": null, "now": "box"}]));
+    assert_eq!(
+        why["nodes"][0]["changes"],
+        json!([{"name": "parameter kernel", "before": null, "now": "box"}])
+    );
 }
 
 #[test]
@@ -50,8 +62,13 @@ fn path_leads_into_an_artifact() {
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
     let two = project.ok(&["path", "prep/train", "-p", "kernel=lanczos,box"]);
     assert_eq!(two.lines().count(), 2);
-    assert!(two.lines().all(|folder| std::path::Path::new(folder).join("views.json").is_file()), "{two}");
-    project.run(&["path", "prep/trian", "-p", "kernel=box"]).fails(2, &["prep has no such folder or file; did you mean train?"]);
+    assert!(
+        two.lines().all(|folder| std::path::Path::new(folder).join("views.json").is_file()),
+        "{two}"
+    );
+    project
+        .run(&["path", "prep/trian", "-p", "kernel=box"])
+        .fails(2, &["prep has no such folder or file; did you mean train?"]);
     project.run(&["path", "perp"]).fails(2, &["did you mean prep?"]);
 }
 
@@ -60,32 +77,51 @@ fn path_leads_into_an_artifact() {
 fn diff_tells_what_differs() {
     let project = Project::new(PIPELINE);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
-    assert_eq!(project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box"]).trim(), "nothing differs");
+    assert_eq!(
+        project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box"]).trim(),
+        "nothing differs"
+    );
     let kernels = project.ok(&["diff", "prep -p kernel=lanczos", "prep -p kernel=box"]);
     let lines: Vec<&str> = kernels.lines().collect();
     assert_eq!(lines[0], "prep: parameter kernel: \"lanczos\" → \"box\"");
-    assert!(lines[1].starts_with("prep: ") && lines[1].contains(" files differ, such as "), "{kernels}");
+    assert!(
+        lines[1].starts_with("prep: ") && lines[1].contains(" files differ, such as "),
+        "{kernels}"
+    );
     assert_eq!(lines.len(), 2, "{kernels}");
     // By hashes, and as JSON.
     let hash = |arguments: &[&str]| {
         let folder = project.ok(&[&["path", "prep"], arguments].concat());
         folder.trim().rsplit('/').next().unwrap()[..12].to_owned()
     };
-    let by_hash = project.ok(&["diff", &hash(&["-p", "kernel=lanczos"]), &hash(&["-p", "kernel=box"])]);
+    let by_hash =
+        project.ok(&["diff", &hash(&["-p", "kernel=lanczos"]), &hash(&["-p", "kernel=box"])]);
     assert_eq!(by_hash, kernels);
-    let told: Value = read(&project, &["diff", "--json", "prep -p kernel=lanczos", "prep -p kernel=box"]);
-    assert_eq!(told[0]["changes"][0]["name"].as_str().map(|name| name.starts_with("file ")), Some(true));
+    let told: Value =
+        read(&project, &["diff", "--json", "prep -p kernel=lanczos", "prep -p kernel=box"]);
+    assert_eq!(
+        told[0]["changes"][0]["name"].as_str().map(|name| name.starts_with("file ")),
+        Some(true)
+    );
     // Another data set leads to another scene: the input's hash follows from that and isn't told.
     project.ok(&["run", "-p", "demo-scene.seed=1", "-p", "kernel=box"]);
-    let scenes = project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box -p demo-scene.seed=1"]);
-    assert!(scenes.contains("demo-scene: parameter seed: 0 → 1") && !scenes.contains("input dataset"), "{scenes}");
+    let scenes =
+        project.ok(&["diff", "prep -p kernel=box", "prep -p kernel=box -p demo-scene.seed=1"]);
+    assert!(
+        scenes.contains("demo-scene: parameter seed: 0 → 1") && !scenes.contains("input dataset"),
+        "{scenes}"
+    );
     // Two recorded runs.
     project.ok(&["pin", "one", "-p", "kernel=box"]);
     project.ok(&["pin", "two", "-p", "kernel=box", "-p", "demo-scene.seed=1"]);
     assert_eq!(project.ok(&["diff", "one", "two"]), scenes);
     for (arguments, code, words) in [
         (["diff", "prep", "prep -p kernel=average"], 3, "isn't made yet; run it first"),
-        (["diff", "prep -p kernel=box,lanczos", "prep -p kernel=box"], 2, "a sweep has several results"),
+        (
+            ["diff", "prep -p kernel=box,lanczos", "prep -p kernel=box"],
+            2,
+            "a sweep has several results",
+        ),
         (["diff", "prep --kernel box", "prep"], 2, "is neither -p nor -i"),
         (["diff", "", "prep"], 2, "expected a stage, an artifact's hash, or a run"),
         (["diff", "nothing", "prep"], 2, "no stage \"nothing\""),
@@ -98,7 +134,8 @@ fn diff_tells_what_differs() {
 fn gc_says_the_same_to_programs() {
     let project = Project::new(PIPELINE);
     project.ok(&["run", "-p", "kernel=lanczos,box"]);
-    let told = read(&project, &["gc", "--json", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
+    let told =
+        read(&project, &["gc", "--json", "--dry-run", "--keep-days", "0", "-p", "kernel=lanczos"]);
     let items = told["items"].as_array().unwrap();
     let goes: Vec<&Value> = items.iter().filter(|item| item["stays"].is_null()).collect();
     assert_eq!((items.len(), goes.len()), (3, 1));

@@ -1,4 +1,5 @@
-//! What a run says, to whom, and what is left of it: reasons of failures, logs, remedies, closed pipes.
+//! What a run says, to whom, and what is left of it: reasons of failures, logs, remedies, closed
+//! pipes.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -6,17 +7,23 @@ mod common;
 use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Command, Stdio};
 
-use common::{Finished, Project, bin, demo_train, last_checkpoint, signal, stage_command, wait_until};
+use common::{
+    Finished, Project, bin, demo_train, last_checkpoint, signal, stage_command, wait_until,
+};
 
-/// A pipeline of two stages that are one shell script; `run` is what it does, with `$out` its output.
+/// A pipeline of two stages that are one shell script; `run` is what it does, with `$out` its
+/// output.
 fn talking(run: &str) -> Project {
-    let project =
-        Project::new("default: [talk]\nstages:\n  talk: {run: ./talk}\n  other: {extends: talk, parameters: {word: other}}\n");
+    let project = Project::new(
+        "default: [talk]\nstages:\n  talk: {run: ./talk}\n  other: \
+        {extends: talk, parameters: {word: other}}\n",
+    );
     let description = r#"{"name": "talk", "version": "1", "code": "1", "summary": "Talks.", "inputs": {},
       "parameters": {"type": "object", "properties": {"word": {"type": "string", "default": "hello"}}}, "output": {"kind": "text"}}"#;
     let script = format!(
         "#!/bin/sh\nif [ \"$1\" = describe ]; then cat <<'END'\n{description}\nEND\nexit; fi\n\
-         while [ $# -gt 0 ]; do case $1 in --output) out=$2;; --params) params=$2;; --threads) threads=$2;; esac; shift; done\n\
+         while [ $# -gt 0 ]; do case $1 in --output) out=$2;; --params) params=$2;; --threads) \
+         threads=$2;; esac; shift; done\n\
          {run}\n"
     );
     project.program("talk", &script);
@@ -33,18 +40,32 @@ fn closed() -> Stdio {
 
 #[test]
 fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
-    let note = "echo 'note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace' >&2";
-    let allocation = format!("echo 'memory allocation of 99532800 bytes failed' >&2; {note}; kill -ABRT $$");
-    let panic = format!("echo \"thread 'main' panicked at x.rs:1:2:\" >&2; echo 'no entry' >&2; {note}; exit 101");
+    let note =
+        "echo 'note: run with `RUST_BACKTRACE=1` environment variable to display a backtrace' >&2";
+    let allocation =
+        format!("echo 'memory allocation of 99532800 bytes failed' >&2; {note}; kill -ABRT $$");
+    let panic = format!(
+        "echo \"thread 'main' panicked at x.rs:1:2:\" >&2; echo 'no entry' >&2; {note}; exit 101"
+    );
     for (run, code, said) in [
         ("echo 'talk: r_0.png: cut short' >&2; exit 3", 3, "talk: failed: r_0.png: cut short"),
         (
-            "echo '{\"event\": \"failed\", \"message\": \"disk full\"}'; echo 'a warning' >&2; exit 1",
+            "echo '{\"event\": \"failed\", \"message\": \"disk full\"}'; echo 'a warning' >&2; \
+            exit 1",
             1,
             "talk: failed: disk full",
         ),
-        (&allocation, 1, "talk: failed: out of memory: 99.5 MB more were asked for; end other programs, run one stage at a time"),
-        ("echo working >&2; kill -KILL $$", 1, "talk: failed: ended by SIGKILL after it said: working; maybe the kernel"),
+        (
+            &allocation,
+            1,
+            "talk: failed: out of memory: 99.5 MB more were asked for; end other programs, run \
+            one stage at a time",
+        ),
+        (
+            "echo working >&2; kill -KILL $$",
+            1,
+            "talk: failed: ended by SIGKILL after it said: working; maybe the kernel",
+        ),
         ("kill -SEGV $$", 1, "talk: failed: crashed with SIGSEGV; please report it"),
         (&panic, 101, "talk: failed: no entry"),
         ("exit 7", 7, "talk: failed: ended with exit code 7 and said nothing"),
@@ -52,7 +73,11 @@ fn the_reason_of_a_failure_is_said_and_not_just_the_last_line() {
         let project = talking(run);
         let finished = project.run(&["run"]);
         assert_eq!(finished.code, code, "{run}: {}", finished.stderr);
-        assert!(finished.stderr.lines().any(|line| line.starts_with(said)), "{run}: {}", finished.stderr);
+        assert!(
+            finished.stderr.lines().any(|line| line.starts_with(said)),
+            "{run}: {}",
+            finished.stderr
+        );
         // The log ends with the same reason.
         let log = project.ok(&["log", "talk"]);
         let reason = said.strip_prefix("talk: failed: ").unwrap();
@@ -69,7 +94,8 @@ fn a_stage_of_ours_states_its_reason_once() {
     }
     let finished = project.run(&["run", "-i", "dataset=data"]);
     assert_eq!(finished.code, 3, "{}", finished.stderr);
-    let reason = finished.stderr.lines().find_map(|line| line.strip_prefix("prep: failed: ")).unwrap();
+    let reason =
+        finished.stderr.lines().find_map(|line| line.strip_prefix("prep: failed: ")).unwrap();
     assert!(reason.contains("r_2.png") && !reason.starts_with("prep"), "{reason}");
     assert_eq!(finished.stderr.matches(reason).count(), 1, "{}", finished.stderr);
 }
@@ -85,10 +111,21 @@ fn a_log_holds_what_a_stage_was_given_said_and_made() {
     project.ok(&["run", "-p", "word=bye"]);
     let log = project.ok(&["log", "talk", "-p", "word=bye"]);
     let lines: Vec<&str> = log.lines().collect();
-    assert!(lines[0].starts_with("talk (") && lines[0].contains("/actions/") && lines[0].ends_with(".log):"), "{log}");
+    assert!(
+        lines[0].starts_with("talk (")
+            && lines[0].contains("/actions/")
+            && lines[0].ends_with(".log):"),
+        "{log}"
+    );
     assert!(lines[1].starts_with("talk: started 2") && lines[1].ends_with(" UTC"), "{log}");
     assert!(lines[2].starts_with("program: ") && lines[2].contains("/talk 1, "), "{log}");
-    for line in ["device: cpu", r#"parameters: {"word":"bye"}"#, "on stderr", "on stdout", "result: 40 words in all"] {
+    for line in [
+        "device: cpu",
+        r#"parameters: {"word":"bye"}"#,
+        "on stderr",
+        "on stdout",
+        "result: 40 words in all",
+    ] {
         assert!(lines.contains(&line), "{line}\n{log}");
     }
     let progress: Vec<&&str> = lines.iter().filter(|line| line.starts_with("talking: ")).collect();
@@ -121,21 +158,45 @@ fn logs_of_our_stages_have_parameters_inputs_and_result() {
 fn the_command_that_is_recommended_works_as_it_is_printed() {
     let project = talking("echo 'it is the word' >&2; exit 1");
     std::fs::rename(project.path("pipeline.yaml"), project.path("my pipeline.yaml")).unwrap();
-    let arguments =
-        ["run", "-j", "1", "--keep-going", "--out", "pages", "other", "-p", "word=it's $(all)", "--pipeline", "my pipeline.yaml"];
+    let arguments = [
+        "run",
+        "-j",
+        "1",
+        "--keep-going",
+        "--out",
+        "pages",
+        "other",
+        "-p",
+        "word=it's $(all)",
+        "--pipeline",
+        "my pipeline.yaml",
+    ];
     let failed = project.run(&arguments);
     assert_eq!(failed.code, 1, "{}", failed.stderr);
     let last = failed.stderr.lines().last().unwrap();
     assert!(last.starts_with("nerf-sr: other failed; `"), "{last}");
     let command = last.split('`').nth(1).unwrap();
-    assert!(command.ends_with(r"nerf-sr log other other -p 'word=it'\''s $(all)' --pipeline 'my pipeline.yaml'"), "{command}");
-    let printed = Finished::of(Command::new("sh").args(["-c", command]).current_dir(project.path(".")).output().unwrap());
-    assert!(printed.stdout.contains("it is the word") && !printed.stdout.contains("not run with these"), "{}", printed.stdout);
+    assert!(
+        command.ends_with(
+            r"nerf-sr log other other -p 'word=it'\''s $(all)' --pipeline 'my pipeline.yaml'"
+        ),
+        "{command}"
+    );
+    let printed = Finished::of(
+        Command::new("sh").args(["-c", command]).current_dir(project.path(".")).output().unwrap(),
+    );
+    assert!(
+        printed.stdout.contains("it is the word") && !printed.stdout.contains("not run with these"),
+        "{}",
+        printed.stdout
+    );
 }
 
 #[test]
 fn a_log_is_found_whatever_the_stage_was_run_with() {
-    let project = talking(&format!("grep -q bad $params && {{ echo 'no good' >&2; exit 3; }}; cat $params >&2; {WELL}"));
+    let project = talking(&format!(
+        "grep -q bad $params && {{ echo 'no good' >&2; exit 3; }}; cat $params >&2; {WELL}"
+    ));
     // A stage that the default targets don't come to, and one that ran with another parameter.
     project.ok(&["run", "other"]);
     project.run(&["log", "nobody"]).fails(2, &["no stage \"nobody\""]);
@@ -172,10 +233,15 @@ fn a_closed_stdout_changes_nothing() {
         &["describe", "eval"],
         &["completions", "bash"],
     ] {
-        let output = project.command(arguments).stdout(closed()).stderr(Stdio::piped()).output().unwrap();
+        let output =
+            project.command(arguments).stdout(closed()).stderr(Stdio::piped()).output().unwrap();
         let finished = Finished::of(output);
         assert_eq!(finished.code, 0, "{arguments:?}: {}", finished.stderr);
-        assert!(!finished.stderr.contains("panicked") && !finished.stderr.contains("internal error"), "{}", finished.stderr);
+        assert!(
+            !finished.stderr.contains("panicked") && !finished.stderr.contains("internal error"),
+            "{}",
+            finished.stderr
+        );
         assert_eq!(
             project.command(arguments).stdout(closed()).stderr(closed()).status().unwrap().code(),
             Some(0),
@@ -184,7 +250,12 @@ fn a_closed_stdout_changes_nothing() {
     }
     assert!(project.path("out/report/index.html").exists());
     // A failure keeps its code.
-    let failed = project.command(&["run", "-p", "kernal=box"]).stdout(closed()).stderr(closed()).status().unwrap();
+    let failed = project
+        .command(&["run", "-p", "kernal=box"])
+        .stdout(closed())
+        .stderr(closed())
+        .status()
+        .unwrap();
     assert_eq!(failed.code(), Some(2));
 }
 
@@ -209,7 +280,9 @@ fn a_stage_does_not_need_somebody_to_talk_to() {
         }
         assert_eq!(command.status().unwrap().code(), Some(code), "{progress} {arguments:?}");
     }
-    assert!(project.path("alone/artifact.json").exists() && project.path("run/artifact.json").exists());
+    assert!(
+        project.path("alone/artifact.json").exists() && project.path("run/artifact.json").exists()
+    );
 }
 
 #[test]
@@ -223,9 +296,15 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
     ));
     let run = project.run(&["run"]);
     assert_eq!(run.code, 1, "{}", run.stderr);
-    assert!(run.stderr.contains(r"\u{1b}]0;PWN\u{7}\u{1b}[31mred one") && run.stderr.contains(r"failed: \u{1b}[31mfor\nged"));
+    assert!(
+        run.stderr.contains(r"\u{1b}]0;PWN\u{7}\u{1b}[31mred one")
+            && run.stderr.contains(r"failed: \u{1b}[31mfor\nged")
+    );
     let log = project.ok(&["log", "talk"]);
-    assert!(log.contains(r"\u{1b}[31mred two") && log.contains(r"\u{1b}[1ma: 100% \u{1b}[2mb"), "{log}");
+    assert!(
+        log.contains(r"\u{1b}[31mred two") && log.contains(r"\u{1b}[1ma: 100% \u{1b}[2mb"),
+        "{log}"
+    );
     // Of a bar that was drawn over and over, what stood there last.
     assert!(log.lines().any(|line| line == " 20%"), "{log}");
     for text in [run.stderr, run.stdout, log] {
@@ -237,7 +316,12 @@ fn nothing_that_a_stage_says_reaches_the_terminal_raw() {
 fn describe_prints_a_stages_help() {
     let project = Project::tiny();
     let help = project.ok(&["describe", "eval"]);
-    assert!(help.contains("Usage: eval ") && help.contains("\nParameters: ") && help.contains("\nInputs, "), "{help}");
+    assert!(
+        help.contains("Usage: eval ")
+            && help.contains("\nParameters: ")
+            && help.contains("\nInputs, "),
+        "{help}"
+    );
     project.run(&["describe", "nobody"]).fails(2, &["no stage \"nobody\"", "known: demo-scene"]);
 }
 
@@ -247,7 +331,11 @@ fn more_threads_than_a_machine_can_use_are_not_started() {
     let run = project.run(&["run", "--threads", "100000", "--jobs", "100000"]);
     assert_eq!(run.code, 0, "{}", run.stderr);
     let most = 4 * std::thread::available_parallelism().unwrap().get();
-    for words in ["nerf-sr: --threads 100000 is more than", "nerf-sr: --jobs 100000 is more than", &format!("threads={most}")] {
+    for words in [
+        "nerf-sr: --threads 100000 is more than",
+        "nerf-sr: --jobs 100000 is more than",
+        &format!("threads={most}"),
+    ] {
         assert!(run.stderr.lines().any(|line| line.contains(words)), "{words}: {}", run.stderr);
     }
     assert!(run.stdout.ends_with("1 of 1 stage ran, 0 were cached\n"), "{}", run.stdout);
@@ -259,9 +347,12 @@ const TERM: u32 = 15;
 
 /// Whether one of a process's sets of signals, as the kernel shows them, has a signal.
 fn has_signal(process: &std::process::Child, set: &str, signal: u32) -> bool {
-    let status = std::fs::read_to_string(format!("/proc/{}/status", process.id())).unwrap_or_default();
-    let mask = status.lines().find_map(|line| line.strip_prefix(set)?.strip_prefix(":")).map(str::trim);
-    mask.and_then(|mask| u64::from_str_radix(mask, 16).ok()).is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
+    let status =
+        std::fs::read_to_string(format!("/proc/{}/status", process.id())).unwrap_or_default();
+    let mask =
+        status.lines().find_map(|line| line.strip_prefix(set)?.strip_prefix(":")).map(str::trim);
+    mask.and_then(|mask| u64::from_str_radix(mask, 16).ok())
+        .is_some_and(|mask| mask >> (signal - 1) & 1 == 1)
 }
 
 #[test]
@@ -270,22 +361,41 @@ fn a_terminal_that_goes_away_leaves_a_checkpoint() {
     let train = demo_train(&project, 8);
     let params = r#"{"rays": 900000000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
     let (output, work) = (project.path("out"), project.path("work"));
-    let stage = stage_command("train-ss", params, &[("scene", &train)], &output, &["--work", work.to_str().unwrap()]);
+    let stage = stage_command(
+        "train-ss",
+        params,
+        &[("scene", &train)],
+        &output,
+        &["--work", work.to_str().unwrap()],
+    );
     // With nohup, under which this test may run, it is to go on.
     for (disposition, code) in [("--default-signal=HUP", 130), ("--ignore-signal=HUP", 130)] {
         let mut command = Command::new("env");
-        let child = command.arg(disposition).arg(stage.get_program()).args(stage.get_args()).stderr(Stdio::piped()).spawn();
+        let child = command
+            .arg(disposition)
+            .arg(stage.get_program())
+            .args(stage.get_args())
+            .stderr(Stdio::piped())
+            .spawn();
         let child = child.unwrap();
         wait_until(|| last_checkpoint(&work).is_some() && has_signal(&child, "SigCgt", TERM));
         let is_ignored = has_signal(&child, "SigIgn", HUP);
-        assert_eq!(is_ignored, disposition.starts_with("--ignore"), "it goes on where it is told to");
+        assert_eq!(
+            is_ignored,
+            disposition.starts_with("--ignore"),
+            "it goes on where it is told to"
+        );
         signal(&child, "-HUP");
         if is_ignored {
             signal(&child, "-TERM");
         }
         let finished = Finished::of(child.wait_with_output().unwrap());
         assert_eq!(finished.code, code, "{}", finished.stderr);
-        assert!(finished.stderr.ends_with("train-ss: interrupted; run again to go on from here\n"), "{}", finished.stderr);
+        assert!(
+            finished.stderr.ends_with("train-ss: interrupted; run again to go on from here\n"),
+            "{}",
+            finished.stderr
+        );
     }
 }
 
@@ -295,10 +405,18 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
     let mut command = project.command(&["run"]);
     let stopped = Finished::of(command.env("NERF_SR_STOP_AFTER", "30000").output().unwrap());
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);
-    assert!(stopped.stderr.contains("train-ss: failed: interrupted; run again to go on from here"), "{}", stopped.stderr);
+    assert!(
+        stopped.stderr.contains("train-ss: failed: interrupted; run again to go on from here"),
+        "{}",
+        stopped.stderr
+    );
     assert!(project.ok(&["status"]).contains("has a checkpoint to go on from"));
     let again = project.run(&["run"]);
-    assert!(again.code == 0 && again.stderr.contains("train-ss: going on from step"), "{}", again.stderr);
+    assert!(
+        again.code == 0 && again.stderr.contains("train-ss: going on from step"),
+        "{}",
+        again.stderr
+    );
     let undisturbed = Project::tiny();
     undisturbed.ok(&["run"]);
     assert_eq!(project.output_of("train-ss", &[]), undisturbed.output_of("train-ss", &[]));
@@ -307,7 +425,8 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
 #[test]
 fn what_a_stage_leaves_running_does_not_hold_up_the_runner() {
     let project = talking("touch started; sleep 1000");
-    let child = project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let child =
+        project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     wait_until(|| project.path("started").exists());
     signal(&child, "-INT");
     let finished = Finished::of(child.wait_with_output().unwrap());
@@ -322,8 +441,13 @@ fn a_group_can_share_a_store() {
     let project = Project::tiny();
     let run = |more: &[(&str, &str)]| {
         let mut command = Command::new("sh");
-        command.args(["-c", "umask 002; exec \"$0\" run"]).arg(bin("nerf-sr")).current_dir(project.path("."));
-        let finished = Finished::of(command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap());
+        command
+            .args(["-c", "umask 002; exec \"$0\" run"])
+            .arg(bin("nerf-sr"))
+            .current_dir(project.path("."));
+        let finished = Finished::of(
+            command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap(),
+        );
         for entry in walkdir::WalkDir::new(project.path(".nerf-sr")) {
             let entry = entry.unwrap();
             let mode = entry.metadata().unwrap().permissions().mode();
@@ -345,7 +469,11 @@ fn verify_names_what_is_not_an_artifact() {
     project.write(".nerf-sr/objects/notes.txt", "mine");
     project.write(".nerf-sr/objects/folder/notes.txt", "mine");
     let said = project.ok(&["verify", "--remove"]);
-    assert!(said.contains("objects/notes.txt: not an artifact") && said.contains("objects/folder: not an artifact"), "{said}");
+    assert!(
+        said.contains("objects/notes.txt: not an artifact")
+            && said.contains("objects/folder: not an artifact"),
+        "{said}"
+    );
     assert!(said.ends_with("1 artifact, 0 damaged\n"), "{said}");
     // A plain file in an artifact's place is damage.
     let object = project.object(&project.output_of("talk", &[])[0]);
@@ -353,6 +481,9 @@ fn verify_names_what_is_not_an_artifact() {
     std::fs::write(&object, "").unwrap();
     assert_eq!(project.run(&["verify"]).code, 3);
     assert_eq!(project.run(&["verify", "--remove"]).code, 3);
-    assert!(project.ok(&["verify"]).ends_with("0 artifacts, 0 damaged\n") && project.path(".nerf-sr/objects/notes.txt").exists());
+    assert!(
+        project.ok(&["verify"]).ends_with("0 artifacts, 0 damaged\n")
+            && project.path(".nerf-sr/objects/notes.txt").exists()
+    );
     assert!(project.ok(&["run"]).contains("1 of 1 stage ran"));
 }

@@ -18,13 +18,17 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let inputs = [("scene", train.as_path())];
-    let [one, two, stopped, work] = ["one", "two", "stopped", "work"].map(|name| project.path(name));
+    let [one, two, stopped, work] =
+        ["one", "two", "stopped", "work"].map(|name| project.path(name));
     assert_eq!(stage("train-ss", PARAMS, &inputs, &one, &["--threads", "1"]).code, 0);
     assert_eq!(stage("train-ss", PARAMS, &inputs, &two, &["--threads", "2"]).code, 0);
     assert_eq!(manifest(&one), manifest(&two));
 
     let more = ["--work", work.to_str().unwrap()];
-    let child = stage_command("train-ss", PARAMS, &inputs, &stopped, &more).stderr(Stdio::piped()).spawn().unwrap();
+    let child = stage_command("train-ss", PARAMS, &inputs, &stopped, &more)
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
     std::thread::sleep(Duration::from_millis(1500));
     common::signal(&child, "-TERM");
     let code = child.wait_with_output().unwrap().status.code();
@@ -40,38 +44,59 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     let inputs = [("scene", train.as_path()), ("init", one.as_path())];
     let on = PARAMS.replace("40000", "2000");
     assert_eq!(stage("train-ss", &on, &inputs, &beside, &[]).code, 0);
-    assert_eq!(stage("train-ss", &on.replace('{', r#"{"combine": "average_weights", "#), &inputs, &averaged, &[]).code, 0);
-    let weights = |folder: &std::path::Path, member: u32| std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok();
+    assert_eq!(
+        stage(
+            "train-ss",
+            &on.replace('{', r#"{"combine": "average_weights", "#),
+            &inputs,
+            &averaged,
+            &[]
+        )
+        .code,
+        0
+    );
+    let weights = |folder: &std::path::Path, member: u32| {
+        std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok()
+    };
     let [initial, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
     assert!(weights(&beside, 0) == initial && weights(&averaged, 1).is_none());
     assert!(initial != trained && initial != mean && trained != mean);
 
     // `render-depth` doesn't know which field it has.
     let (cameras, views) = (project.path("scene/cameras"), project.path("views"));
-    let rendered = stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);
+    let rendered =
+        stage("render-depth", "{}", &[("field", &one), ("cameras", &cameras)], &views, &[]);
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
     assert!(views.join("images").read_dir().unwrap().count() == 1);
 }
 
-/// A high rate kills a network under some seeds: the stage says so, and another seed is tried where that is allowed.
+/// A high rate kills a network under some seeds: the stage says so, and another seed is tried where
+/// that is allowed.
 #[test]
 fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
     let run = |name: &str, seed: u64, restarts: u32| {
-        let more = format!(r#""learning_rate": 0.03, "seed": {seed}, "restarts": {restarts}, "max_rays_per_step": 16"#);
+        let more = format!(
+            r#""learning_rate": 0.03, "seed": {seed}, "restarts": {restarts}, "max_rays_per_step": 16"#
+        );
         let params =
             PARAMS.replace(r#""max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1"#, &more);
-        let params = params.replace(r#""learning_rate""#, r#""rays": 4000, "precrop_steps": 0, "learning_rate""#);
+        let params = params
+            .replace(r#""learning_rate""#, r#""rays": 4000, "precrop_steps": 0, "learning_rate""#);
         stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
     };
     let alone = |seed: u64| run(&format!("alone-{seed}"), seed, 0);
     let seed = (0..20).find(|&seed| alone(seed).code == 4).expect("some seed collapses");
     run("told", seed, 0).fails(4, &["network has collapsed", "try another seed"]);
     assert!(!project.path("told").exists());
-    let after = (1..20).find(|after| alone(seed + after).code == 0).expect("some seed doesn't collapse");
+    let after =
+        (1..20).find(|after| alone(seed + after).code == 0).expect("some seed doesn't collapse");
     assert_eq!(run("again", seed, after as u32).code, 0);
-    assert_eq!(manifest(&project.path("again")), manifest(&project.path(&format!("alone-{}", seed + after))));
+    assert_eq!(
+        manifest(&project.path("again")),
+        manifest(&project.path(&format!("alone-{}", seed + after)))
+    );
 }
 
 #[test]
@@ -80,9 +105,12 @@ fn mistakes_are_one_line() {
     let train = demo_train(&project, 6);
     let out = project.path("out");
     let inputs = [("scene", train.as_path())];
-    stage("train-ss", PARAMS, &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);
-    stage("train-ss", PARAMS, &inputs, &out, &["--device", "gpu"]).fails(2, &["--device gpu", "cuda:N"]);
-    stage("train-ss", "{}", &inputs, &out, &["--device", "cuda:99"]).fails(2, &["--device cuda:99"]);
+    stage("train-ss", PARAMS, &inputs, &out, &["--device", "cuda:99"])
+        .fails(2, &["--device cuda:99"]);
+    stage("train-ss", PARAMS, &inputs, &out, &["--device", "gpu"])
+        .fails(2, &["--device gpu", "cuda:N"]);
+    stage("train-ss", "{}", &inputs, &out, &["--device", "cuda:99"])
+        .fails(2, &["--device cuda:99"]);
     let on_gpu = stage("train-ss", r#"{"rays": 1000}"#, &inputs, &out, &["--device", "cuda:0"]);
     if on_gpu.code != 0 {
         on_gpu.fails(2, &["--device cuda:0", "leave --device away"]);

@@ -15,12 +15,19 @@ const STAGES: [&str; 6] = ["demo-scene", "prep", "train-ss", "render-depth", "ev
 fn watched() -> Project {
     let mut pipeline = FAST.to_owned();
     for stage in STAGES {
-        pipeline = pipeline.replace(&format!("\n  {stage}:\n"), &format!("\n  {stage}:\n    run: ./watched/{stage}\n"));
+        pipeline = pipeline.replace(
+            &format!("\n  {stage}:\n"),
+            &format!("\n  {stage}:\n    run: ./watched/{stage}\n"),
+        );
     }
     let project = Project::new(&pipeline);
     let here = project.path("started");
     for stage in STAGES {
-        let script = format!("#!/bin/sh\necho {stage} >> '{}'\nexec '{}' \"$@\"\n", here.display(), bin(stage).display());
+        let script = format!(
+            "#!/bin/sh\necho {stage} >> '{}'\nexec '{}' \"$@\"\n",
+            here.display(),
+            bin(stage).display()
+        );
         project.program(&format!("watched/{stage}"), &script);
     }
     project.program("path/git", &format!("#!/bin/sh\necho git >> '{}'\n", here.display()));
@@ -28,7 +35,8 @@ fn watched() -> Project {
 }
 
 fn run(project: &Project) -> String {
-    let path = format!("{}:{}", project.path("path").display(), std::env::var("PATH").unwrap_or_default());
+    let path =
+        format!("{}:{}", project.path("path").display(), std::env::var("PATH").unwrap_or_default());
     let output = project.command(&["run"]).env("PATH", path).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
@@ -38,7 +46,8 @@ fn started(project: &Project) -> usize {
     std::fs::read_to_string(project.path("started")).unwrap_or_default().lines().count()
 }
 
-/// Sets when a file was last read to long ago, so that the next read changes it on any file system that keeps such times.
+/// Sets when a file was last read to long ago, so that the next read changes it on any file system
+/// that keeps such times.
 fn set_unread(path: &Path) {
     let long_ago = SystemTime::now() - Duration::from_secs(1_000_000);
     File::open(path).unwrap().set_times(FileTimes::new().set_accessed(long_ago)).unwrap();
@@ -50,7 +59,10 @@ fn last_read(path: &Path) -> SystemTime {
 
 /// Files of all artifacts but their manifests.
 fn contents(project: &Project) -> Vec<PathBuf> {
-    let files = walkdir::WalkDir::new(project.path(".nerf-sr/objects")).sort_by_file_name().into_iter().flatten();
+    let files = walkdir::WalkDir::new(project.path(".nerf-sr/objects"))
+        .sort_by_file_name()
+        .into_iter()
+        .flatten();
     let is_content = |path: &PathBuf| path.is_file() && !path.ends_with("artifact.json");
     files.map(walkdir::DirEntry::into_path).filter(is_content).collect()
 }
@@ -70,7 +82,8 @@ fn a_run_with_nothing_to_do_starts_nothing_and_reads_nothing() {
 
     let second = run(&project);
     assert!(second.contains("nothing to run: all 5 stages are cached"), "{second}");
-    let summary = |said: &str| said.lines().find(|line| line.starts_with("eval: ")).unwrap().to_owned();
+    let summary =
+        |said: &str| said.lines().find(|line| line.starts_with("eval: ")).unwrap().to_owned();
     assert_eq!(summary(&first), summary(&second));
     assert_eq!(started(&project), before, "nothing was started");
     if last_read(&probe) == untouched {

@@ -1,5 +1,5 @@
-//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used, what can't be is refused by
-//! a line that names it, and what is likely wrong is warned of.
+//! Odd data sets: names, text, poses and images as they happen to people. What can be used is used,
+//! what can't be is refused by a line that names it, and what is likely wrong is warned of.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -24,7 +24,8 @@ stages:
 fn project(size: u32, train: u32) -> (Project, PathBuf) {
     let project = Project::new(FROM_FOLDER);
     let folder = project.path("data");
-    let params = format!(r#"{{"size": {size}, "train": {train}, "test": 2, "samples_per_axis": 1}}"#);
+    let params =
+        format!(r#"{{"size": {size}, "train": {train}, "test": 2, "samples_per_axis": 1}}"#);
     let made = stage("demo-scene", &params, &[], &folder, &[]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     std::fs::remove_file(folder.join("artifact.json")).unwrap();
@@ -50,10 +51,14 @@ fn names_from_files_are_printed_without_control_characters() {
     edit(&folder, |list| list["frames"][1]["file_path"] = json!(format!("./train/{name}")));
     let is_plain = |text: &str| !text.replace('\n', "").contains(char::is_control);
     let missing = project.run(&["run"]);
-    missing.fails(3, &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "is not there; remove the frame"]);
+    missing.fails(
+        3,
+        &[r"frame 1 (./train/\u{1b}]0;PWN\u{7}\u{1b}[31m\nred)", "is not there; remove the frame"],
+    );
     assert!(is_plain(&missing.stderr) && is_plain(&missing.stdout), "{}", missing.stderr);
     // An image may have such a name; its view hasn't.
-    std::fs::rename(folder.join("train/r_1.png"), folder.join(format!("train/{name}.png"))).unwrap();
+    std::fs::rename(folder.join("train/r_1.png"), folder.join(format!("train/{name}.png")))
+        .unwrap();
     let scene = project.path("scene");
     let made = stage("prep", "{}", &[("dataset", &folder)], &scene, &["--threads", "1"]);
     assert!(made.code == 0 && is_plain(&made.stderr), "{}", made.stderr);
@@ -71,9 +76,20 @@ fn names_that_are_not_utf8_are_passed_over_or_named() {
     let list = std::fs::read_to_string(folder.join("transforms_train.json")).unwrap();
     let bytes: Vec<u8> = list.replace("r_2", "\u{fffd}").into_bytes();
     let place = bytes.windows(3).position(|w| w == "\u{fffd}".as_bytes()).unwrap();
-    std::fs::write(folder.join("transforms_train.json"), [&bytes[..place], b"\xff\xfe", &bytes[place + 3..]].concat()).unwrap();
+    std::fs::write(
+        folder.join("transforms_train.json"),
+        [&bytes[..place], b"\xff\xfe", &bytes[place + 3..]].concat(),
+    )
+    .unwrap();
     let refused = stage("prep", "{}", &[("dataset", &folder)], &project.path("other"), &[]);
-    refused.fails(3, &["transforms_train.json: line", r"./train/\xff\xfe", "is not UTF-8; save the file as UTF-8"]);
+    refused.fails(
+        3,
+        &[
+            "transforms_train.json: line",
+            r"./train/\xff\xfe",
+            "is not UTF-8; save the file as UTF-8",
+        ],
+    );
 }
 
 #[test]
@@ -91,7 +107,8 @@ fn text_as_other_editors_save_it() {
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, format!("\u{feff}{}", text.replace('\n', "\r\n"))).unwrap();
     assert_eq!(prepared("marked"), plain);
-    let wide: Vec<u8> = format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
+    let wide: Vec<u8> =
+        format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
     std::fs::write(&path, wide).unwrap();
     project.run(&["run"]).fails(3, &["transforms_train.json: is UTF-16; save it as UTF-8"]);
 }
@@ -102,13 +119,22 @@ type Damage = (fn(&mut Value), i32, &'static [&'static str]);
 #[test]
 fn poses_that_cannot_be_are_refused() {
     let refusals: [Damage; 4] = [
-        (|list| pose(list, 2)[0][3] = json!(1e30), 3, &["frame 2 (./train/r_2)", "(1e30, ", "farther from the origin than 1e9"]),
+        (
+            |list| pose(list, 2)[0][3] = json!(1e30),
+            3,
+            &["frame 2 (./train/r_2)", "(1e30, ", "farther from the origin than 1e9"],
+        ),
         (
             |list| {
-                pose(list, 1).as_array_mut().unwrap()[..3].iter_mut().for_each(|row| row[0] = json!(-row[0].as_f64().unwrap()));
+                pose(list, 1).as_array_mut().unwrap()[..3]
+                    .iter_mut()
+                    .for_each(|row| row[0] = json!(-row[0].as_f64().unwrap()));
             },
             3,
-            &["frame 1 (./train/r_1)", "transform_matrix: camera_to_world is a reflection (its determinant is -1.000)"],
+            &[
+                "frame 1 (./train/r_1)",
+                "transform_matrix: camera_to_world is a reflection (its determinant is -1.000)",
+            ],
         ),
         (
             |list| {
@@ -129,7 +155,11 @@ fn poses_that_cannot_be_are_refused() {
         edit(&folder, damage);
         // Python writes infinities without quotes.
         let path = folder.join("transforms_train.json");
-        std::fs::write(&path, std::fs::read_to_string(&path).unwrap().replace("\"Infinity\"", "Infinity")).unwrap();
+        std::fs::write(
+            &path,
+            std::fs::read_to_string(&path).unwrap().replace("\"Infinity\"", "Infinity"),
+        )
+        .unwrap();
         project.run(&["run"]).fails(code, words);
         assert_eq!(project.store_listing(), Vec::<String>::new());
     }
@@ -138,7 +168,8 @@ fn poses_that_cannot_be_are_refused() {
     drop(folder);
 }
 
-/// What is likely wrong is used all the same, and said at once, in the log, in `scene.json` and at the end.
+/// What is likely wrong is used all the same, and said at once, in the log, in `scene.json` and at
+/// the end.
 #[test]
 fn poses_that_look_wrong_are_warned_of() {
     type Change = fn(&mut Value);
@@ -150,8 +181,12 @@ fn poses_that_look_wrong_are_warned_of() {
         ),
         (|list| pose(list, 2)[0][3] = json!(-3000.0), "training view r_2 is "),
         (
-            |list| (list["w"], list["h"], list["cx"], list["cy"]) = (json!(32), json!(32), json!(8), json!(8)),
-            "4 of 6 views have a principal point far from the middle, first training view r_0: (4.0, 4.0) in 16×16 pixels",
+            |list| {
+                (list["w"], list["h"], list["cx"], list["cy"]) =
+                    (json!(32), json!(32), json!(8), json!(8))
+            },
+            "4 of 6 views have a principal point far from the middle, first training view r_0: \
+            (4.0, 4.0) in 16×16 pixels",
         ),
     ];
     for (change, words) in warnings {
@@ -183,7 +218,9 @@ fn training_views_alone_are_a_data_set() {
     assert_eq!(counts(&[]), (8, 2));
     assert_eq!(counts(&["-p", "split=holdout"]), (8, 2));
     assert_eq!(counts(&["-p", "split=paper"]), (10, 9));
-    project.run(&["run", "-p", "split=given"]).fails(2, &["parameter split", "choose holdout or paper"]);
+    project
+        .run(&["run", "-p", "split=given"])
+        .fails(2, &["parameter split", "choose holdout or paper"]);
 }
 
 #[test]
@@ -213,7 +250,8 @@ fn the_largest_size_is_said() {
     let (project, folder) = project(16, 4);
     // An EXR's header isn't summed up: an image of one pixel that says it has 20000 × 20000.
     let path = folder.join("train/huge.exr");
-    let channels = ["R", "G", "B"].map(|name| pixels::Channel { name, sample_type: pixels::SampleType::Half });
+    let channels =
+        ["R", "G", "B"].map(|name| pixels::Channel { name, sample_type: pixels::SampleType::Half });
     pixels::write_exr(&path, (1, 1), &channels, "", |_, _, samples| {
         samples.fill(0.5);
         Ok::<(), pixels::PixelError>(())
@@ -222,7 +260,8 @@ fn the_largest_size_is_said() {
     let mut bytes = std::fs::read(&path).unwrap();
     for window in [&b"dataWindow\0box2i\0"[..], b"displayWindow\0box2i\0"] {
         let at = bytes.windows(window.len()).position(|w| w == window).unwrap() + window.len() + 4;
-        bytes[at + 8..at + 16].copy_from_slice(&[19_999i32.to_le_bytes(), 19_999i32.to_le_bytes()].concat());
+        bytes[at + 8..at + 16]
+            .copy_from_slice(&[19_999i32.to_le_bytes(), 19_999i32.to_le_bytes()].concat());
     }
     std::fs::write(&path, bytes).unwrap();
     edit(&folder, |list| list["frames"][1]["file_path"] = json!("./train/huge.exr"));
@@ -256,11 +295,15 @@ fn a_reference_has_the_exposure_of_its_own_lr_photograph() {
         let settings = ["-p", "train-ss.rays=600", "-p", &format!("kernel={kernel}")];
         project.ok(&[&["run", "train-ss"], &settings[..]].concat());
         let said = project.ok(&[&["log", "train-ss"], &settings[..]].concat());
-        assert!(!said.contains("another exposure") && !said.contains("is left out"), "{kernel}: {said}");
+        assert!(
+            !said.contains("another exposure") && !said.contains("is left out"),
+            "{kernel}: {said}"
+        );
     }
 }
 
-/// So few rays say nothing of poses: cameras wander off, photographs don't meet their neighbours, and the field is the one with the given poses.
+/// So few rays say nothing of poses: cameras wander off, photographs don't meet their neighbours,
+/// and the field is the one with the given poses.
 #[test]
 fn poses_stay_where_refined_ones_are_no_better() {
     let project = Project::new(TRAINED);
@@ -268,20 +311,34 @@ fn poses_stay_where_refined_ones_are_no_better() {
         let settings = ["-p", refined];
         let run = project.run(&[&["run"], &settings[..]].concat());
         assert_eq!(run.code, 0, "{}", run.stderr);
-        let weights = std::fs::read(project.artifact("train-ss", &settings).join(radiance::FieldFile::member(0))).unwrap();
+        let weights = std::fs::read(
+            project.artifact("train-ss", &settings).join(radiance::FieldFile::member(0)),
+        )
+        .unwrap();
         let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
         (weights, run.stderr, project.json("train-ss", "training.json", &settings), page)
     };
     let (given, said, training, page) = weights("pose_refinement=false");
-    assert!(!said.contains("warning: ") && training.get("warnings").is_none() && !page.contains("id=\"warnings\""), "{said}");
+    assert!(
+        !said.contains("warning: ")
+            && training.get("warnings").is_none()
+            && !page.contains("id=\"warnings\""),
+        "{said}"
+    );
     let (kept, said, training, page) = weights("pose_refinement=true");
-    let words = "the given poses stay: photographs meet their neighbours no better with refined poses";
+    let words =
+        "the given poses stay: photographs meet their neighbours no better with refined poses";
     assert!(said.contains(&format!("warning: {words}")), "{said}");
     assert!(training["warnings"][0].as_str().unwrap().starts_with(words), "{training}");
     assert!(page.contains("id=\"warnings\"") && page.contains(words));
     assert!(project.ok(&["log", "train-ss", "-p", "pose_refinement=true"]).contains(words));
     let cameras: Value = project.json("prep", "train/views.json", &[]);
-    let poses: Vec<Value> = cameras["views"].as_array().unwrap().iter().map(|v| v["camera"]["camera_to_world"].clone()).collect();
+    let poses: Vec<Value> = cameras["views"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|v| v["camera"]["camera_to_world"].clone())
+        .collect();
     assert_eq!(training["poses"], Value::Array(poses));
     assert!(kept == given, "the field is that with the given poses");
 }

@@ -1,5 +1,5 @@
-//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one command makes HR views of LR
-//! images.
+//! Photographs of one's own: whatever form their folder has, the cameras are the same, and one
+//! command makes HR views of LR images.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -14,11 +14,13 @@ use serde_json::{Value, json};
 const WIDTH: u32 = 32;
 const ANGLE: f64 = 0.691_111_2;
 
-/// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's training views, in `folder/images`.
+/// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's
+/// training views, in `folder/images`.
 fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let data = project.path("data");
     if !data.exists() {
-        let params = format!(r#"{{"size": {WIDTH}, "train": 20, "test": 1, "samples_per_axis": 2}}"#);
+        let params =
+            format!(r#"{{"size": {WIDTH}, "train": 20, "test": 1, "samples_per_axis": 2}}"#);
         assert_eq!(stage("demo-scene", &params, &[], &data, &[]).code, 0);
     }
     let text = std::fs::read_to_string(data.join("transforms_train.json")).unwrap();
@@ -29,10 +31,19 @@ fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
     let frames = transforms["frames"].as_array().unwrap().iter();
     let mut views: Vec<_> = frames
         .map(|frame| {
-            let name = Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned();
-            let image = pixels::read_premultiplied(&data.join(format!("train/{name}.png"))).unwrap().over(1.0);
+            let name = Path::new(frame["file_path"].as_str().unwrap())
+                .file_name()
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .to_owned();
+            let image = pixels::read_premultiplied(&data.join(format!("train/{name}.png")))
+                .unwrap()
+                .over(1.0);
             pixels::write_png(&images.join(format!("{name}.png")), &image.to_rgba8()).unwrap();
-            let number = |row: usize, column: usize| frame["transform_matrix"][row][column].as_f64().unwrap();
+            let number = |row: usize, column: usize| {
+                frame["transform_matrix"][row][column].as_f64().unwrap()
+            };
             let column = |c: usize| DVec3::new(number(0, c), number(1, c), number(2, c));
             (name, DMat3::from_cols(column(0), column(1), column(2)), column(3))
         })
@@ -67,14 +78,27 @@ fn as_colmap(project: &Project) -> PathBuf {
     let sparse = project.path("colmap/sparse/0");
     std::fs::create_dir_all(&sparse).unwrap();
     let centre = 0.5 * f64::from(WIDTH);
-    std::fs::write(sparse.join("cameras.txt"), format!("1 SIMPLE_PINHOLE {WIDTH} {WIDTH} {} {centre} {centre}\n", focal()))
-        .unwrap();
+    std::fs::write(
+        sparse.join("cameras.txt"),
+        format!("1 SIMPLE_PINHOLE {WIDTH} {WIDTH} {} {centre} {centre}\n", focal()),
+    )
+    .unwrap();
     let mut images = "# as COLMAP registers them: in no order\n".to_owned();
     for (id, (name, axes, centre)) in views.iter().enumerate().rev() {
         // World to camera, with axes right, down, forward.
         let rotation = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
         let (q, t) = (DQuat::from_mat3(&rotation), -(rotation * *centre));
-        images += &format!("{} {} {} {} {} {} {} {} 1 {name}.png\n\n", id + 1, q.w, q.x, q.y, q.z, t.x, t.y, t.z);
+        images += &format!(
+            "{} {} {} {} {} {} {} {} 1 {name}.png\n\n",
+            id + 1,
+            q.w,
+            q.x,
+            q.y,
+            q.z,
+            t.x,
+            t.y,
+            t.z
+        );
     }
     std::fs::write(sparse.join("images.txt"), images).unwrap();
     project.path("colmap")
@@ -90,7 +114,8 @@ fn as_llff(project: &Project) -> PathBuf {
         }
         numbers.extend([2.0, 6.0]);
     }
-    let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}", views.len());
+    let header =
+        format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 17), }}", views.len());
     let mut bytes = b"\x93NUMPY\x01\x00\x76\x00".to_vec();
     bytes.extend(format!("{header:<117}\n").bytes());
     bytes.extend(numbers.iter().flat_map(|v| v.to_le_bytes()));
@@ -102,8 +127,13 @@ fn as_llff(project: &Project) -> PathBuf {
 /// The largest difference between the numbers of two views' cameras.
 fn difference(a: &Value, b: &Value) -> f64 {
     let numbers = |v: &Value| -> Vec<f64> {
-        let pose = v["camera"]["camera_to_world"].as_array().unwrap().iter().flat_map(|r| r.as_array().unwrap().clone());
-        let inside = v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
+        let pose = v["camera"]["camera_to_world"]
+            .as_array()
+            .unwrap()
+            .iter()
+            .flat_map(|r| r.as_array().unwrap().clone());
+        let inside =
+            v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
         pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
     };
     numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
@@ -121,10 +151,20 @@ fn every_form_gives_the_same_cameras_and_images() {
     let mut scenes = Vec::new();
     for (i, folder) in folders.iter().enumerate() {
         let scene = project.path(&format!("scene-{i}"));
-        let made = stage("prep", r#"{"lr_source": "photographs", "scale": 1.5}"#, &[("dataset", folder)], &scene, &[]);
+        let made = stage(
+            "prep",
+            r#"{"lr_source": "photographs", "scale": 1.5}"#,
+            &[("dataset", folder)],
+            &scene,
+            &[],
+        );
         assert_eq!(made.code, 0, "{}", made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
-        for words in ["17 views to train on, 3 others for testing", "as if made by box; HR is 48×48", "20 photographs"] {
+        for words in [
+            "17 views to train on, 3 others for testing",
+            "as if made by box; HR is 48×48",
+            "20 photographs",
+        ] {
             assert!(summary.contains(words), "{words} isn't in {summary}");
         }
         scenes.push(scene);
@@ -157,7 +197,12 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     let colmap = project.path("pycolmap");
     photographs(&project, "pycolmap");
     let model = colmap.join("sparse/0");
-    let written = std::process::Command::new("python3").arg(script).arg(&folder).arg(&model).output().unwrap();
+    let written = std::process::Command::new("python3")
+        .arg(script)
+        .arg(&folder)
+        .arg(&model)
+        .output()
+        .unwrap();
     assert!(written.status.success(), "{}", String::from_utf8_lossy(&written.stderr));
     let scenes = [folder, colmap].map(|folder| {
         let scene = folder.with_extension("scene");
@@ -173,14 +218,16 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
     }
 }
 
-/// COLMAP's folder and no option: views at twice the size of photographs that nobody has larger, scored by what can be known.
+/// COLMAP's folder and no option: views at twice the size of photographs that nobody has larger,
+/// scored by what can be known.
 #[test]
 fn one_command_makes_hr_views_of_lr_photographs() {
     let project = Project::tiny();
     as_colmap(&project);
     // One of them is a smaller copy.
     let copy = project.path("colmap/images/r_3.png");
-    let small = pixels::resize_pillow(&pixels::read_png(&copy).unwrap(), 20, 20, pixels::Filter::Box);
+    let small =
+        pixels::resize_pillow(&pixels::read_png(&copy).unwrap(), 20, 20, pixels::Filter::Box);
     pixels::write_png(&copy, &small).unwrap();
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("default: [eval]", "default: [report]");
@@ -193,10 +240,16 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     // What is far above a page of the mean colour's; wrong poses end there.
     assert!(mean["low_resolution"]["psnr"].as_f64().unwrap() > 19.0, "{mean}");
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
-    assert!(page.contains("render, 64 px") && page.contains("PSNR at LR") && !page.contains("ground truth"), "no such page");
+    assert!(
+        page.contains("render, 64 px")
+            && page.contains("PSNR at LR")
+            && !page.contains("ground truth"),
+        "no such page"
+    );
 }
 
-/// Photographs of one scene with exposures and white balances of their own: the field has one, and it is that of the untouched ones.
+/// Photographs of one scene with exposures and white balances of their own: the field has one, and
+/// it is that of the untouched ones.
 #[test]
 fn exposures_are_found() {
     let project = Project::tiny();
@@ -205,39 +258,52 @@ fn exposures_are_found() {
     let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     // Every eighth is held out and stays as it is; the others' factors have 1 as their mean.
     let factors = |i: usize| [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[i % 2];
-    let frames = transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
+    let frames =
+        transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
     for (taken, (_, frame)) in frames.enumerate() {
         let path = folder.join(frame["file_path"].as_str().unwrap());
         let mut image = pixels::read_png(&path).unwrap();
         for pixel in image.data.chunks_exact_mut(4) {
-            (0..3).for_each(|c| pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8);
+            (0..3).for_each(|c| {
+                pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8
+            });
         }
         pixels::write_png(&path, &image).unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
     let scored = |exposure: &str| {
-        // Each exposure has a grey of its own behind the things: that looks like a scene that goes on.
+        // Each exposure has a grey of its own behind the things: that looks like a scene that goes
+        // on.
         let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
         project.ok(&[&["run"], &settings[..]].concat());
         let read = |stage: &str, file: &str| project.json(stage, file, &settings);
-        (read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(), read("train-ss", "training.json"))
+        (
+            read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(),
+            read("train-ss", "training.json"),
+        )
     };
     let ((found, training), (ignored, _)) = (scored("exposure=true"), scored("exposure=false"));
     let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
     println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
     // Against having found nothing: all factors 1.
     let off = |found: &[[f32; 3]]| -> f32 {
-        found.iter().enumerate().flat_map(|(i, e)| (0..3).map(move |c| (e[c] / factors(i)[c]).ln().abs())).sum()
+        found
+            .iter()
+            .enumerate()
+            .flat_map(|(i, e)| (0..3).map(move |c| (e[c] / factors(i)[c]).ln().abs()))
+            .sum()
     };
     let (off, was) = (off(&exposures), off(&vec![[1.0; 3]; exposures.len()]));
     assert!(!exposures.is_empty() && off < 0.5 * was, "off by {off} of {was}: {exposures:?}");
     assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
-    let open = ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
+    let open =
+        ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
 }
 
-/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores it gets floaters.
+/// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores
+/// it gets floaters.
 #[test]
 fn lenses_are_followed_or_undone() {
     let project = Project::tiny();
@@ -246,18 +312,25 @@ fn lenses_are_followed_or_undone() {
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let distortion = Distortion { radial: [3.0, 0.0, 0.0], tangential: [0.0, 0.05] };
     let lens = Intrinsics { distortion, ..Intrinsics::from_angle_x(WIDTH, WIDTH, ANGLE) };
-    (transforms["k1"], transforms["p2"]) = (json!(distortion.radial[0]), json!(distortion.tangential[1]));
+    (transforms["k1"], transforms["p2"]) =
+        (json!(distortion.radial[0]), json!(distortion.tangential[1]));
     std::fs::write(&file, transforms.to_string()).unwrap();
     let size = WIDTH as usize;
     for frame in transforms["frames"].as_array().unwrap() {
         let path = folder.join(frame["file_path"].as_str().unwrap());
         let pinhole = pixels::read_png(&path).unwrap();
-        let pixel = |column: usize, row: usize| [0, 1, 2, 3].map(|c| f64::from(pinhole.data[4 * (row * size + column) + c]));
+        let pixel = |column: usize, row: usize| {
+            [0, 1, 2, 3].map(|c| f64::from(pinhole.data[4 * (row * size + column) + c]))
+        };
         let seen = |i: usize| {
             let at = lens.undistort([(i % size) as f64 + 0.5, (i / size) as f64 + 0.5]);
             pixels::sample_cubic((size, size), at, pixel).map(|v| (v + 0.5) as u8)
         };
-        pixels::write_png(&path, &pixels::Rgba8::new(size, size, (0..size * size).flat_map(seen).collect())).unwrap();
+        pixels::write_png(
+            &path,
+            &pixels::Rgba8::new(size, size, (0..size * size).flat_map(seen).collect()),
+        )
+        .unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 400000");
@@ -275,19 +348,28 @@ fn lenses_are_followed_or_undone() {
         "{followed} dB followed, {undone} dB undone, {ignored} dB ignored"
     );
     // Cameras say so, and films don't.
-    let scene = project.artifact("prep", &["-i", "dataset=./transforms", "-p", "background=white"]).join("cameras");
+    let scene = project
+        .artifact("prep", &["-i", "dataset=./transforms", "-p", "background=white"])
+        .join("cameras");
     let film = project.path("film");
-    assert_eq!(stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &scene)], &film, &[]).code, 0);
-    let is_bent = |folder: &Path| views(folder)[0]["camera"]["intrinsics"].get("distortion").is_some();
+    assert_eq!(
+        stage("camera-path", r#"{"frames": 1}"#, &[("cameras", &scene)], &film, &[]).code,
+        0
+    );
+    let is_bent =
+        |folder: &Path| views(folder)[0]["camera"]["intrinsics"].get("distortion").is_some();
     assert!(is_bent(&scene) && !is_bent(&film));
     // Beyond 0.55 of the focal length nothing is seen by such a lens: the corners have no ray.
     transforms["k1"] = json!(-1.1);
     std::fs::write(&file, transforms.to_string()).unwrap();
-    project.run(&["run", "-i", "dataset=./transforms"]).fails(3, &["frame r_0", "k1 -1.1", "lens: undo"]);
+    project
+        .run(&["run", "-i", "dataset=./transforms"])
+        .fails(3, &["frame r_0", "k1 -1.1", "lens: undo"]);
     project.ok(&["run", "prep", "-i", "dataset=./transforms", "-p", "lens=undo"]);
 }
 
-/// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those that it is tested by are found by it.
+/// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those
+/// that it is tested by are found by it.
 #[test]
 fn poses_are_refined_and_test_views_registered() {
     let project = Project::shipped(&["registered"], "");
@@ -295,13 +377,17 @@ fn poses_are_refined_and_test_views_registered() {
     let file = folder.join("transforms.json");
     let mut transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let mut rng = counter_rng::CounterRng::new(7, 1, 1);
-    let mut off = |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * rng.uniform() - 1.0)));
+    let mut off =
+        |size: f64| DVec3::from([0, 1, 2].map(|_| size * f64::from(2.0 * rng.uniform() - 1.0)));
     for frame in transforms["frames"].as_array_mut().unwrap() {
-        let matrix: [[f64; 4]; 4] = serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
+        let matrix: [[f64; 4]; 4] =
+            serde_json::from_value(frame["transform_matrix"].clone()).unwrap();
         let turn = DMat3::from_quat(DQuat::from_scaled_axis(off(0.02)));
-        let axes = DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [0, 1, 2].map(|r| matrix[r][c]))) * turn;
+        let axes =
+            DMat3::from_cols_array_2d(&[0, 1, 2].map(|c| [0, 1, 2].map(|r| matrix[r][c]))) * turn;
         let shift = off(0.08);
-        let row = |r: usize| [axes.x_axis[r], axes.y_axis[r], axes.z_axis[r], matrix[r][3] + shift[r]];
+        let row =
+            |r: usize| [axes.x_axis[r], axes.y_axis[r], axes.z_axis[r], matrix[r][3] + shift[r]];
         frame["transform_matrix"] = json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]);
     }
     std::fs::write(&file, transforms.to_string()).unwrap();
@@ -315,17 +401,30 @@ fn poses_are_refined_and_test_views_registered() {
             metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
         })
     };
-    let ([as_given, only_registered], [only_refined, both]) = (scored("pose_refinement=false"), scored("pose_refinement=true"));
-    println!("{as_given:.2} dB as given, {only_registered:.2} registered, {only_refined:.2} refined, {both:.2} both");
+    let ([as_given, only_registered], [only_refined, both]) =
+        (scored("pose_refinement=false"), scored("pose_refinement=true"));
+    println!(
+        "{as_given:.2} dB as given, {only_registered:.2} registered, {only_refined:.2} refined, \
+        {both:.2} both"
+    );
     assert!(both > only_registered + 1.0 && both > only_refined + 1.0 && both > as_given + 3.0);
     let settings = ["-i", "dataset=./transforms", "-p", "pose_refinement=true"];
     let training = project.json("train-ss", "training.json", &settings);
     assert_eq!(training["poses"].as_array().unwrap().len(), 17);
-    let open = ["run", "-i", "dataset=./transforms", "-p", "pose_refinement=true", "-p", "background=alpha"];
+    let open = [
+        "run",
+        "-i",
+        "dataset=./transforms",
+        "-p",
+        "pose_refinement=true",
+        "-p",
+        "background=alpha",
+    ];
     project.run(&open).fails(2, &["parameter pose_refinement", "open background"]);
 }
 
-/// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor scored.
+/// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor
+/// scored.
 #[test]
 fn what_masks_leave_out_is_not_learnt() {
     let project = Project::tiny();
@@ -335,8 +434,14 @@ fn what_masks_leave_out_is_not_learnt() {
     std::fs::create_dir(folder.join("masks")).unwrap();
     for (i, frame) in transforms["frames"].as_array_mut().unwrap().iter_mut().enumerate() {
         // The held-out ones are free of it but for a corner.
-        let (columns, rows) = if i % 8 == 0 { (0..4, 0..4) } else { (8 + i % 5..20 + i % 5, 6..26) };
-        let name = Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned();
+        let (columns, rows) =
+            if i % 8 == 0 { (0..4, 0..4) } else { (8 + i % 5..20 + i % 5, 6..26) };
+        let name = Path::new(frame["file_path"].as_str().unwrap())
+            .file_name()
+            .unwrap()
+            .to_str()
+            .unwrap()
+            .to_owned();
         let mut image = pixels::read_png(&folder.join("images").join(&name)).unwrap();
         let mut mask = pixels::Rgba8::new(32, 32, vec![255; 4 * 32 * 32]);
         for pixel in rows.flat_map(|y| columns.clone().map(move |x| 4 * (32 * y + x))) {
@@ -365,27 +470,40 @@ fn what_masks_leave_out_is_not_learnt() {
     let object = |stage: &str| project.artifact(stage, &small);
     let (rendered, truth) = (object("render-depth"), object("prep").join("truth"));
     let metrics = project.json("eval", "metrics.json", &small);
-    let list: scene::Views = serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
+    let list: scene::Views =
+        serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
     let shown = list.background.shown();
     for (view, scores) in list.views.iter().zip(metrics["views"].as_array().unwrap()) {
         let file = |path: &Option<String>| truth.join(path.as_ref().unwrap());
         let name = &view.camera.name;
-        let found = pixels::read_premultiplied(&rendered.join(format!("images/{name}.exr"))).unwrap().over(shown);
+        let found = pixels::read_premultiplied(&rendered.join(format!("images/{name}.exr")))
+            .unwrap()
+            .over(shown);
         let expected = pixels::read_premultiplied(&file(&view.image)).unwrap().over(shown);
         let mask = pixels::Mask::read(&file(&view.mask), (32, 32)).unwrap();
-        let pixels = found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).zip(&mask.counts);
+        let pixels =
+            found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).zip(&mask.counts);
         let counted: Vec<f64> = pixels
             .filter(|(_, counts)| **counts)
-            .flat_map(|((f, e), _)| f.iter().zip(e).map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2)))
+            .flat_map(|((f, e), _)| {
+                f.iter().zip(e).map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2))
+            })
             .collect();
-        assert!(counted.len() < 3 * 32 * 32 && counted.len() > 3 * 16 * 32, "{name}: {} samples", counted.len());
+        assert!(
+            counted.len() < 3 * 32 * 32 && counted.len() > 3 * 16 * 32,
+            "{name}: {} samples",
+            counted.len()
+        );
         let by_hand = pixels::psnr_of(counted.iter().sum::<f64>() / counted.len() as f64);
         let psnr = scores["scores"]["psnr"].as_f64().unwrap();
         assert!((psnr - by_hand).abs() < 1e-3, "{name}: {psnr}, by hand {by_hand}");
     }
     let spoiled = scored(false);
     println!("{masked:.2} dB with masks, {spoiled:.2} dB without");
-    assert!(masked > 17.0 && masked > spoiled + 3.0, "{masked} dB with masks, {spoiled} dB without");
+    assert!(
+        masked > 17.0 && masked > spoiled + 3.0,
+        "{masked} dB with masks, {spoiled} dB without"
+    );
 }
 
 #[test]
@@ -393,9 +511,17 @@ fn contradictions_are_refused() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
     let out = project.path("out");
-    let refused = |params: &str, words: &[&str]| stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
-    refused(r#"{"lr_source": "photographs", "lr_width": 16}"#, &["parameter lr_width", "leave lr_width out"]);
-    refused(r#"{"lr_source": "photographs", "kernel": "average"}"#, &["parameter kernel", "choose box"]);
+    let refused = |params: &str, words: &[&str]| {
+        stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words)
+    };
+    refused(
+        r#"{"lr_source": "photographs", "lr_width": 16}"#,
+        &["parameter lr_width", "leave lr_width out"],
+    );
+    refused(
+        r#"{"lr_source": "photographs", "kernel": "average"}"#,
+        &["parameter kernel", "choose box"],
+    );
     refused(r#"{"lr_source": "photographs", "hr_width": 16}"#, &["32", "larger than", "16"]);
 }
 
@@ -405,11 +531,18 @@ fn the_papers_split_leaves_references_out() {
     let project = Project::tiny();
     let folder = as_llff(&project);
     let scene = project.path("scene");
-    let made = stage("prep", r#"{"split": "paper", "hr_references": 3}"#, &[("dataset", &folder)], &scene, &[]);
+    let made = stage(
+        "prep",
+        r#"{"split": "paper", "hr_references": 3}"#,
+        &[("dataset", &folder)],
+        &scene,
+        &[],
+    );
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
-    let names =
-        |subtree: &str| -> Vec<Value> { views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect() };
+    let names = |subtree: &str| -> Vec<Value> {
+        views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect()
+    };
     let (references, tested) = (names("references"), names("truth"));
     // The first view, and others far from it, of which none is tested.
     assert_eq!((references.len(), &references[0]), (3, &json!("r_0")));
@@ -417,8 +550,9 @@ fn the_papers_split_leaves_references_out() {
     assert_ne!(references[1], json!("r_1"));
 }
 
-/// A world without end, seen from the front and from all around: trained in NDC and in a contraction. Depth is the camera's z, whatever
-/// the field's own space, and the views are better than a box's, whose world ends.
+/// A world without end, seen from the front and from all around: trained in NDC and in a
+/// contraction. Depth is the camera's z, whatever the field's own space, and the views are better
+/// than a box's, whose world ends.
 #[test]
 fn worlds_without_end_have_a_space_of_their_own() {
     let project = Project::tiny();
@@ -431,9 +565,10 @@ fn worlds_without_end_have_a_space_of_their_own() {
         let mean = project.json("eval", "metrics.json", &all)["mean"].take();
         (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
     };
-    for (layout, space, least, depth_error) in
-        [("layout=forward", "space=ndc", 22.0, 0.7), ("layout=around", "space=contraction", 18.0, 0.7)]
-    {
+    for (layout, space, least, depth_error) in [
+        ("layout=forward", "space=ndc", 22.0, 0.7),
+        ("layout=around", "space=contraction", 18.0, 0.7),
+    ] {
         let (psnr, depth) = mean([layout, space]);
         let (psnr_of_box, _) = mean([layout, "space=box"]);
         println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");

@@ -67,39 +67,66 @@ fn a_sweep_shares_what_it_can() {
     assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));
 }
 
-/// LPIPS stands for each network that is there with its heads, and what lacks for the others is said.
+/// LPIPS stands for each network that is there with its heads, and what lacks for the others is
+/// said.
 #[test]
 fn every_network_given_scores() {
     let project = Project::tiny();
     let folder = project.path("weights");
     std::fs::create_dir(&folder).unwrap();
     let arguments = ["run", "-i", "eval.weights=./weights"];
-    project.run(&arguments).fails(3, &["input weights", "no network is there", "alexnet.safetensors"]);
+    project
+        .run(&arguments)
+        .fails(3, &["input weights", "no network is there", "alexnet.safetensors"]);
     let write = |file: &str, shapes: &[(String, Vec<usize>)]| {
-        let zeros = vec![0u8; 4 * shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max().unwrap()];
+        let zeros =
+            vec![
+                0u8;
+                4 * shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max().unwrap()
+            ];
         let view = |shape: &Vec<usize>| {
             let length = 4 * shape.iter().product::<usize>();
-            safetensors::tensor::TensorView::new(safetensors::Dtype::F32, shape.clone(), &zeros[..length]).unwrap()
+            safetensors::tensor::TensorView::new(
+                safetensors::Dtype::F32,
+                shape.clone(),
+                &zeros[..length],
+            )
+            .unwrap()
         };
         let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), view(shape)));
         std::fs::write(folder.join(file), safetensors::serialize(tensors, None).unwrap()).unwrap();
     };
-    let layers = [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)];
+    let layers =
+        [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)];
     let network = layers.iter().flat_map(|&(i, outputs, inputs, size)| {
-        [(format!("features.{i}.weight"), vec![outputs, inputs, size, size]), (format!("features.{i}.bias"), vec![outputs])]
+        [
+            (format!("features.{i}.weight"), vec![outputs, inputs, size, size]),
+            (format!("features.{i}.bias"), vec![outputs]),
+        ]
     });
     write("alexnet.safetensors", &network.collect::<Vec<_>>());
     // Without its heads it isn't whole.
     project.run(&arguments).fails(3, &["no network is there"]);
-    let heads = layers.iter().enumerate().map(|(k, layer)| (format!("lin{k}.model.1.weight"), vec![1, layer.1, 1, 1]));
+    let heads = layers
+        .iter()
+        .enumerate()
+        .map(|(k, layer)| (format!("lin{k}.model.1.weight"), vec![1, layer.1, 1, 1]));
     write("lpips_linear_alex_v0.1.safetensors", &heads.collect::<Vec<_>>());
     project.ok(&arguments);
     let metrics = project.json("eval", "metrics.json", &arguments[1..]);
-    assert!(metrics["mean"]["lpips"].is_null() && metrics["mean"]["lpips_vgg"].is_null(), "{}", metrics["mean"]);
+    assert!(
+        metrics["mean"]["lpips"].is_null() && metrics["mean"]["lpips_vgg"].is_null(),
+        "{}",
+        metrics["mean"]
+    );
     // A network without weights sees no difference.
     assert_eq!(metrics["mean"]["lpips_alex"], 0.0);
     let said = metrics["conventions"]["lpips"].as_str().unwrap();
-    assert!(said.contains("by AlexNet (lpips_alex); weights not given for others") && said.contains("vgg16"), "{said}");
+    assert!(
+        said.contains("by AlexNet (lpips_alex); weights not given for others")
+            && said.contains("vgg16"),
+        "{said}"
+    );
     let ssim = |name: &str| metrics["mean"][name].as_f64().unwrap();
     assert!(ssim("ssim") != ssim("ssim_valid") && (ssim("ssim") - ssim("ssim_valid")).abs() < 0.2);
 }
@@ -175,19 +202,30 @@ fn a_stage_in_python_takes_evals_place() {
 #[test]
 fn two_runners_at_once_make_everything_once() {
     let project = Project::tiny();
-    let spawn =
-        || project.command(&["run"]).stdout(std::process::Stdio::piped()).stderr(std::process::Stdio::piped()).spawn().unwrap();
+    let spawn = || {
+        project
+            .command(&["run"])
+            .stdout(std::process::Stdio::piped())
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .unwrap()
+    };
     let runners = [spawn(), spawn()].map(|child| Finished::of(child.wait_with_output().unwrap()));
     let mut ran = 0;
     for runner in &runners {
         assert_eq!(runner.code, 0, "{}", runner.stderr);
         let last = runner.stdout.lines().last().unwrap();
-        ran += if last.starts_with("nothing") { 0 } else { last.split(' ').next().unwrap().parse::<usize>().unwrap() };
+        ran += if last.starts_with("nothing") {
+            0
+        } else {
+            last.split(' ').next().unwrap().parse::<usize>().unwrap()
+        };
     }
     assert_eq!(ran, 5);
 }
 
-/// Options that change what flows between stages, each through the whole pipeline to a plausible score.
+/// Options that change what flows between stages, each through the whole pipeline to a plausible
+/// score.
 #[test]
 fn every_option_goes_through() {
     let project = Project::tiny();
@@ -197,12 +235,50 @@ fn every_option_goes_through() {
         &["-p", "background=black", "-p", "kernel=bicubic"],
         &["-p", "kernel=average", "-p", "supersample_warmup=0.2"],
         &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
-        &["-p", "lr_width=20", "-p", "scale=1.5", "-p", "prep.hr_references=2", "-p", "test_views=2"],
+        &[
+            "-p",
+            "lr_width=20",
+            "-p",
+            "scale=1.5",
+            "-p",
+            "prep.hr_references=2",
+            "-p",
+            "test_views=2",
+        ],
         &["-p", "lr_width=24", "-p", "scale=1", "-p", "supersample=1"],
         &["-p", "supervision=kernel"],
-        &["-p", "lr_width=32", "-p", "scale=1.5", "-p", "supersample=1.5", "-p", "supervision=kernel"],
-        &["-p", "lr_width=16", "-p", "scale=3", "-p", "supersample=3", "-p", "kernel=bicubic", "-p", "supervision=kernel"],
-        &["-p", "lr_width=17", "-p", "scale=2.7", "-p", "supersample=2.7", "-p", "supervision=kernel"],
+        &[
+            "-p",
+            "lr_width=32",
+            "-p",
+            "scale=1.5",
+            "-p",
+            "supersample=1.5",
+            "-p",
+            "supervision=kernel",
+        ],
+        &[
+            "-p",
+            "lr_width=16",
+            "-p",
+            "scale=3",
+            "-p",
+            "supersample=3",
+            "-p",
+            "kernel=bicubic",
+            "-p",
+            "supervision=kernel",
+        ],
+        &[
+            "-p",
+            "lr_width=17",
+            "-p",
+            "scale=2.7",
+            "-p",
+            "supersample=2.7",
+            "-p",
+            "supervision=kernel",
+        ],
         &[
             "-p",
             "lr_width=17",
@@ -219,7 +295,8 @@ fn every_option_goes_through() {
         ],
     ] {
         let run = project.ok(&[&["run"], options].concat());
-        let psnr: f64 = run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
+        let psnr: f64 =
+            run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
         assert!((17.0..40.0).contains(&psnr), "{options:?}: {run}");
         assert!(run.contains("depth error"), "{run}");
     }
@@ -231,16 +308,30 @@ fn members_are_fields_of_their_own_and_average() {
     let project = Project::tiny();
     let of = |stage: &str, more: &[&str]| project.artifact(stage, more);
     // With all rays everywhere: by which rays a mean is shown depends on the mean.
-    let both = ["-p", "render-depth.tolerance=0", "-p", "train-ss.seed=4", "-p", "ensemble=2", "-p", "rays=60000"];
-    let singles =
-        ["train-ss.seed=4", "train-ss.seed=5"].map(|seed| ["-p", "render-depth.tolerance=0", "-p", seed, "-p", "rays=30000"]);
+    let both = [
+        "-p",
+        "render-depth.tolerance=0",
+        "-p",
+        "train-ss.seed=4",
+        "-p",
+        "ensemble=2",
+        "-p",
+        "rays=60000",
+    ];
+    let singles = ["train-ss.seed=4", "train-ss.seed=5"]
+        .map(|seed| ["-p", "render-depth.tolerance=0", "-p", seed, "-p", "rays=30000"]);
     project.ok(&[&["run"], &both[..]].concat());
     let views = of("render-depth", &both);
     let mut images = Vec::new();
     for (m, single) in singles.iter().enumerate() {
         project.ok(&[&["run"], &single[..]].concat());
-        let weights = |stage: &std::path::Path, m: usize| std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap();
-        assert!(weights(&of("train-ss", &both), m) == weights(&of("train-ss", single), 0), "member {m}");
+        let weights = |stage: &std::path::Path, m: usize| {
+            std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap()
+        };
+        assert!(
+            weights(&of("train-ss", &both), m) == weights(&of("train-ss", single), 0),
+            "member {m}"
+        );
         images.push(of("render-depth", single).join("images"));
     }
     for entry in std::fs::read_dir(views.join("images")).unwrap() {
@@ -265,7 +356,8 @@ fn any_size_and_shape() {
     // Cut the data set's images to 48×30: the same focal length, the same centre.
     let dataset = project.artifact("demo-scene", &[]);
     for split in ["train", "test"] {
-        let text = std::fs::read_to_string(dataset.join(format!("transforms_{split}.json"))).unwrap();
+        let text =
+            std::fs::read_to_string(dataset.join(format!("transforms_{split}.json"))).unwrap();
         let file = project.path(&format!("cut/transforms_{split}.json"));
         std::fs::create_dir_all(file.parent().unwrap().join(split)).unwrap();
         std::fs::write(file, text.replace("depth_file_path", "ignored")).unwrap();
@@ -273,7 +365,11 @@ fn any_size_and_shape() {
             let name = format!("{split}/r_{i}.png");
             let Ok(image) = pixels::read_png(&dataset.join(&name)) else { continue };
             let data = image.data[9 * 48 * 4..39 * 48 * 4].to_vec();
-            pixels::write_png(&project.path(&format!("cut/{name}")), &pixels::Rgba8::new(48, 30, data)).unwrap();
+            pixels::write_png(
+                &project.path(&format!("cut/{name}")),
+                &pixels::Rgba8::new(48, 30, data),
+            )
+            .unwrap();
         }
     }
     let run = project.ok(&["run", "-i", "dataset=cut"]);

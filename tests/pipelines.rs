@@ -1,4 +1,5 @@
-//! The shipped `pipelines/`: found by their names, sharing one store, and old names that lead to new ones. Nothing slow is run.
+//! The shipped `pipelines/`: found by their names, sharing one store, and old names that lead to
+//! new ones. Nothing slow is run.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -18,7 +19,10 @@ fn every_verb_finds_a_target_of_its_own_file() {
     for (arguments, words) in [
         (&["plan", "refined"][..], &["downscaled-field", "eval-refined", "refined"][..]),
         (&["plan", "eval-refined"], &["downscaled-field", "eval-refined"]),
-        (&["plan", "reference-refine", "-p", "prep.hr_references=2"], &["finetuned-field", "refine-reference"]),
+        (
+            &["plan", "reference-refine", "-p", "prep.hr_references=2"],
+            &["finetuned-field", "refine-reference"],
+        ),
         (&["plan", "hr-finetune"], &["finetuned-views"]),
         (&["plan", "sisr-fuse", "-p", "upsample.method=bicubic"], &["refine-sisr"]),
         (&["plan", "paper-refine"], &["train-paper"]),
@@ -38,7 +42,8 @@ fn every_verb_finds_a_target_of_its_own_file() {
     project.run(&["pin", "kept", "video"]).fails(2, &["isn't cached"]);
 }
 
-/// What pipeline.yaml made is there for a file of `pipelines/`, however that is named; pages are, too.
+/// What pipeline.yaml made is there for a file of `pipelines/`, however that is named; pages are,
+/// too.
 #[test]
 fn targets_share_one_store() {
     let project = project();
@@ -48,14 +53,23 @@ fn targets_share_one_store() {
     assert!(said.contains("cached") && !said.contains("will run"), "{said}");
     assert!(!project.path("pipelines/.nerf-sr").exists());
     let made = project.output_of("camera-path", &["camera-path"]);
-    assert_eq!(made, project.output_of("camera-path", &["video", "--pipeline", "pipelines/video.yaml"]));
+    assert_eq!(
+        made,
+        project.output_of("camera-path", &["video", "--pipeline", "pipelines/video.yaml"])
+    );
     // A folder is named from the file in which it stands.
     let dataset = project.artifact("demo-scene", &[]);
     std::os::unix::fs::symlink(dataset, project.path("scene")).unwrap();
-    project.write("pipelines/mine.yaml", "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ../scene}}\n");
+    project.write(
+        "pipelines/mine.yaml",
+        "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ../scene}}\n",
+    );
     let said = project.ok(&["plan", "mine"]);
     assert!(!said.contains("demo-scene") && said.contains("report"), "{said}");
-    project.write("pipelines/mine.yaml", "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ./scene}}\n");
+    project.write(
+        "pipelines/mine.yaml",
+        "extends: ../pipeline.yaml\nstages:\n  prep: {inputs: {dataset: ./scene}}\n",
+    );
     project.run(&["plan", "mine"]).fails(3, &["scene"]);
 }
 
@@ -68,10 +82,16 @@ fn wrong_and_old_names_are_told_the_right_ones() {
         (&["why", "rehearsal-field", "refined"], &["it is called downscaled-field now"]),
         (&["log", "train-joined", "hr-finetune"], &["it is called finetuned-field now"]),
         (&["describe", "locate"], &["it is called register now"]),
-        (&["plan", "refined", "-p", "rehearsal-field.rays=1"], &["it is called downscaled-field now"]),
+        (
+            &["plan", "refined", "-p", "rehearsal-field.rays=1"],
+            &["it is called downscaled-field now"],
+        ),
     ] {
         project.run(arguments).fails(2, words);
     }
     project.replace("scene: prep/train", "scene: prep/rehearsal");
-    project.run(&["plan"]).fails(2, &["pipeline.yaml:", "prep has no folder \"rehearsal\"; it is called downscaled now"]);
+    project.run(&["plan"]).fails(
+        2,
+        &["pipeline.yaml:", "prep has no folder \"rehearsal\"; it is called downscaled now"],
+    );
 }

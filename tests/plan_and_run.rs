@@ -1,4 +1,5 @@
-//! Property: `plan` and `run` agree, over random pipelines, edits and overrides. NERF_SR_SEED says which.
+//! Property: `plan` and `run` agree, over random pipelines, edits and overrides. NERF_SR_SEED says
+//! which.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,8 +12,8 @@ use common::Project;
 use counter_rng::CounterRng;
 use serde_json::Value;
 
-/// A stage in shell. Its output follows from its inputs and from half of its value, that in `sub` from the value alone: so a change may come
-/// out as before. It notes the key under which it ran.
+/// A stage in shell. Its output follows from its inputs and from half of its value, that in `sub`
+/// from the value alone: so a change may come out as before. It notes the key under which it ran.
 const PROGRAM: &str = r#"#!/bin/sh
 if [ "$1" = describe ]; then
     input='{"kinds": ["text"], "summary": "a text", "optional": true}'
@@ -98,7 +99,8 @@ impl World {
 
     fn write_program(&mut self, program: u64) {
         self.edits += 1;
-        self.project.program(&format!("p{program}"), &format!("{PROGRAM}# p{program}, {}\n", self.edits));
+        self.project
+            .program(&format!("p{program}"), &format!("{PROGRAM}# p{program}, {}\n", self.edits));
     }
 
     fn write_source(&mut self, source: u64) {
@@ -110,9 +112,14 @@ impl World {
         let names: Vec<String> = (0..self.blocks.len()).map(|index| format!("s{index}")).collect();
         let mut text = format!("default: [{}]\nstages:\n", names.join(", "));
         for (name, Block { program, value, inputs }) in names.iter().zip(&self.blocks) {
-            let inputs: Vec<String> = inputs.iter().map(|(name, from)| format!("{name}: {from}")).collect();
-            writeln!(text, "  {name}: {{run: ./p{program}, inputs: {{{}}}, parameters: {{value: {value}}}}}", inputs.join(", "))
-                .unwrap();
+            let inputs: Vec<String> =
+                inputs.iter().map(|(name, from)| format!("{name}: {from}")).collect();
+            writeln!(
+                text,
+                "  {name}: {{run: ./p{program}, inputs: {{{}}}, parameters: {{value: {value}}}}}",
+                inputs.join(", ")
+            )
+            .unwrap();
         }
         self.project.write("pipeline.yaml", &text);
     }
@@ -131,9 +138,14 @@ impl World {
                 let program = self.draws.below(PROGRAMS);
                 self.write_program(program);
             }
-            4 => self.overrides = vec!["-p".to_owned(), format!("s{index}.value={}", self.values())],
+            4 => {
+                self.overrides = vec!["-p".to_owned(), format!("s{index}.value={}", self.values())]
+            }
             5 => {
-                self.overrides = vec!["-i".to_owned(), format!("s{index}.a=./source{}", self.draws.below(SOURCES))];
+                self.overrides = vec![
+                    "-i".to_owned(),
+                    format!("s{index}.a=./source{}", self.draws.below(SOURCES)),
+                ];
             }
             6 => self.harm("objects", "/all.txt"),
             7 => self.harm("actions", ""),
@@ -162,25 +174,33 @@ impl World {
 
     /// One value or a sweep's.
     fn values(&mut self) -> String {
-        let values: BTreeSet<u64> = (0..1 + self.draws.below(3)).map(|_| self.draws.below(6)).collect();
+        let values: BTreeSet<u64> =
+            (0..1 + self.draws.below(3)).map(|_| self.draws.below(6)).collect();
         values.iter().map(u64::to_string).collect::<Vec<_>>().join(",")
     }
 
-    /// Cuts a file of the store short, or takes it away: one of a folder, or one below an entry of it.
+    /// Cuts a file of the store short, or takes it away: one of a folder, or one below an entry of
+    /// it.
     fn harm(&mut self, folder: &str, below: &str) {
         let entries = std::fs::read_dir(self.project.path(".nerf-sr").join(folder)).unwrap();
-        let paths = entries.map(|entry| entry.unwrap().path().into_os_string().into_string().unwrap() + below);
+        let paths = entries
+            .map(|entry| entry.unwrap().path().into_os_string().into_string().unwrap() + below);
         let mut paths: Vec<String> = paths.filter(|path| Path::new(path).is_file()).collect();
         paths.sort();
         let chosen = &paths[self.draws.below(paths.len() as u64) as usize];
-        if self.draws.below(2) == 0 { std::fs::remove_file(chosen).unwrap() } else { std::fs::write(chosen, "").unwrap() }
+        if self.draws.below(2) == 0 {
+            std::fs::remove_file(chosen).unwrap()
+        } else {
+            std::fs::write(chosen, "").unwrap()
+        }
     }
 
     fn words<'a>(&'a self, verb: &[&'a str]) -> Vec<&'a str> {
         verb.iter().copied().chain(self.overrides.iter().map(String::as_str)).collect()
     }
 
-    /// The nodes as a looking verb has them; none where it doesn't start a new program before a run has.
+    /// The nodes as a looking verb has them; none where it doesn't start a new program before a run
+    /// has.
     fn nodes(&self, verb: &[&str]) -> Vec<Value> {
         let finished = self.project.run(&self.words(verb));
         if finished.stderr.contains("starts it; read it first") {
@@ -196,7 +216,8 @@ impl World {
         let ran = self.project.path("ran");
         std::fs::remove_file(&ran).ok();
         self.project.ok(&[&self.words(&["run"])[..], more].concat());
-        let mut keys: Vec<String> = std::fs::read_to_string(ran).unwrap_or_default().lines().map(str::to_owned).collect();
+        let mut keys: Vec<String> =
+            std::fs::read_to_string(ran).unwrap_or_default().lines().map(str::to_owned).collect();
         keys.sort();
         keys
     }
@@ -213,7 +234,8 @@ fn keys(nodes: &[Value], state: &str) -> BTreeSet<String> {
 
 #[test]
 fn plan_and_run_agree() {
-    let seed = std::env::var("NERF_SR_SEED").map_or_else(|_| std::process::id().into(), |text| text.parse().unwrap());
+    let seed = std::env::var("NERF_SR_SEED")
+        .map_or_else(|_| std::process::id().into(), |text| text.parse().unwrap());
     let mut planned = 0;
     for number in 0..12 {
         let mut world = World::new(seed, number);
@@ -231,29 +253,47 @@ fn plan_and_run_agree() {
             assert_eq!(distinct.len(), ran.len(), "each key once; {place}");
             let after = world.nodes(&["status", "--json"]);
             assert!(after.iter().all(|node| node["state"] == "cached"), "{place}");
-            // What the plan said of each node: whether it runs, and under which key; or that its key isn't known.
+            // What the plan said of each node: whether it runs, and under which key; or that its
+            // key isn't known.
             assert!(keys(&before, "cached").is_disjoint(&distinct), "cached, and ran; {place}");
             for (planned, node) in before.iter().zip(&after) {
-                assert_eq!([&planned["stage"], &planned["point"]], [&node["stage"], &node["point"]], "{place}");
+                assert_eq!(
+                    [&planned["stage"], &planned["point"]],
+                    [&node["stage"], &node["point"]],
+                    "{place}"
+                );
                 assert!(planned["state"] == "waits" || planned["key"] == node["key"], "{place}");
             }
-            // What was there didn't run. What wasn't did, but where another key made the artifact again.
+            // What was there didn't run. What wasn't did, but where another key made the artifact
+            // again.
             let ran_now = |node: &Value| distinct.contains(&text(node, "key"));
-            let made: BTreeSet<String> = after.iter().filter(|node| ran_now(node)).map(|node| text(node, "output")).collect();
+            let made: BTreeSet<String> = after
+                .iter()
+                .filter(|node| ran_now(node))
+                .map(|node| text(node, "output"))
+                .collect();
             for node in &after {
                 let known = records.get(&text(node, "key"));
                 let made_by_another = known.is_some() && made.contains(&text(node, "output"));
                 let was_there = known == Some(&true);
-                assert!(if was_there { !ran_now(node) } else { ran_now(node) || made_by_another }, "{node}; {place}");
+                assert!(
+                    if was_there { !ran_now(node) } else { ran_now(node) || made_by_another },
+                    "{node}; {place}"
+                );
             }
             assert!(distinct.is_subset(&keys(&after, "cached")), "nothing else ran; {place}");
             assert_eq!(world.run(&[]), Vec::<String>::new(), "{place}");
         }
         // Whatever came of it is what a store that knows nothing gets.
-        let outputs = |nodes: &[Value]| nodes.iter().map(|node| text(node, "output")).collect::<Vec<_>>();
+        let outputs =
+            |nodes: &[Value]| nodes.iter().map(|node| text(node, "output")).collect::<Vec<_>>();
         let kept = outputs(&world.nodes(&["status", "--json"]));
         world.run(&["--store", "fresh"]);
-        assert_eq!(kept, outputs(&world.nodes(&["status", "--json", "--store", "fresh"])), "seed {seed}, pipeline {number}");
+        assert_eq!(
+            kept,
+            outputs(&world.nodes(&["status", "--json", "--store", "fresh"])),
+            "seed {seed}, pipeline {number}"
+        );
     }
     assert!(planned > 50, "{planned} nodes were planned");
 }

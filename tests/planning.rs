@@ -1,4 +1,5 @@
-//! What comes before a run: asking programs what they are, checking what is asked for, and saying what will be done.
+//! What comes before a run: asking programs what they are, checking what is asked for, and saying
+//! what will be done.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -9,13 +10,17 @@ use std::process::{Command, Stdio};
 
 use common::{Finished, Project, TINY, bin, signal, wait_until};
 
-/// A copy of a program, made by another process: one that this process has open for writing can't be started.
+/// A copy of a program, made by another process: one that this process has open for writing can't
+/// be started.
 fn install(from: &Path, to: &Path) {
     std::fs::create_dir_all(to.parent().unwrap()).unwrap();
-    assert!(Command::new("install").args(["-m", "755"]).args([from, to]).status().unwrap().success());
+    assert!(
+        Command::new("install").args(["-m", "755"]).args([from, to]).status().unwrap().success()
+    );
 }
 
-/// A stage as a script: it leaves a mark when it is started, waits for `go` where that is asked for, describes itself, or makes its output.
+/// A stage as a script: it leaves a mark when it is started, waits for `go` where that is asked
+/// for, describes itself, or makes its output.
 const SCRIPT: &str = r#"#!/bin/sh
 cd "$(dirname "$0")"
 echo "$1" >> started
@@ -29,22 +34,39 @@ mkdir "$2" && echo 1 > "$2/x"
 "#;
 
 fn with_script() -> Project {
-    let project = Project::new("default: [mine]\nstages:\n  mine: {run: ./mine.sh}\n  other: {run: ./other.sh}\n");
+    let project = Project::new(
+        "default: [mine]\nstages:\n  mine: {run: ./mine.sh}\n  other: {run: ./other.sh}\n",
+    );
     project.write("script", SCRIPT);
     install(&project.path("script"), &project.path("mine.sh"));
     project
 }
 
-/// Looking at somebody's pipeline starts nothing of theirs: only `run` does, and then the others know what it said, until it changes.
+/// Looking at somebody's pipeline starts nothing of theirs: only `run` does, and then the others
+/// know what it said, until it changes.
 #[test]
 fn only_run_starts_a_foreign_program() {
     let project = with_script();
     let started = || std::fs::read_to_string(project.path("started")).unwrap_or_default();
-    let looks: [&[&str]; 6] = [&["plan"], &["why", "mine"], &["status"], &["graph"], &["log", "mine"], &["gc", "--dry-run"]];
+    let looks: [&[&str]; 6] = [
+        &["plan"],
+        &["why", "mine"],
+        &["status"],
+        &["graph"],
+        &["log", "mine"],
+        &["gc", "--dry-run"],
+    ];
     for look in looks {
         let finished = project.run(look);
         if !["log", "gc"].contains(&look[0]) {
-            finished.fails(2, &["pipeline.yaml:3: stage mine", "mine.sh", "`nerf-sr run` starts it; read it first"]);
+            finished.fails(
+                2,
+                &[
+                    "pipeline.yaml:3: stage mine",
+                    "mine.sh",
+                    "`nerf-sr run` starts it; read it first",
+                ],
+            );
         }
         assert_eq!(started(), "", "{look:?}");
     }
@@ -68,10 +90,23 @@ fn only_run_starts_a_foreign_program() {
     project.ok(&["run"]);
     project.ok(&["plan"]);
     // One that isn't needed isn't started by a run either.
-    project.write("pipeline.yaml", "default: [demo-scene]\nstages:\n  demo-scene: {}\n  mine: {run: ./new.sh}\n");
+    project.write(
+        "pipeline.yaml",
+        "default: [demo-scene]\nstages:\n  demo-scene: {}\n  mine: {run: ./new.sh}\n",
+    );
     install(&project.path("script"), &project.path("new.sh"));
     let before = started();
-    project.ok(&["run", "-p", "size=4", "-p", "train=1", "-p", "test=1", "-p", "demo-scene.samples_per_axis=1"]);
+    project.ok(&[
+        "run",
+        "-p",
+        "size=4",
+        "-p",
+        "train=1",
+        "-p",
+        "test=1",
+        "-p",
+        "demo-scene.samples_per_axis=1",
+    ]);
     assert_eq!(started(), before);
 }
 
@@ -80,7 +115,8 @@ fn only_run_starts_a_foreign_program() {
 fn asking_can_be_watched_and_interrupted() {
     let project = with_script();
     project.write("wait", "");
-    let mut child = project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child =
+        project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut stderr = BufReader::new(child.stderr.take().unwrap());
     let mut line = String::new();
     stderr.read_line(&mut line).unwrap();
@@ -90,51 +126,84 @@ fn asking_can_be_watched_and_interrupted() {
     line.clear();
     stderr.read_to_string(&mut line).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(130), "{line}");
-    assert!(line.contains("interrupted") && !line.contains("failed") && !line.contains("stage mine"), "{line}");
+    assert!(
+        line.contains("interrupted") && !line.contains("failed") && !line.contains("stage mine"),
+        "{line}"
+    );
     // What was begun goes on when it may.
-    let child = project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let child =
+        project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     std::fs::remove_file(project.path("wait")).unwrap();
     let finished = Finished::of(child.wait_with_output().unwrap());
     assert_eq!(finished.code, 0, "{}", finished.stderr);
 }
 
-/// A program that isn't there is no matter to targets that don't use it; to others the one command that builds it is said.
+/// A program that isn't there is no matter to targets that don't use it; to others the one command
+/// that builds it is said.
 #[test]
 fn a_missing_program_is_missed_where_it_is_needed() {
     let project = Project::tiny();
     let own = |name: &str| -> PathBuf { project.path("bin").join(name) };
     ["nerf-sr", "demo-scene", "prep"].into_iter().for_each(|name| install(&bin(name), &own(name)));
     let run = |arguments: &[&str]| {
-        Finished::of(Command::new(own("nerf-sr")).args(arguments).current_dir(project.path("")).output().unwrap())
+        Finished::of(
+            Command::new(own("nerf-sr"))
+                .args(arguments)
+                .current_dir(project.path(""))
+                .output()
+                .unwrap(),
+        )
     };
-    for arguments in [&["plan", "prep"][..], &["run", "demo-scene"], &["plan", "prep", "-p", "kernel=box"]] {
+    for arguments in
+        [&["plan", "prep"][..], &["run", "demo-scene"], &["plan", "prep", "-p", "kernel=box"]]
+    {
         let finished = run(arguments);
         assert_eq!(finished.code, 0, "{arguments:?}: {}", finished.stderr);
     }
-    run(&["plan"]).fails(2, &["pipeline.yaml:9: stage train-ss", "No such file", "cargo build --release -p train-ss"]);
-    run(&["plan", "prep", "-p", "rays=1"]).fails(2, &["no stage has such a parameter", "couldn't be asked"]);
+    run(&["plan"]).fails(
+        2,
+        &["pipeline.yaml:9: stage train-ss", "No such file", "cargo build --release -p train-ss"],
+    );
+    run(&["plan", "prep", "-p", "rays=1"])
+        .fails(2, &["no stage has such a parameter", "couldn't be asked"]);
     project.replace("  demo-scene:\n", "  demo-secne:\n");
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
     run(&["plan"]).fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
     // The rest of the file is checked, needed or not.
     project.replace("lr_width: 24", "ir_width: 24");
-    run(&["plan", "demo-secne"]).fails(2, &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean hr_width?"]);
+    run(&["plan", "demo-secne"]).fails(
+        2,
+        &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean hr_width?"],
+    );
 }
 
 /// What can't go well is refused before anything runs, in the plan as in the run.
 #[test]
 fn what_stages_would_refuse_is_refused_in_the_plan() {
-    let upsample = "  upsample:\n    inputs: {views: prep/train, cameras: prep/train-cameras}\n    parameters: {method: imdn}\n";
+    let upsample = "  upsample:\n    inputs: \
+        {views: prep/train, cameras: prep/train-cameras}\n    parameters: {method: imdn}\n";
     let project = Project::new(&format!("{TINY}{upsample}"));
     for (arguments, words) in [
-        (&["upsample"][..], "stage upsample: input weights is missing: methods imdn, liif and swinir"),
-        (&["upsample", "-p", "method=bicubic,liif"], "stage upsample [method=liif]: input weights is missing"),
-        (&["-p", "prep.scale=2.7", "-p", "kernel=average"], "stage prep: parameter kernel: average needs a whole scale"),
+        (
+            &["upsample"][..],
+            "stage upsample: input weights is missing: methods imdn, liif and swinir",
+        ),
+        (
+            &["upsample", "-p", "method=bicubic,liif"],
+            "stage upsample [method=liif]: input weights is missing",
+        ),
+        (
+            &["-p", "prep.scale=2.7", "-p", "kernel=average"],
+            "stage prep: parameter kernel: average needs a whole scale",
+        ),
         (
             &["-p", "background=alpha", "-p", "supervision=kernel"],
             "stage train-ss: parameter supervision: kernel needs a background",
         ),
-        (&["-p", "background=white,alpha", "-p", "exposure=true"], "stage train-ss [background=alpha]: parameter exposure"),
+        (
+            &["-p", "background=white,alpha", "-p", "exposure=true"],
+            "stage train-ss [background=alpha]: parameter exposure",
+        ),
         (
             &["-p", "background=alpha", "-p", "pose_refinement=true"],
             "parameter pose_refinement: photographs with an open background",
@@ -161,9 +230,16 @@ fn what_stages_would_refuse_is_refused_in_the_plan() {
 /// Sinks are drawn and explained.
 #[test]
 fn sinks_are_part_of_the_picture() {
-    let project = Project::new(&format!("{}  report:\n    inputs: {{run: eval}}\n", TINY.replace("[eval]", "[report]")));
+    let project = Project::new(&format!(
+        "{}  report:\n    inputs: {{run: eval}}\n",
+        TINY.replace("[eval]", "[report]")
+    ));
     for (arguments, words) in [
-        (&["why", "report"][..], &["report: shows eval; a run writes it anew where they change", "\n  eval: waits for"][..]),
+        (
+            &["why", "report"][..],
+            &["report: shows eval; a run writes it anew where they change", "\n  eval: waits for"]
+                [..],
+        ),
         (&["plan"], &["shows eval"]),
         (&["graph"], &["report (shows the run)  ← eval\n"]),
         (&["graph", "--format", "dot"], &["[label=\"report\", shape=note]", "n4 -> n5"]),
@@ -173,10 +249,13 @@ fn sinks_are_part_of_the_picture() {
         assert!(words.iter().all(|w| said.contains(w)), "{arguments:?}: {said}");
     }
     project.run(&["why", "reprot"]).fails(2, &["no stage \"reprot\" in this plan"]);
-    project.run(&["why", "evla"]).fails(2, &["no stage \"evla\" in this plan; did you mean eval? known: demo-scene, eval"]);
+    project
+        .run(&["why", "evla"])
+        .fails(2, &["no stage \"evla\" in this plan; did you mean eval? known: demo-scene, eval"]);
 }
 
-/// The plan says what a run then does: what will run runs, what is cached doesn't, and what waits may do either. Equal values are one key.
+/// The plan says what a run then does: what will run runs, what is cached doesn't, and what waits
+/// may do either. Equal values are one key.
 #[test]
 fn a_run_does_what_the_plan_says() {
     let project = Project::tiny();
@@ -186,7 +265,19 @@ fn a_run_does_what_the_plan_says() {
         (&[][..], 2),
         (&[], 0),
         // Said otherwise, or said where it is so by default.
-        (&["-p", "prep.scale=2.0", "-p", "lr_width=24.0", "-p", "demo-scene.size=48e0", "-p", "demo-scene.seed=0"], 0),
+        (
+            &[
+                "-p",
+                "prep.scale=2.0",
+                "-p",
+                "lr_width=24.0",
+                "-p",
+                "demo-scene.size=48e0",
+                "-p",
+                "demo-scene.seed=0",
+            ],
+            0,
+        ),
         (&["-p", "prep.scale=3", "-p", "prep.scale=2", "-p", "near=", "-p", "lens=follow"], 0),
         // Equal output ends what waits.
         (&["-p", "hr_width=48"], 1),
@@ -201,20 +292,29 @@ fn a_run_does_what_the_plan_says() {
         let (will_run, waits, before) = (count("will run"), count("waits for"), actions());
         project.ok(&[&["run"], &arguments[..]].concat());
         let ran = actions() - before;
-        assert!((will_run..=will_run + waits).contains(&ran) && ran == runs, "{arguments:?}: {ran} ran of\n{plan}");
+        assert!(
+            (will_run..=will_run + waits).contains(&ran) && ran == runs,
+            "{arguments:?}: {ran} ran of\n{plan}"
+        );
         let after = project.ok(&[&["plan"], &arguments[..]].concat());
         assert!(after.lines().all(|line| line.contains("cached")), "{after}");
     }
     for verb in ["plan", "run"] {
         let said = project.run(&[verb, "prep", "-p", "kernel=lanczos", "-p", "prep.kernel=box"]);
-        assert!(said.code == 0 && said.stderr.contains("-p kernel=lanczos: overridden by -p prep.kernel=box"), "{}", said.stderr);
+        assert!(
+            said.code == 0
+                && said.stderr.contains("-p kernel=lanczos: overridden by -p prep.kernel=box"),
+            "{}",
+            said.stderr
+        );
     }
 }
 
 #[test]
 fn a_file_in_another_encoding_is_refused_with_the_cure() {
     let project = Project::new("");
-    let utf16: Vec<u8> = std::iter::once(0xfeff).chain(TINY.encode_utf16()).flat_map(u16::to_le_bytes).collect();
+    let utf16: Vec<u8> =
+        std::iter::once(0xfeff).chain(TINY.encode_utf16()).flat_map(u16::to_le_bytes).collect();
     std::fs::write(project.path("pipeline.yaml"), utf16).unwrap();
     project.run(&["plan"]).fails(2, &["pipeline.yaml: the text is UTF-16; save it as UTF-8"]);
     project.write("pipeline.yaml", &format!("\u{feff}{}", TINY.replace('\n', "\r\n")));

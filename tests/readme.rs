@@ -1,4 +1,5 @@
-//! The documents tell the truth: commands parse and plan, pipeline blocks are valid, the files they name are there.
+//! The documents tell the truth: commands parse and plan, pipeline blocks are valid, the files they
+//! name are there.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -11,7 +12,8 @@ use common::Project;
 const DOCUMENTS: [&str; 2] = ["README.md", "ARCHITECTURE.md"];
 const FOLDERS: [&str; 2] = ["docs/guide", "docs/results"];
 /// The same for those whose links alone are checked.
-const LINKED: [&str; 4] = ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
+const LINKED: [&str; 4] =
+    ["CONTRIBUTING.md", "CHANGELOG.md", "docs/glossary.md", "docs/comparison.md"];
 const LINKED_FOLDERS: [&str; 1] = ["docs/design"];
 
 fn read(path: impl AsRef<Path>) -> String {
@@ -23,7 +25,8 @@ fn paths(files: &[&str], folders: &[&str]) -> Vec<String> {
     let mut paths: Vec<String> = files.iter().map(|file| (*file).to_owned()).collect();
     for folder in folders {
         let entries = std::fs::read_dir(common::root().join(folder)).unwrap();
-        let mut names: Vec<String> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+        let mut names: Vec<String> =
+            entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
         names.retain(|name| name.ends_with(".md"));
         names.sort();
         assert!(!names.is_empty(), "no documents in {folder}");
@@ -45,7 +48,11 @@ fn blocks(text: &str, language: &str) -> Vec<String> {
 /// The words of a command line, without quotes.
 fn words_of(line: &str) -> Vec<&str> {
     let pieces = line.split('"').enumerate();
-    pieces.flat_map(|(i, piece)| if i % 2 == 1 { vec![piece] } else { piece.split_whitespace().collect() }).collect()
+    pieces
+        .flat_map(
+            |(i, piece)| if i % 2 == 1 { vec![piece] } else { piece.split_whitespace().collect() },
+        )
+        .collect()
 }
 
 #[test]
@@ -72,7 +79,10 @@ fn every_command_plans() {
     for block in blocks(&documents(), "sh") {
         let joined = block.replace("\\\n", " ");
         for line in joined.lines().map(|l| l.split('#').next().unwrap().trim()) {
-            let Some(rest) = line.strip_prefix("nerf-sr ").or_else(|| line.strip_prefix("target/release/nerf-sr ")) else {
+            let Some(rest) = line
+                .strip_prefix("nerf-sr ")
+                .or_else(|| line.strip_prefix("target/release/nerf-sr "))
+            else {
                 assert!(
                     line.is_empty()
                         || line.starts_with("make ")
@@ -92,14 +102,18 @@ fn every_command_plans() {
                 "diff" => words = ["plan"].into_iter().chain(words[1].split_whitespace()).collect(),
                 _ => {}
             }
-            // `run` would train for minutes; the plan is the same code up to running. It has no use for run's own options.
+            // `run` would train for minutes; the plan is the same code up to running. It has no use
+            // for run's own options.
             if words[0] == "run" {
                 words[0] = "plan";
-                while let Some(at) = words.iter().position(|w| ["-j", "--threads", "--memory", "--out"].contains(w)) {
+                while let Some(at) =
+                    words.iter().position(|w| ["-j", "--threads", "--memory", "--out"].contains(w))
+                {
                     words.drain(at..at + 2);
                 }
             }
-            let output = project.command(&words).current_dir(project.path("project")).output().unwrap();
+            let output =
+                project.command(&words).current_dir(project.path("project")).output().unwrap();
             assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
             planned += 1;
         }
@@ -132,8 +146,11 @@ fn pipeline_blocks_are_valid() {
         let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
         let start = text.find(&format!("  {name}:")).unwrap();
         let after = &text[start + 3..];
-        let end =
-            after.match_indices("\n  ").map(|(i, _)| i + 1).find(|&i| !after[i + 2..].starts_with(' ')).unwrap_or(after.len());
+        let end = after
+            .match_indices("\n  ")
+            .map(|(i, _)| i + 1)
+            .find(|&i| !after[i + 2..].starts_with(' '))
+            .unwrap_or(after.len());
         project.write("pipeline.yaml", &format!("{}{block}{}", &text[..start], &after[end..]));
         if block.contains("run: ./") {
             // Somebody's program: it is for `run` to start.
@@ -150,7 +167,9 @@ fn links_lead_somewhere() {
     let folders = [&FOLDERS[..], &LINKED_FOLDERS[..]].concat();
     for document in paths(&files, &folders) {
         let folder = common::root().join(&document).parent().unwrap().to_owned();
-        for target in read(&document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap()) {
+        for target in
+            read(&document).split("](").skip(1).map(|rest| rest.split([')', '#']).next().unwrap())
+        {
             assert!(folder.join(target).exists(), "{document}: {target} is not there");
         }
     }

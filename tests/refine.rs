@@ -7,7 +7,9 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::SystemTime;
 
-use common::{Finished, Project, kill_again_and_again, manifest, signal, stage, stage_command, wait_until};
+use common::{
+    Finished, Project, kill_again_and_again, manifest, signal, stage, stage_command, wait_until,
+};
 
 /// The shipped targets at tiny sizes.
 const REFINED: &str = "
@@ -35,10 +37,15 @@ fn refined_views_stand_beside_rendered_ones() {
     let run = project.ok(&["run", "refined"]);
     assert!(run.contains("out/refined/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/refined/index.html")).unwrap();
-    assert!(page.contains("Views · refined") && page.contains("Views · eval<"), "the page lacks one of both");
+    assert!(
+        page.contains("Views · refined") && page.contains("Views · eval<"),
+        "the page lacks one of both"
+    );
     let rows: serde_json::Value =
-        serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
-    let stages: Vec<&str> = rows.as_array().unwrap().iter().map(|r| r["stage"].as_str().unwrap()).collect();
+        serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap())
+            .unwrap();
+    let stages: Vec<&str> =
+        rows.as_array().unwrap().iter().map(|r| r["stage"].as_str().unwrap()).collect();
     assert_eq!(stages, ["eval", "eval-refined"]);
 
     // Colours change, opacity and depth don't.
@@ -50,7 +57,13 @@ fn refined_views_stand_beside_rendered_ones() {
         let (before, after) = (read(&rendered), read(&refined));
         assert_eq!(before.channel("Z"), after.channel("Z"));
         assert_eq!(before.channel("A"), after.channel("A"));
-        let changed = before.channel("G").unwrap().iter().zip(after.channel("G").unwrap()).filter(|(a, b)| a != b).count();
+        let changed = before
+            .channel("G")
+            .unwrap()
+            .iter()
+            .zip(after.channel("G").unwrap())
+            .filter(|(a, b)| a != b)
+            .count();
         assert!(changed > 100, "{changed} pixels changed");
     }
     // Nothing of what the network predicts is nothing at all, but for half precision.
@@ -58,21 +71,27 @@ fn refined_views_stand_beside_rendered_ones() {
     let inputs = [("views", rendered.as_path()), ("refiner", &folder("train-refine"))];
     assert_eq!(stage("refine", r#"{"residual_weight": 0}"#, &inputs, &none, &[]).code, 0);
     let file = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap().file_name();
-    let green = |folder: &Path| pixels::read_exr(&folder.join("images").join(&file)).unwrap().channel("G").unwrap().to_vec();
+    let green = |folder: &Path| {
+        pixels::read_exr(&folder.join("images").join(&file)).unwrap().channel("G").unwrap().to_vec()
+    };
     assert!(green(&none).iter().zip(green(&rendered)).all(|(a, b)| (a - b).abs() < 2e-3));
     // The network is for views.
     let views = rendered.as_path();
-    stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[]).fails(3, &["refiner.json"]);
+    stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[])
+        .fails(3, &["refiner.json"]);
 }
 
-/// What a block extends reaches it from the file and from the command line, save what it says itself.
+/// What a block extends reaches it from the file and from the command line, save what it says
+/// itself.
 #[test]
 fn a_block_follows_the_one_it_extends() {
     let project = project();
     let parameters = |stage: &str, name: &str, more: &[&str]| -> Vec<String> {
         project.ok(&[&["run", "refined"], more].concat());
-        let rows: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
+        let rows: serde_json::Value = serde_json::from_slice(
+            &std::fs::read(project.path("out/refined/results.json")).unwrap(),
+        )
+        .unwrap();
         let refined = rows.as_array().unwrap().iter().filter(|row| row["stage"] == "eval-refined");
         refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
     };
@@ -81,7 +100,10 @@ fn a_block_follows_the_one_it_extends() {
     assert_eq!(parameters("downscaled-field", "supersample", &both), ["1.0", "2.0"]);
     assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
     assert_eq!(parameters("downscaled-field", "rays", &both), ["40000", "40000"]);
-    assert_eq!(parameters("downscaled-field", "rays", &["-p", "downscaled-field.rays=30000"]), ["30000"]);
+    assert_eq!(
+        parameters("downscaled-field", "rays", &["-p", "downscaled-field.rays=30000"]),
+        ["30000"]
+    );
     let own = "parameters: {rays: 40000}";
     for (more, words) in [
         ("extends: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
@@ -96,22 +118,31 @@ fn a_block_follows_the_one_it_extends() {
     }
 }
 
-/// In the paper's split all views are trained on, so each one's LR image is known; where views are withheld, none is.
+/// In the paper's split all views are trained on, so each one's LR image is known; where views are
+/// withheld, none is.
 #[test]
 fn views_are_consistent_with_their_own_photographs() {
     let project = project();
     let at_lr = |more: &[&str]| -> Vec<f64> {
         project.ok(&[&["run", "refined"], more].concat());
-        let rows: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(project.path("out/refined/results.json")).unwrap()).unwrap();
-        rows.as_array().unwrap().iter().map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap()).collect()
+        let rows: serde_json::Value = serde_json::from_slice(
+            &std::fs::read(project.path("out/refined/results.json")).unwrap(),
+        )
+        .unwrap();
+        rows.as_array()
+            .unwrap()
+            .iter()
+            .map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap())
+            .collect()
     };
     let said = |more: &[&str]| {
         let folder = project.artifact("refine", &[&["refined"], more].concat());
         std::fs::read_to_string(folder.join("summary.txt")).unwrap()
     };
     let is_trained_so = |more: &[&str]| -> bool {
-        project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"].as_bool().unwrap()
+        project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"]
+            .as_bool()
+            .unwrap()
     };
     let given = at_lr(&[]);
     assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
@@ -124,15 +155,21 @@ fn views_are_consistent_with_their_own_photographs() {
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
     let mut command = std::process::Command::new(common::bin("refine"));
     command.arg("--output").arg(project.path("alone"));
-    command
-        .args([("views", &views), ("refiner", &refiner)].map(|(input, folder)| format!("--input={input}={}", folder.display())));
+    command.args(
+        [("views", &views), ("refiner", &refiner)]
+            .map(|(input, folder)| format!("--input={input}={}", folder.display())),
+    );
     let alone = Finished::of(command.output().unwrap());
     assert_eq!(alone.code, 0, "{}", alone.stderr);
-    assert!(alone.stderr.contains("trained on views consistent with LR photographs of their own"), "{}", alone.stderr);
+    assert!(
+        alone.stderr.contains("trained on views consistent with LR photographs of their own"),
+        "{}",
+        alone.stderr
+    );
 }
 
-/// A view becomes the mean of what is refined and of its own photograph enlarged, where that counts, and is consistent with the
-/// photograph.
+/// A view becomes the mean of what is refined and of its own photograph enlarged, where that
+/// counts, and is consistent with the photograph.
 #[test]
 fn views_are_means_with_their_enlarged_photographs() {
     let project = project();
@@ -142,13 +179,20 @@ fn views_are_means_with_their_enlarged_photographs() {
     let summary = std::fs::read_to_string(folder("refine-sisr").join("summary.txt")).unwrap();
     assert!(summary.contains("14 are means") && summary.contains("14 of them agree"), "{summary}");
 
-    let (views, refiner, enlarged) = (folder("render-depth"), folder("train-refine"), project.path("enlarged"));
+    let (views, refiner, enlarged) =
+        (folder("render-depth"), folder("train-refine"), project.path("enlarged"));
     let (train, cameras) = (folder("prep").join("train"), folder("prep").join("train-cameras"));
     // Half of one photograph doesn't count.
     let name = "r_1";
     let photographs = changed(&project, "photographs", &train, "json", &|path| {
-        let mut list: serde_json::Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
-        for view in list["views"].as_array_mut().into_iter().flatten().filter(|view| view["camera"]["name"] == name) {
+        let mut list: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+        for view in list["views"]
+            .as_array_mut()
+            .into_iter()
+            .flatten()
+            .filter(|view| view["camera"]["name"] == name)
+        {
             view["mask"] = "masks/it.png".into();
         }
         std::fs::write(path, list.to_string()).unwrap();
@@ -174,11 +218,16 @@ fn views_are_means_with_their_enlarged_photographs() {
     let (plain, mean, enlarged) = (green(&plain), green(&mean), green(&enlarged));
     for (i, ((plain, mean), enlarged)) in plain.iter().zip(&mean).zip(&enlarged).enumerate() {
         let expected = if i % 48 < 24 { 0.5 * (plain + enlarged) } else { *plain };
-        assert!((mean - expected).abs() < 2e-3, "pixel {i}: {mean}, not the mean of {plain} and {enlarged}");
+        assert!(
+            (mean - expected).abs() < 2e-3,
+            "pixel {i}: {mean}, not the mean of {plain} and {enlarged}"
+        );
     }
     assert!(plain.iter().zip(&enlarged).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
     // Of another size.
-    refine("no", Some(&photographs)).0.fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
+    refine("no", Some(&photographs))
+        .0
+        .fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
 }
 
 #[test]
@@ -187,7 +236,8 @@ fn references_are_used_by_a_network_that_knows_how() {
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
     let (views, refiner) = (folder("finetuned-views"), folder("train-reference"));
-    let (prep, reference_views, referenced) = (folder("prep"), folder("reference-views"), folder("refine-reference"));
+    let (prep, reference_views, referenced) =
+        (folder("prep"), folder("reference-views"), folder("refine-reference"));
     let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
         let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
         let output = project.path(name);
@@ -199,24 +249,34 @@ fn references_are_used_by_a_network_that_knows_how() {
         (Finished::of(command.output().unwrap()), output)
     };
     let references = prep.join("references");
-    let green = |folder: &Path| pixels::read_exr(&folder.join("images/r_0.exr")).unwrap().channel("G").unwrap().to_vec();
+    let green = |folder: &Path| {
+        pixels::read_exr(&folder.join("images/r_0.exr")).unwrap().channel("G").unwrap().to_vec()
+    };
     // Without references it still refines, otherwise, and says so.
     let (alone, output) = refine("alone", &refiner, &[]);
     assert!(alone.code == 0 && alone.stderr.contains("there are none"), "{}", alone.stderr);
     assert_ne!(green(&output), green(&referenced));
     // Images without their rendered views can't be placed.
     let both = [("references", references.as_path()), ("reference-views", views.as_path())];
-    refine("no", &refiner, &both).0.fails(3, &["input reference-views: no view r_0 with that pose"]);
+    refine("no", &refiner, &both)
+        .0
+        .fails(3, &["input reference-views: no view r_0 with that pose"]);
     // A network that can't use them says so.
     let plain_target = [&["train-refine"], &target[1..]].concat();
     project.ok(&[&["run"], &plain_target[..]].concat());
     let plain = project.artifact("train-refine", &plain_target);
-    let both = [("references", references.as_path()), ("reference-views", reference_views.as_path())];
+    let both =
+        [("references", references.as_path()), ("reference-views", reference_views.as_path())];
     let (left_out, _) = refine("plain", &plain, &both);
-    assert!(left_out.code == 0 && left_out.stderr.contains("trained without references"), "{}", left_out.stderr);
+    assert!(
+        left_out.code == 0 && left_out.stderr.contains("trained without references"),
+        "{}",
+        left_out.stderr
+    );
 }
 
-/// A scene of which references see much, trained as far as it takes that they look as rendered; and what to run of it.
+/// A scene of which references see much, trained as far as it takes that they look as rendered; and
+/// what to run of it.
 fn seen_from_the_front() -> (Project, Vec<&'static str>) {
     let project = project();
     project.replace("train: 12", "train: 30");
@@ -226,14 +286,22 @@ fn seen_from_the_front() -> (Project, Vec<&'static str>) {
         "parameters: {references_per_view: 2}",
         "parameters: {references_per_view: 2, steps: 600, features: 16, blocks: 2}",
     );
-    let from_the_front = ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
+    let from_the_front =
+        ["-p", "layout=forward", "-p", "backdrop=true", "-p", "near=2", "-p", "far=80"];
     (project, [&["refine-reference", "-p", "prep.hr_references=2"], &from_the_front[..]].concat())
 }
 
 /// A copy of a folder with its files of a kind changed.
-fn changed(project: &Project, name: &str, of: &Path, extension: &str, change: &dyn Fn(&Path)) -> std::path::PathBuf {
+fn changed(
+    project: &Project,
+    name: &str,
+    of: &Path,
+    extension: &str,
+    change: &dyn Fn(&Path),
+) -> std::path::PathBuf {
     let to = project.path(name);
-    for file in walkdir::WalkDir::new(of).into_iter().flatten().filter(|f| f.file_type().is_file()) {
+    for file in walkdir::WalkDir::new(of).into_iter().flatten().filter(|f| f.file_type().is_file())
+    {
         let target = to.join(file.path().strip_prefix(of).unwrap());
         std::fs::create_dir_all(target.parent().unwrap()).unwrap();
         std::fs::write(&target, std::fs::read(file.path()).unwrap()).unwrap();
@@ -250,13 +318,19 @@ fn changed(project: &Project, name: &str, of: &Path, extension: &str, change: &d
 fn change_depth(path: &Path, change: fn(usize, f32) -> f32) {
     let image = pixels::read_exr(path).unwrap();
     let channels = &pixels::VIEW_CHANNELS[..5];
-    let written = pixels::write_exr(path, (image.width, image.height), channels, pixels::VIEW_NOTE, |first, _, samples| {
-        for (i, sample) in (first * image.width..).zip(samples.chunks_exact_mut(5)) {
-            (0..5).for_each(|c| sample[c] = image.channel(channels[c].name).unwrap()[i]);
-            sample[4] = change(i, sample[4]);
-        }
-        Ok::<(), pixels::PixelError>(())
-    });
+    let written = pixels::write_exr(
+        path,
+        (image.width, image.height),
+        channels,
+        pixels::VIEW_NOTE,
+        |first, _, samples| {
+            for (i, sample) in (first * image.width..).zip(samples.chunks_exact_mut(5)) {
+                (0..5).for_each(|c| sample[c] = image.channel(channels[c].name).unwrap()[i]);
+                sample[4] = change(i, sample[4]);
+            }
+            Ok::<(), pixels::PixelError>(())
+        },
+    );
     written.unwrap();
 }
 
@@ -265,15 +339,20 @@ fn noise(seed: u64, pixel: usize) -> f32 {
     1.0 + 0.03 * (counter_rng::uniform(seed, 2, pixel as u64) - 0.5)
 }
 
-/// Depth with noise, depth of surfaces that lie elsewhere, references that see nothing, are of another exposure or show something else: never
-/// worse than what is rendered by more than a hair, and the log says what is wrong.
+/// Depth with noise, depth of surfaces that lie elsewhere, references that see nothing, are of
+/// another exposure or show something else: never worse than what is rendered by more than a hair,
+/// and the log says what is wrong.
 #[test]
 fn bad_references_do_no_harm() {
     let (project, target) = seen_from_the_front();
     project.ok(&[&["run"], &target[..]].concat());
     let folder = |stage: &str| project.artifact(stage, &target);
-    let (views, refiner, prep, reference_views) =
-        (folder("finetuned-views"), folder("train-reference"), folder("prep"), folder("reference-views"));
+    let (views, refiner, prep, reference_views) = (
+        folder("finetuned-views"),
+        folder("train-reference"),
+        folder("prep"),
+        folder("reference-views"),
+    );
     println!("{}", project.json("train-reference", "refiner.json", &target));
     let references = prep.join("references");
     let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
@@ -283,7 +362,11 @@ fn bad_references_do_no_harm() {
         changed(&project, name, &references, "png", &|path| {
             let image = pixels::read_premultiplied(path).unwrap().over(1.0);
             let data = image.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
-            pixels::write_png(path, &pixels::Image::new(image.width, image.height, 3, data).to_rgba8()).unwrap();
+            pixels::write_png(
+                path,
+                &pixels::Image::new(image.width, image.height, 3, data).to_rgba8(),
+            )
+            .unwrap();
         })
     };
     let psnr = |found: &Path| {
@@ -294,38 +377,58 @@ fn bad_references_do_no_harm() {
     };
     let rendered = psnr(&views);
     let refined = |name: &str, views: &Path, references: &Path, reference_views: &Path| {
-        let inputs = [("views", views), ("refiner", &refiner), ("references", references), ("reference-views", reference_views)];
+        let inputs = [
+            ("views", views),
+            ("refiner", &refiner),
+            ("references", references),
+            ("reference-views", reference_views),
+        ];
         let mut command = std::process::Command::new(common::bin("refine"));
         command.arg("--output").arg(project.path(name));
         command.args(inputs.map(|(input, folder)| format!("--input={input}={}", folder.display())));
         let finished = Finished::of(command.output().unwrap());
         assert_eq!(finished.code, 0, "{}", finished.stderr);
         let summary = std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap();
-        println!("{name}: {:.2} dB, rendered {rendered:.2}; {summary}; {}", psnr(&project.path(name)), finished.stderr);
+        println!(
+            "{name}: {:.2} dB, rendered {rendered:.2}; {summary}; {}",
+            psnr(&project.path(name)),
+            finished.stderr
+        );
         // Three of four seeds lose at most 0.11 dB by the shifted depth, one 0.36.
-        assert!(psnr(&project.path(name)) > rendered - 0.15, "{name}: {} of {rendered}", psnr(&project.path(name)));
+        assert!(
+            psnr(&project.path(name)) > rendered - 0.15,
+            "{name}: {} of {rendered}",
+            psnr(&project.path(name))
+        );
         finished.stderr
     };
     let good = refined("good", &views, &references, &reference_views);
     assert!(!good.contains("reference r_"), "{good}");
 
-    let (mine, theirs) = (depths("a", &views, |i, z| z * noise(1, i)), depths("b", &reference_views, |i, z| z * noise(3, i)));
+    let (mine, theirs) = (
+        depths("a", &views, |i, z| z * noise(1, i)),
+        depths("b", &reference_views, |i, z| z * noise(3, i)),
+    );
     refined("noisy", &mine, &references, &theirs);
-    let (mine, theirs) = (depths("c", &views, |_, _| 2.5), depths("d", &reference_views, |_, _| 2.5));
+    let (mine, theirs) =
+        (depths("c", &views, |_, _| 2.5), depths("d", &reference_views, |_, _| 2.5));
     let said = refined("shifted", &mine, &references, &theirs);
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
-    let said = refined("hidden", &views, &references, &depths("e", &reference_views, |_, z| 0.01 * z));
+    let said =
+        refined("hidden", &views, &references, &depths("e", &reference_views, |_, z| 0.01 * z));
     assert!(said.contains("sees nothing of these views"), "{said}");
     let said = refined("dark", &views, &images("f", |p| p.map(|v| 0.6 * v)), &reference_views);
     assert!(said.contains("has another exposure"), "{said}");
-    let said = refined("other", &views, &images("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
+    let said =
+        refined("other", &views, &images("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
 }
 
 /// HR references that join the training: what they show is learnt.
 #[test]
 fn references_join_a_training() {
-    // A field of its own that learns from both, beside the shipped one, which goes on from the field of LR images.
+    // A field of its own that learns from both, beside the shipped one, which goes on from the
+    // field of LR images.
     let joined = "
   joined-field:
     extends: train-ss
@@ -338,31 +441,54 @@ fn references_join_a_training() {
     inputs: {views: joined-views, truth: prep/truth}
 ";
     let project = Project::shipped(&["hr-finetune"], joined);
-    let arguments = ["eval", "eval-joined", "-p", "prep.hr_references=6", "-p", "train-ss.rays=800000"];
+    let arguments =
+        ["eval", "eval-joined", "-p", "prep.hr_references=6", "-p", "train-ss.rays=800000"];
     project.ok(&[&["run"], &arguments[..]].concat());
     let psnr = |stage: &str| {
         let metrics = project.json(stage, "metrics.json", &arguments);
         metrics["mean"]["psnr"].as_f64().unwrap()
     };
-    println!("{:.2} dB from LR images, {:.2} dB with six of twelve at HR", psnr("eval"), psnr("eval-joined"));
+    println!(
+        "{:.2} dB from LR images, {:.2} dB with six of twelve at HR",
+        psnr("eval"),
+        psnr("eval-joined")
+    );
     assert!(psnr("eval-joined") > psnr("eval") + 0.3);
-    // Half as many rays do, where the training goes on from what LR images gave and both fields, or their weights' mean, are
-    // kept. Few rays, or one reference alone, lose nothing of that.
+    // Half as many rays do, where the training goes on from what LR images gave and both fields, or
+    // their weights' mean, are kept. Few rays, or one reference alone, lose nothing of that.
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
         let on = |rays: &str, references: &str| {
             let given = [("rays", rays), ("max_references", references), ("combine", combine)]
                 .map(|(name, value)| format!("finetuned-field.{name}={value}"));
-            let more =
-                ["-p", "prep.hr_references=6", "-p", "train-ss.rays=800000", "-p", &given[0], "-p", &given[1], "-p", &given[2]];
+            let more = [
+                "-p",
+                "prep.hr_references=6",
+                "-p",
+                "train-ss.rays=800000",
+                "-p",
+                &given[0],
+                "-p",
+                &given[1],
+                "-p",
+                &given[2],
+            ];
             let arguments = [&["eval-finetuned"], &more[..]].concat();
             project.ok(&[&["run"], &arguments[..]].concat());
-            let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"].as_f64().unwrap();
+            let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"]
+                .as_f64()
+                .unwrap();
             println!("{on:.2} dB, {given:?}");
             let field = project.artifact("finetuned-field", &arguments);
-            let weights = |field: &Path, member: u32| std::fs::read(field.join(format!("field-{member}.safetensors"))).ok();
+            let weights = |field: &Path, member: u32| {
+                std::fs::read(field.join(format!("field-{member}.safetensors"))).ok()
+            };
             assert_eq!(weights(&field, 1).is_some(), combine == "ensemble");
-            assert_eq!(weights(&field, 0) == weights(&first, 0), combine == "ensemble", "the initial field is the first member");
+            assert_eq!(
+                weights(&field, 0) == weights(&first, 0),
+                combine == "ensemble",
+                "the initial field is the first member"
+            );
             on
         };
         assert!(on("100000", "6") > psnr("eval") + 0.2);
@@ -372,7 +498,9 @@ fn references_join_a_training() {
     // None of them, and all is as without.
     let none = [&arguments[..], &["-p", "joined-field.max_references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
-    let weights = |stage: &str| std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap();
+    let weights = |stage: &str| {
+        std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap()
+    };
     assert!(weights("joined-field") == weights("train-ss"));
 }
 
@@ -385,7 +513,14 @@ fn other_fields_are_not_gone_on_from() {
     let (scene, field) = (folder("prep").join("train"), folder("train-ss"));
     let file = std::fs::read_to_string(field.join("field.json")).unwrap();
     let fails = |parameters: &str, field: &Path, words: &[&str]| {
-        stage("train-ss", parameters, &[("scene", scene.as_path()), ("init", field)], &project.path("no"), &[]).fails(3, words);
+        stage(
+            "train-ss",
+            parameters,
+            &[("scene", scene.as_path()), ("init", field)],
+            &project.path("no"),
+            &[],
+        )
+        .fails(3, words);
         assert!(!project.path("no").exists());
     };
     fails("{}", &field, &["input init: it is made of something else than the parameters ask for"]);
@@ -394,17 +529,36 @@ fn other_fields_are_not_gone_on_from() {
         std::fs::write(field.join("field.json"), file).unwrap();
         field
     };
-    let own =
-        r#"{"rays": 8000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
-    fails(own, &with("black", &file.replace("\"white\"", "\"black\"")), &["input init: it has another background"]);
-    fails(own, &with("far", &file.replace("\"far\": ", "\"far\": 1")), &["input init: it lies elsewhere"]);
+    let own = r#"{"rays": 8000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
+    fails(
+        own,
+        &with("black", &file.replace("\"white\"", "\"black\"")),
+        &["input init: it has another background"],
+    );
+    fails(
+        own,
+        &with("far", &file.replace("\"far\": ", "\"far\": 1")),
+        &["input init: it lies elsewhere"],
+    );
     let cut = with("cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
     fails(own, &cut, &["input init", "field-0.safetensors"]);
     // Nor can more than sixteen be kept.
     let many = own.replace('{', r#"{"ensemble": 16, "#);
-    stage("train-ss", &many, &[("scene", scene.as_path()), ("init", field.as_path())], &project.path("no"), &[])
-        .fails(2, &["parameter ensemble: members = 17 is not in 1..=16 with those of input init", "combine to average_weights"]);
+    stage(
+        "train-ss",
+        &many,
+        &[("scene", scene.as_path()), ("init", field.as_path())],
+        &project.path("no"),
+        &[],
+    )
+    .fails(
+        2,
+        &[
+            "parameter ensemble: members = 17 is not in 1..=16 with those of input init",
+            "combine to average_weights",
+        ],
+    );
 }
 
 /// Rendered downscaled views and their truth, and parameters of a training of a few seconds.
@@ -422,55 +576,87 @@ fn training(project: &Project) -> (std::path::PathBuf, std::path::PathBuf, &'sta
 fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() {
     let project = project();
     let (views, truth, params) = training(&project);
-    // With references: which of them what views are shown with now isn't in the checkpoint, and must be found again.
+    // With references: which of them what views are shown with now isn't in the checkpoint, and
+    // must be found again.
     let params = &params.replace('{', r#"{"references_per_view": 1, "#);
     let inputs = [("views", views.as_path()), ("truth", truth.as_path())];
-    let (whole, output, work) = (project.path("whole"), project.path("killed"), project.path("work"));
+    let (whole, output, work) =
+        (project.path("whole"), project.path("killed"), project.path("work"));
     assert_eq!(stage("train-refine", params, &inputs, &whole, &["--threads", "1"]).code, 0);
     let more = ["--work", work.to_str().unwrap()];
     let checkpoint = work.join("checkpoint.safetensors");
-    let resumed = kill_again_and_again("train-refine", params, &inputs, &output, &work, &[100, 100, 300, 700]);
+    let resumed = kill_again_and_again(
+        "train-refine",
+        params,
+        &inputs,
+        &output,
+        &work,
+        &[100, 100, 300, 700],
+    );
     assert!(resumed > 0, "no kill came after a checkpoint; lengthen the training");
     if !output.exists() {
         // A checkpoint cut short is said and left out, not trusted.
         let bytes = std::fs::read(&checkpoint).unwrap();
         std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-        let last = Finished::of(stage_command("train-refine", params, &inputs, &output, &more).output().unwrap());
+        let last = Finished::of(
+            stage_command("train-refine", params, &inputs, &output, &more).output().unwrap(),
+        );
         assert_eq!(last.code, 0, "{}", last.stderr);
     }
     assert_eq!(manifest(&output), manifest(&whole));
 }
 
-/// Views that were rendered or refined before a kill aren't made again, unless they are damaged or something else was asked for.
+/// Views that were rendered or refined before a kill aren't made again, unless they are damaged or
+/// something else was asked for.
 #[test]
 fn views_that_were_finished_are_kept() {
     let project = project();
     project.ok(&["run", "refine-reference", "-p", "prep.hr_references=2"]);
-    let folder = |stage: &str| project.artifact(stage, &["refine-reference", "-p", "prep.hr_references=2"]);
+    let folder =
+        |stage: &str| project.artifact(stage, &["refine-reference", "-p", "prep.hr_references=2"]);
     let (prep, field, rendered) = (folder("prep"), folder("train-ss"), folder("reference-views"));
-    let (cameras, references, refiner) = (prep.join("train"), prep.join("references"), folder("train-reference"));
+    let (cameras, references, refiner) =
+        (prep.join("train"), prep.join("references"), folder("train-reference"));
     let views = project.path("render-depth-whole");
     let render = [("field", field.as_path()), ("cameras", &cameras)];
-    let refine = [("views", views.as_path()), ("refiner", &refiner), ("references", &references), ("reference-views", &rendered)];
+    let refine = [
+        ("views", views.as_path()),
+        ("refiner", &refiner),
+        ("references", &references),
+        ("reference-views", &rendered),
+    ];
     let kept = |work: &Path| -> Vec<std::path::PathBuf> {
         let found = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
-        let manifests = found.filter(|f| f.file_name() == "artifact.json").map(|f| f.path().parent().unwrap().to_owned());
-        manifests.filter(|part| !part.file_name().unwrap().to_string_lossy().starts_with('.')).collect()
+        let manifests = found
+            .filter(|f| f.file_name() == "artifact.json")
+            .map(|f| f.path().parent().unwrap().to_owned());
+        manifests
+            .filter(|part| !part.file_name().unwrap().to_string_lossy().starts_with('.'))
+            .collect()
     };
     for (name, inputs, params, other) in [
         ("render-depth", &render[..], r#"{"size": 120}"#, r#"{"size": 40}"#),
         ("refine", &refine, r#"{"self_ensemble": 8}"#, r#"{"self_ensemble": 1}"#),
     ] {
-        let (work, output, whole) =
-            (project.path(&format!("{name}-work")), project.path(name), project.path(&format!("{name}-whole")));
+        let (work, output, whole) = (
+            project.path(&format!("{name}-work")),
+            project.path(name),
+            project.path(&format!("{name}-whole")),
+        );
         let more = ["--work", work.to_str().unwrap()];
         assert_eq!(stage(name, params, inputs, &whole, &[]).code, 0);
-        let mut child = stage_command(name, params, inputs, &output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        let mut child = stage_command(name, params, inputs, &output, &more)
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
         wait_until(|| !kept(&work).is_empty() || child.try_wait().unwrap().is_some());
         signal(&child, "-KILL");
         child.wait().unwrap();
         let written = |parts: &[std::path::PathBuf]| -> Vec<SystemTime> {
-            parts.iter().map(|part| part.join("artifact.json").metadata().unwrap().modified().unwrap()).collect()
+            parts
+                .iter()
+                .map(|part| part.join("artifact.json").metadata().unwrap().modified().unwrap())
+                .collect()
         };
         let again = |output: &str, params: &str| {
             let output = project.path(output);
@@ -486,8 +672,10 @@ fn views_that_were_finished_are_kept() {
         let parts = kept(&work);
         let times = written(&parts[3..]);
         assert_eq!(parts.len(), 12, "{parts:?}");
-        let image =
-            walkdir::WalkDir::new(&parts[0]).into_iter().flatten().find(|f| f.path().extension().is_some_and(|e| e == "exr"));
+        let image = walkdir::WalkDir::new(&parts[0])
+            .into_iter()
+            .flatten()
+            .find(|f| f.path().extension().is_some_and(|e| e == "exr"));
         let image = image.unwrap().path().to_owned();
         let mut bytes = std::fs::read(&image).unwrap();
         *bytes.last_mut().unwrap() ^= 1;
@@ -497,14 +685,19 @@ fn views_that_were_finished_are_kept() {
         std::fs::remove_dir_all(&parts[2]).unwrap();
         assert_eq!(again("mended", params), manifest(&whole), "{name}");
         assert!(kept(&work) == parts && written(&parts[3..]) == times, "{name}");
-        assert!(again("different", other) != manifest(&whole), "{name}: other parameters, other views");
+        assert!(
+            again("different", other) != manifest(&whole),
+            "{name}: other parameters, other views"
+        );
         // Of an input that nothing vouches for, nothing is kept.
         let bare = changed(&project, &format!("{name}-bare"), inputs[0].1, "none", &|_| ());
         let known = kept(&work);
         let others = [&[(inputs[0].0, bare.as_path())], &inputs[1..]].concat();
         assert_eq!(stage(name, params, &others, &output, &more).code, 0);
         assert!(kept(&work) == known && manifest(&output) == manifest(&whole), "{name}");
-        ["resumed", "mended", "different"].iter().for_each(|output| std::fs::remove_dir_all(project.path(output)).unwrap());
+        ["resumed", "mended", "different"]
+            .iter()
+            .for_each(|output| std::fs::remove_dir_all(project.path(output)).unwrap());
     }
 }
 
@@ -513,10 +706,17 @@ fn wrong_views_are_refused_in_a_line() {
     let project = project();
     let (views, truth, _) = training(&project);
     let train = |params: &str, views: &Path, truth: &Path| {
-        stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
+        stage(
+            "train-refine",
+            params,
+            &[("views", views), ("truth", truth)],
+            &project.path("no"),
+            &[],
+        )
     };
     train(r#"{"patch_size": 15}"#, &views, &truth).fails(2, &["parameter patch_size: 15 is odd"]);
-    train("{}", &views, &truth.with_file_name("downscaled")).fails(3, &["24×24 pixels where its image has 12×12"]);
+    train("{}", &views, &truth.with_file_name("downscaled"))
+        .fails(3, &["24×24 pixels where its image has 12×12"]);
     train("{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has an image, by name and pose, in input truth"]);
 }
@@ -532,7 +732,8 @@ fn the_paper_s_network_refines_by_references() {
     let summary = std::fs::read_to_string(folder("refine-paper").join("summary.txt")).unwrap();
     assert!(summary.contains("3 views by 1 reference"), "{summary}");
     let (views, refiner) = (folder("render-depth"), folder("train-paper"));
-    let file: serde_json::Value = serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
+    let file: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(refiner.join("refiner.json")).unwrap()).unwrap();
     assert_eq!(file["network"]["paper"]["width"], 4);
 
     // Without references, patches are given themselves.
@@ -547,7 +748,12 @@ fn the_paper_s_network_refines_by_references() {
         inputs.extend(weights.map(|folder| ("weights", folder)));
         stage("train-refine", params, &inputs, &output, &[]).fails(code, words);
     };
-    fails(r#"{"net": "paper", "steps": 1}"#, Some(&scene), 3, &["input weights", "vgg19.safetensors"]);
+    fails(
+        r#"{"net": "paper", "steps": 1}"#,
+        Some(&scene),
+        3,
+        &["input weights", "vgg19.safetensors"],
+    );
     fails(r#"{"net": "paper", "patch_size": 96}"#, None, 3, &["smaller than a patch of 96×96"]);
     fails(r#"{"net": "paper", "patch_size": 20}"#, None, 3, &["multiple of 8"]);
 }

@@ -1,5 +1,6 @@
-//! Tables of docs/results are made by experiments. A comment above each names its command; at small budgets that makes a table with these
-//! columns, and has all of these rows. `UPDATE=1` puts what the commands made in `out/` into the documents (`make results`).
+//! Tables of docs/results are made by experiments. A comment above each names its command; at small
+//! budgets that makes a table with these columns, and has all of these rows. `UPDATE=1` puts what
+//! the commands made in `out/` into the documents (`make results`).
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -10,7 +11,8 @@ use std::process::Command;
 use common::{Project, data, root};
 
 /// Columns that say what a row is of.
-const KEYS: [&str; 7] = ["protocol", "method", "supervision", "scene", "references", "has seen", "gain"];
+const KEYS: [&str; 7] =
+    ["protocol", "method", "supervision", "scene", "references", "has seen", "gain"];
 /// Protocols as they are named, on images of 48 pixels.
 const SMALL: &str = "  presets:
     100x2: {lr_width: 24, prep.scale: 2}
@@ -52,14 +54,16 @@ struct Marked {
 impl Marked {
     /// Where its command wrote it: `OUT/SINK/table.md`, the sink the first target.
     fn file(&self) -> PathBuf {
-        let out = self.command.iter().position(|word| word == "--out").expect("--out in the comment");
+        let out =
+            self.command.iter().position(|word| word == "--out").expect("--out in the comment");
         Path::new(&self.command[out + 1]).join(&self.command[1]).join("table.md")
     }
 
     /// The command without `--out` and its folder.
     fn words(&self) -> Vec<&str> {
         let out = self.command.iter().position(|word| word == "--out").unwrap();
-        let words = self.command.iter().enumerate().filter(|(place, _)| *place != out && *place != out + 1);
+        let words =
+            self.command.iter().enumerate().filter(|(place, _)| *place != out && *place != out + 1);
         words.map(|(_, word)| word.as_str()).collect()
     }
 }
@@ -72,15 +76,21 @@ fn cells(line: &str) -> Vec<String> {
 /// The tables of a text: the line before, and their lines.
 fn tables(text: &str) -> Vec<(&str, Vec<&str>)> {
     let lines: Vec<&str> = text.lines().collect();
-    let is_first = |&place: &usize| lines[place].starts_with('|') && (place == 0 || !lines[place - 1].starts_with('|'));
+    let is_first = |&place: &usize| {
+        lines[place].starts_with('|') && (place == 0 || !lines[place - 1].starts_with('|'))
+    };
     let firsts = (0..lines.len()).filter(is_first);
-    let table = |place: usize| lines[place..].iter().take_while(|line| line.starts_with('|')).copied().collect();
+    let table = |place: usize| {
+        lines[place..].iter().take_while(|line| line.starts_with('|')).copied().collect()
+    };
     firsts.map(|place| (if place == 0 { "" } else { lines[place - 1] }, table(place))).collect()
 }
 
 /// The marked tables of a document.
 fn marked(text: &str) -> Vec<Marked> {
-    let command = |comment: &str| Some(comment.strip_prefix("<!-- nerf-sr ")?.strip_suffix(" -->")?.to_owned());
+    let command = |comment: &str| {
+        Some(comment.strip_prefix("<!-- nerf-sr ")?.strip_suffix(" -->")?.to_owned())
+    };
     let found = tables(text).into_iter().filter_map(|(before, lines)| {
         Some(Marked {
             command: command(before)?.split_whitespace().map(str::to_owned).collect(),
@@ -92,15 +102,21 @@ fn marked(text: &str) -> Vec<Marked> {
 }
 
 fn documents() -> Vec<PathBuf> {
-    let entries = std::fs::read_dir(root().join("docs/results")).unwrap().map(|entry| entry.unwrap().path());
-    let mut documents: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|end| end == "md")).collect();
+    let entries =
+        std::fs::read_dir(root().join("docs/results")).unwrap().map(|entry| entry.unwrap().path());
+    let mut documents: Vec<PathBuf> =
+        entries.filter(|path| path.extension().is_some_and(|end| end == "md")).collect();
     documents.sort();
     documents
 }
 
 /// The cells of a row that say what it is of.
 fn keys(head: &[String], row: &[String]) -> Vec<String> {
-    head.iter().zip(row).filter(|(name, _)| KEYS.contains(&name.as_str())).map(|(_, cell)| cell.clone()).collect()
+    head.iter()
+        .zip(row)
+        .filter(|(name, _)| KEYS.contains(&name.as_str()))
+        .map(|(_, cell)| cell.clone())
+        .collect()
 }
 
 /// The project's scene under the names of those in the documents.
@@ -129,17 +145,23 @@ fn project() -> Option<Project> {
 
 #[test]
 fn experiments_make_these_tables() {
-    let all: Vec<Marked> = documents().iter().flat_map(|path| marked(&std::fs::read_to_string(path).unwrap())).collect();
+    let all: Vec<Marked> = documents()
+        .iter()
+        .flat_map(|path| marked(&std::fs::read_to_string(path).unwrap()))
+        .collect();
     assert!(all.len() >= 8, "{} tables", all.len());
     let Some(project) = project() else { return };
     let budgets: Vec<&str> = BUDGETS.into_iter().flat_map(|word| ["-p", word]).collect();
     for table in &all {
         let words = table.words();
         project.ok(&[&words[..], &["--data", "data", "--out", "made"], &budgets].concat());
-        let made = std::fs::read_to_string(project.path("made").join(words[1]).join("table.md")).unwrap();
+        let made =
+            std::fs::read_to_string(project.path("made").join(words[1]).join("table.md")).unwrap();
         let of_head = tables(&made).into_iter().find(|(_, lines)| cells(lines[0]) == table.head);
-        let (_, lines) = of_head.unwrap_or_else(|| panic!("{words:?}: no table with {:?} in\n{made}", table.head));
-        let made: Vec<Vec<String>> = lines[2..].iter().map(|line| keys(&table.head, &cells(line))).collect();
+        let (_, lines) = of_head
+            .unwrap_or_else(|| panic!("{words:?}: no table with {:?} in\n{made}", table.head));
+        let made: Vec<Vec<String>> =
+            lines[2..].iter().map(|line| keys(&table.head, &cells(line))).collect();
         for row in &table.rows {
             let wanted = keys(&table.head, row);
             assert!(made.contains(&wanted), "{words:?}: no row {wanted:?} among {made:?}");
@@ -147,7 +169,8 @@ fn experiments_make_these_tables() {
     }
 }
 
-/// Puts the tables that the commands made at full budgets into the documents; those whose command hasn't run stay.
+/// Puts the tables that the commands made at full budgets into the documents; those whose command
+/// hasn't run stay.
 #[test]
 fn what_was_measured_is_put_into_the_documents() {
     if std::env::var_os("UPDATE").is_none() {
@@ -157,11 +180,21 @@ fn what_was_measured_is_put_into_the_documents() {
         let mut text = std::fs::read_to_string(&path).unwrap();
         for table in marked(&text.clone()) {
             let Ok(made) = std::fs::read_to_string(root().join(table.file())) else { continue };
-            let Some((_, lines)) = tables(&made).into_iter().find(|(_, lines)| cells(lines[0]) == table.head) else { continue };
+            let Some((_, lines)) =
+                tables(&made).into_iter().find(|(_, lines)| cells(lines[0]) == table.head)
+            else {
+                continue;
+            };
             let comment = format!("<!-- nerf-sr {} -->\n", table.command.join(" "));
-            let is_meant = |(before, lines): &(&str, Vec<&str>)| *before == comment.trim_end() && cells(lines[0]) == table.head;
+            let is_meant = |(before, lines): &(&str, Vec<&str>)| {
+                *before == comment.trim_end() && cells(lines[0]) == table.head
+            };
             let old = tables(&text).into_iter().find(is_meant).unwrap().1.join("\n");
-            text = text.replacen(&format!("{comment}{old}"), &format!("{comment}{}", lines.join("\n")), 1);
+            text = text.replacen(
+                &format!("{comment}{old}"),
+                &format!("{comment}{}", lines.join("\n")),
+                1,
+            );
             println!("{}: {}", path.display(), table.file().display());
         }
         std::fs::write(&path, text).unwrap();

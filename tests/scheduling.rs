@@ -6,7 +6,8 @@ mod common;
 use common::Project;
 use serde_json::Value;
 
-/// A stage that takes some memory for a while, keeps one core busy, and writes when it began and ended and how many threads it had.
+/// A stage that takes some memory for a while, keeps one core busy, and writes when it began and
+/// ended and how many threads it had.
 const HUNGRY: &str = r#"#!/usr/bin/env python3
 import json, os, sys, time
 if sys.argv[1:] == ["describe"]:
@@ -47,7 +48,9 @@ fn written(project: &Project, arguments: &[&str]) -> Vec<Value> {
 fn lie_apart(spans: &[Value]) -> bool {
     let time = |span: &Value, name: &str| span[name].as_f64().unwrap();
     spans.iter().enumerate().all(|(i, one)| {
-        spans[..i].iter().all(|other| time(one, "began") >= time(other, "ended") || time(other, "began") >= time(one, "ended"))
+        spans[..i].iter().all(|other| {
+            time(one, "began") >= time(other, "ended") || time(other, "began") >= time(one, "ended")
+        })
     })
 }
 
@@ -56,8 +59,10 @@ fn memory_and_processor_time_are_recorded() {
     let project = project(ALONE);
     project.ok(&["run"]);
     let status: Value = serde_json::from_str(&project.ok(&["status", "--json"])).unwrap();
-    let (memory, busy) =
-        (status["nodes"][0]["peak_memory"].as_f64().unwrap(), status["nodes"][0]["processor_seconds"].as_f64().unwrap());
+    let (memory, busy) = (
+        status["nodes"][0]["peak_memory"].as_f64().unwrap(),
+        status["nodes"][0]["processor_seconds"].as_f64().unwrap(),
+    );
     assert!((2.0e8..2.6e8).contains(&memory), "200 MB and the interpreter's: {memory}");
     // Beside other work a core isn't a stage's own for all of its time.
     assert!((0.05..2.0).contains(&busy), "{busy}");
@@ -70,10 +75,14 @@ fn memory_gives_places() {
     let refused = project.run(&["run", "-p", "x=1", "--memory", "100M"]);
     refused.fails(
         1,
-        &["hungry: failed: it took 2", "MB of memory when it last ran, and there are 104.9 MB; --memory says otherwise"],
+        &[
+            "hungry: failed: it took 2",
+            "MB of memory when it last ran, and there are 104.9 MB; --memory says otherwise",
+        ],
     );
     let sweep = ["-p", "x=1,2"];
-    let waited = project.run(&[&["run", "-j", "2", "--threads", "8", "--memory", "400M"][..], &sweep].concat());
+    let waited = project
+        .run(&[&["run", "-j", "2", "--threads", "8", "--memory", "400M"][..], &sweep].concat());
     assert_eq!(waited.code, 0, "{}", waited.stderr);
     let said = waited.stderr.lines().filter(|line| line.contains("hungry [x=2]: waits: it took 2"));
     assert_eq!(said.count(), 1, "{}", waited.stderr);
@@ -101,8 +110,10 @@ fn a_cached_stage_takes_no_place_and_one_left_alone_has_all_threads() {
 fn records_of_other_versions_are_read() {
     let project = project(ALONE);
     project.ok(&["run"]);
-    let action = std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap().map(|e| e.unwrap().path());
-    let file = action.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
+    let action =
+        std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap().map(|e| e.unwrap().path());
+    let file =
+        action.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
     let mut record: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     let fields = record.as_object_mut().unwrap();
     assert!(fields.remove("peak_memory").is_some() && fields.remove("processor_seconds").is_some());

@@ -1,4 +1,5 @@
-//! `schemas/` and `docs/reference/` are made from the types; this test keeps them current. `UPDATE=1 cargo test --test schemas` writes them anew.
+//! `schemas/` and `docs/reference/` are made from the types; this test keeps them current.
+//! `UPDATE=1 cargo test --test schemas` writes them anew.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -49,8 +50,13 @@ fn schemas() -> BTreeMap<String, Value> {
         ("results", of::<Vec<report::ResultRow>>()),
         ("degradation", of::<pixels::Degradation>()),
     ];
-    let parameters = descriptions().into_iter().map(|d| (format!("parameters/{}.json", d.name), d.parameters));
-    files.into_iter().map(|(name, schema)| (format!("{name}.json"), schema)).chain(parameters).collect()
+    let parameters =
+        descriptions().into_iter().map(|d| (format!("parameters/{}.json", d.name), d.parameters));
+    files
+        .into_iter()
+        .map(|(name, schema)| (format!("{name}.json"), schema))
+        .chain(parameters)
+        .collect()
 }
 
 /// Compares a folder with what it should hold, or writes it anew.
@@ -64,23 +70,34 @@ fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
             std::fs::write(&path, text).unwrap();
         } else {
             let found = std::fs::read_to_string(&path).unwrap_or_default();
-            assert!(found == *text, "{folder}/{name} is out of date: UPDATE=1 cargo test --test schemas");
+            assert!(
+                found == *text,
+                "{folder}/{name} is out of date: UPDATE=1 cargo test --test schemas"
+            );
         }
     }
-    let files = walkdir::WalkDir::new(&root).into_iter().filter(|e| e.as_ref().unwrap().file_type().is_file()).count();
+    let files = walkdir::WalkDir::new(&root)
+        .into_iter()
+        .filter(|e| e.as_ref().unwrap().file_type().is_file())
+        .count();
     assert_eq!(files, expected.len(), "{folder} has a file that nothing makes");
 }
 
 #[test]
 fn schemas_are_current() {
     let text = |schema: &Value| serde_json::to_string_pretty(schema).unwrap() + "\n";
-    check_folder("schemas", &schemas().iter().map(|(name, schema)| (name.clone(), text(schema))).collect());
+    check_folder(
+        "schemas",
+        &schemas().iter().map(|(name, schema)| (name.clone(), text(schema))).collect(),
+    );
 }
 
 #[test]
 fn reference_pages_are_current() {
-    let mut pages: BTreeMap<String, String> =
-        descriptions().iter().map(|d| (format!("{}.md", d.name), reference::stage_page(d))).collect();
+    let mut pages: BTreeMap<String, String> = descriptions()
+        .iter()
+        .map(|d| (format!("{}.md", d.name), reference::stage_page(d)))
+        .collect();
     pages.insert("files.md".to_owned(), reference::files_page(&schemas()));
     let project = common::Project::tiny();
     let help = |arguments: &[&str]| project.run(arguments).stdout;
@@ -88,7 +105,10 @@ fn reference_pages_are_current() {
     let list = |d: &Description| format!("* [{0}]({0}.md): {1}\n", d.name, d.summary);
     let stages: String = descriptions().iter().map(list).collect();
     let further = "\nBesides: [file formats](files.md), [command line](command-line.md).\n";
-    let index = reference::heading("Reference", "Inputs, output and parameters of every stage.") + "\n" + &stages + further;
+    let index = reference::heading("Reference", "Inputs, output and parameters of every stage.")
+        + "\n"
+        + &stages
+        + further;
     pages.insert("README.md".to_owned(), index);
     check_folder("docs/reference", &pages);
 }
@@ -96,17 +116,27 @@ fn reference_pages_are_current() {
 /// A stage's help names its page, and a parameter's group is one of those that there are.
 #[test]
 fn help_leads_to_the_reference() {
-    for description in descriptions().iter().filter(|d| d.documented().iter().any(|section| !section.parameters.is_empty())) {
-        let help = std::process::Command::new(common::bin(&description.name)).arg("--help").output().unwrap();
+    for description in descriptions()
+        .iter()
+        .filter(|d| d.documented().iter().any(|section| !section.parameters.is_empty()))
+    {
+        let help = std::process::Command::new(common::bin(&description.name))
+            .arg("--help")
+            .output()
+            .unwrap();
         let help = String::from_utf8(help.stdout).unwrap();
         let page = format!("docs/reference/{}.md", description.name);
         assert!(help.contains(&page) && common::root().join(&page).exists(), "{page}");
         assert!(!help.contains("null"), "{help}");
         for parameter in description.documented().iter().flat_map(|section| &section.parameters) {
-            let known = parameter.group.is_empty() || artifact::GROUPS.contains(&parameter.group.as_str());
+            let known =
+                parameter.group.is_empty() || artifact::GROUPS.contains(&parameter.group.as_str());
             assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
             let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
-            assert!(parameter.text.ends_with('.') && (parameter.default != "none" || is_choice), "{parameter:?}");
+            assert!(
+                parameter.text.ends_with('.') && (parameter.default != "none" || is_choice),
+                "{parameter:?}"
+            );
         }
     }
 }
@@ -116,7 +146,8 @@ fn help_leads_to_the_reference() {
 fn parameters_have_one_meaning() {
     for description in descriptions() {
         let sections = description.documented();
-        let (common, variants): (Vec<_>, Vec<_>) = sections.iter().partition(|section| section.variant.is_none());
+        let (common, variants): (Vec<_>, Vec<_>) =
+            sections.iter().partition(|section| section.variant.is_none());
         for variant in &variants {
             let all = common.iter().chain([variant]).flat_map(|section| &section.parameters);
             let mut names: Vec<&str> = all.map(|parameter| parameter.name.as_str()).collect();
@@ -150,18 +181,28 @@ fn artifacts_fit_their_schemas() {
     project.ok(&["run"]);
     let folder = common::root().join("schemas");
     let check = |schema: &str, file: &Path| {
-        let read = |path: &Path| -> serde_json::Value { serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap() };
+        let read = |path: &Path| -> serde_json::Value {
+            serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+        };
         let validator = jsonschema::validator_for(&read(&folder.join(schema))).unwrap();
-        let errors: Vec<String> = validator.iter_errors(&read(file)).map(|e| e.to_string()).collect();
+        let errors: Vec<String> =
+            validator.iter_errors(&read(file)).map(|e| e.to_string()).collect();
         assert!(errors.is_empty(), "{}: {errors:?}", file.display());
     };
     let object = |stage: &str| project.artifact(stage, &[]);
-    let (scene, field, views, metrics) = (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
+    let (scene, field, views, metrics) =
+        (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
     for folder in [&scene, &field, &views, &metrics] {
         check("artifact.json", &folder.join("artifact.json"));
     }
     check("scene.json", &scene.join("scene.json"));
-    for views in [scene.join("train"), scene.join("truth"), scene.join("cameras"), scene.join("references"), views] {
+    for views in [
+        scene.join("train"),
+        scene.join("truth"),
+        scene.join("cameras"),
+        scene.join("references"),
+        views,
+    ] {
         check("views.json", &views.join("views.json"));
     }
     check("field.json", &field.join("field.json"));

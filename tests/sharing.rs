@@ -24,8 +24,10 @@ fn eight_runners_make_each_stage_once() {
     for _ in 0..rounds {
         let project = Project::fast();
         let outs = ["a", "b", "c", "d", "shared", "shared", "shared", "shared"];
-        let runners: Vec<Child> = outs.iter().map(|out| project.spawn(&["run", "--out", out])).collect();
-        let finished: Vec<Finished> = runners.into_iter().map(|r| Finished::of(r.wait_with_output().unwrap())).collect();
+        let runners: Vec<Child> =
+            outs.iter().map(|out| project.spawn(&["run", "--out", out])).collect();
+        let finished: Vec<Finished> =
+            runners.into_iter().map(|r| Finished::of(r.wait_with_output().unwrap())).collect();
         for one in &finished {
             assert_eq!(one.code, 0, "{}{}", one.stdout, one.stderr);
         }
@@ -33,7 +35,11 @@ fn eight_runners_make_each_stage_once() {
         assert_eq!(done, 5, "five stages in all");
         for out in outs {
             assert!(is_whole(&project.path(out).join("report")), "{out}");
-            assert_eq!(std::fs::read_dir(project.path(out)).unwrap().count(), 1, "nothing is left beside {out}'s page");
+            assert_eq!(
+                std::fs::read_dir(project.path(out)).unwrap().count(),
+                1,
+                "nothing is left beside {out}'s page"
+            );
         }
         assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
     }
@@ -42,7 +48,10 @@ fn eight_runners_make_each_stage_once() {
 /// Lines of a runner's stderr until one has these words.
 fn said(child: &mut Child, words: &str) -> String {
     let lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
-    lines.into_iter().find(|line| line.contains(words)).unwrap_or_else(|| panic!("never said {words:?}"))
+    lines
+        .into_iter()
+        .find(|line| line.contains(words))
+        .unwrap_or_else(|| panic!("never said {words:?}"))
 }
 
 /// A training that is at work on its checkpoints.
@@ -62,7 +71,10 @@ fn a_runner_that_waits_says_for_whom_and_ends_at_a_signal() {
         }
         let mut second = project.spawn(&[&["run"][..], &ENDLESS].concat());
         let line = said(&mut second, "is being made");
-        assert!(line.contains(&format!("train-ss: is being made by process {}", first.id())), "{line}");
+        assert!(
+            line.contains(&format!("train-ss: is being made by process {}", first.id())),
+            "{line}"
+        );
         signal(&second, name);
         assert_eq!(second.wait().unwrap().code(), Some(130), "{name}");
         signal(&first, "-CONT");
@@ -75,12 +87,24 @@ fn a_runner_that_waits_says_for_whom_and_ends_at_a_signal() {
 fn garbage_collection_keeps_what_a_run_in_progress_needs() {
     let project = Project::fast();
     let first = training(&project);
-    let partial = std::fs::read_dir(project.path(".nerf-sr/partial")).unwrap().next().unwrap().unwrap().path();
+    let partial = std::fs::read_dir(project.path(".nerf-sr/partial"))
+        .unwrap()
+        .next()
+        .unwrap()
+        .unwrap()
+        .path();
     // However long ago it began.
     Command::new("touch").args(["-d", "9 days ago"]).arg(&partial).status().unwrap();
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0", "--drop-unfinished"]);
-    for (stage, reason) in [("prep", "is running it"), ("demo-scene", "the pipeline needs it"), ("train-ss", "is running it")] {
-        assert!(said.lines().any(|line| line.contains(stage) && line.contains(reason)), "{stage}: {said}");
+    for (stage, reason) in [
+        ("prep", "is running it"),
+        ("demo-scene", "the pipeline needs it"),
+        ("train-ss", "is running it"),
+    ] {
+        assert!(
+            said.lines().any(|line| line.contains(stage) && line.contains(reason)),
+            "{stage}: {said}"
+        );
     }
     assert!(partial.join("work").is_dir(), "{said}");
     let before = last_checkpoint(&project.path(".nerf-sr/partial"));
@@ -88,12 +112,20 @@ fn garbage_collection_keeps_what_a_run_in_progress_needs() {
     signal(&first, "-INT");
     let finished = Finished::of(first.wait_with_output().unwrap());
     assert_eq!(finished.code, 130, "{}", finished.stderr);
-    // Stopped, it is an unfinished action with a checkpoint: it and what it is made of stay until one says otherwise.
+    // Stopped, it is an unfinished action with a checkpoint: it and what it is made of stay until
+    // one says otherwise.
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0"]);
     assert!(partial.join("work").is_dir() && said.contains("has a checkpoint"), "{said}");
-    assert!(said.lines().any(|line| line.contains("prep") && line.contains("train-ss was made of it")), "{said}");
+    assert!(
+        said.lines().any(|line| line.contains("prep") && line.contains("train-ss was made of it")),
+        "{said}"
+    );
     let said = project.ok(&["gc", "demo-scene", "--keep-days", "0", "--drop-unfinished"]);
-    assert!(!partial.exists() && said.lines().any(|line| line.contains("prep") && line.ends_with("goes")), "{said}");
+    assert!(
+        !partial.exists()
+            && said.lines().any(|line| line.contains("prep") && line.ends_with("goes")),
+        "{said}"
+    );
 }
 
 /// What `plan` promises to find again isn't collected, though its key isn't known.
@@ -166,7 +198,9 @@ fn somebody_elses_folder_is_not_replaced() {
     project.ok(&["run"]);
     project.write("out/report/notes.txt", "precious");
     assert!(project.ok(&["run"]).contains("up to date"));
-    project.run(&["run", "-p", "render-depth.samples_per_axis=2"]).fails(1, &["out/report/notes.txt", "is not nerf-sr's"]);
+    project
+        .run(&["run", "-p", "render-depth.samples_per_axis=2"])
+        .fails(1, &["out/report/notes.txt", "is not nerf-sr's"]);
     assert!(is_whole(&project.path("out/report")));
     std::fs::remove_file(project.path("out/report/notes.txt")).unwrap();
     project.ok(&["run", "-p", "render-depth.samples_per_axis=2"]);
@@ -178,7 +212,8 @@ fn a_full_disk_leaves_the_old_page() {
     let project = Project::fast();
     let out = project.path("out");
     std::fs::create_dir(&out).unwrap();
-    let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=200k", "tmpfs"]).arg(&out).output();
+    let mounted =
+        Command::new("mount").args(["-t", "tmpfs", "-o", "size=200k", "tmpfs"]).arg(&out).output();
     if !mounted.is_ok_and(|m| m.status.success()) {
         eprintln!("skipped: a tmpfs can't be mounted here (it needs root)");
         return;
@@ -203,13 +238,24 @@ fn any_file_name_may_lie_in_a_data_folder() {
     let project = Project::fast();
     project.demo_data("demo");
     let data = project.path("ds");
-    assert!(Command::new("cp").arg("-rL").args([project.path("data/demo"), data.clone()]).status().unwrap().success());
+    assert!(
+        Command::new("cp")
+            .arg("-rL")
+            .args([project.path("data/demo"), data.clone()])
+            .status()
+            .unwrap()
+            .success()
+    );
     std::fs::remove_file(data.join("artifact.json")).unwrap();
     let from = ["-i", "dataset=ds"];
     project.ok(&[&["run", "prep"][..], &from].concat());
     let scene = project.output_of("prep", &from);
     for name in [&b"\xff\xfe.png"[..], b"\x1b]0;PWN\x07", b"new\nline"] {
-        std::fs::copy(data.join("train/r_2.png"), data.join("train").join(std::ffi::OsStr::from_bytes(name))).unwrap();
+        std::fs::copy(
+            data.join("train/r_2.png"),
+            data.join("train").join(std::ffi::OsStr::from_bytes(name)),
+        )
+        .unwrap();
         assert!(project.ok(&[&["plan", "prep"][..], &from].concat()).contains("prep"));
         project.ok(&[&["run", "prep"][..], &from].concat());
         assert_eq!(project.output_of("prep", &from), scene);
@@ -226,7 +272,8 @@ fn any_file_name_may_lie_in_a_data_folder() {
 
 /// All files of the store, by path and size.
 fn files(project: &Project) -> Vec<(String, u64)> {
-    let entries = walkdir::WalkDir::new(project.path(".nerf-sr")).sort_by_file_name().into_iter().flatten();
+    let entries =
+        walkdir::WalkDir::new(project.path(".nerf-sr")).sort_by_file_name().into_iter().flatten();
     let files = entries.filter(|entry| entry.file_type().is_file());
     files.map(|file| (file.path().display().to_string(), file.metadata().unwrap().len())).collect()
 }
@@ -255,7 +302,8 @@ fn a_store_of_a_newer_form_is_refused() {
     assert_eq!(files(&project), before, "nothing is written");
 }
 
-/// A newer runner takes the store over while this one trains: what this one made is not taken in, and nothing of the store changes.
+/// A newer runner takes the store over while this one trains: what this one made is not taken in,
+/// and nothing of the store changes.
 #[test]
 fn a_runner_takes_nothing_into_a_store_that_has_become_newer() {
     let project = Project::fast();
@@ -265,7 +313,8 @@ fn a_runner_takes_nothing_into_a_store_that_has_become_newer() {
     wait_until(|| last_checkpoint(&project.path(".nerf-sr/partial")).is_some());
     project.write(".nerf-sr/format", "2\n");
     let before = project.store_listing();
-    Finished::of(child.wait_with_output().unwrap()).fails(1, &["train-ss: failed", "format 2", "use the newer nerf-sr"]);
+    Finished::of(child.wait_with_output().unwrap())
+        .fails(1, &["train-ss: failed", "format 2", "use the newer nerf-sr"]);
     assert_eq!(project.store_listing(), before);
     // The older one again, once it is alone: what it had made is there to go on from.
     project.write(".nerf-sr/format", "1\n");

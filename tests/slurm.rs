@@ -13,9 +13,9 @@ use std::time::{Duration, Instant};
 use common::{Finished, Project, root, wait_until};
 use counter_rng::CounterRng;
 
-/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a checkpoint when it is asked to end, or where it
-/// `keeps` them at every step. While a file
-/// is there that `hold` names, it waits at the step that stands in it.
+/// A stage in plain Python. It goes so many steps, each from the one before, and leaves a
+/// checkpoint when it is asked to end, or where it `keeps` them at every step. While a file is
+/// there that `hold` names, it waits at the step that stands in it.
 const STEP: &str = r#"#!/usr/bin/env python3
 import hashlib, json, os, pathlib, signal, sys, time
 here = pathlib.Path(__file__).parent
@@ -96,7 +96,8 @@ fn project(pipeline: &str) -> Project {
 fn free_ports() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
     let first = (std::process::id() % 600) as u16 * 20;
-    let ports = std::iter::repeat_with(|| 20_000 + (first + NEXT.fetch_add(2, Ordering::Relaxed)) % 12_000);
+    let ports =
+        std::iter::repeat_with(|| 20_000 + (first + NEXT.fetch_add(2, Ordering::Relaxed)) % 12_000);
     let is_free = |port: u16| TcpListener::bind(("127.0.0.1", port)).is_ok();
     ports.take(6_000).find(|&port| is_free(port) && is_free(port + 1)).expect("two free ports")
 }
@@ -111,18 +112,28 @@ impl Cluster {
     fn start() -> Option<Self> {
         let path = std::env::var("PATH").unwrap_or_default() + ":/usr/sbin";
         let has = |name: &str| path.split(':').any(|folder| Path::new(folder).join(name).exists());
-        if let Some(missing) = ["slurmctld", "slurmd", "munged"].into_iter().find(|name| !has(name)) {
+        if let Some(missing) = ["slurmctld", "slurmd", "munged"].into_iter().find(|name| !has(name))
+        {
             eprintln!("skipped: no {missing}");
             return None;
         }
         // Socket paths are short: not in a test's own deep folder.
         // Somebody else may take a port between the look and the start.
         let start = || {
-            let cluster = Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
+            let cluster =
+                Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
             let mut script = cluster.script("start");
-            script.env("MINI_SLURM_PORT", free_ports().to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
+            script
+                .env("MINI_SLURM_PORT", free_ports().to_string())
+                .env("MINI_SLURM_FAKE_GPUS", "2");
             // The daemons would hold a pipe open, and write into the lines of tests.
-            script.stdout(Stdio::null()).stderr(Stdio::null()).status().unwrap().success().then_some(cluster)
+            script
+                .stdout(Stdio::null())
+                .stderr(Stdio::null())
+                .status()
+                .unwrap()
+                .success()
+                .then_some(cluster)
         };
         let cluster = (0..3).find_map(|_| start());
         assert!(cluster.is_some(), "the cluster doesn't start");
@@ -170,13 +181,24 @@ impl Cluster {
     #[track_caller]
     fn drain(&self) {
         wait_until(|| self.slurm("squeue", &["-h"]).is_empty());
-        assert_eq!(self.slurm("squeue", &["-h"]), "", "{}", self.slurm("scontrol", &["show", "job"]));
+        assert_eq!(
+            self.slurm("squeue", &["-h"]),
+            "",
+            "{}",
+            self.slurm("scontrol", &["show", "job"])
+        );
     }
 
     /// Slurm's word on a job: `COMPLETED 0:0`.
     fn state(&self, job: &str) -> String {
         let shown = self.slurm("scontrol", &["-o", "show", "job", job]);
-        let of = |key: &str| shown.split_whitespace().find_map(|word| word.strip_prefix(key)).unwrap_or_default().to_owned();
+        let of = |key: &str| {
+            shown
+                .split_whitespace()
+                .find_map(|word| word.strip_prefix(key))
+                .unwrap_or_default()
+                .to_owned()
+        };
         format!("{} {}", of("JobState="), of("ExitCode="))
     }
 }
@@ -195,17 +217,27 @@ fn with_environment(mut command: Command, name: &str, value: &Path) -> Command {
 /// The runner with the Slurm executor, and no settings of whoever runs the tests.
 fn command(project: &Project, arguments: &[&str]) -> Command {
     let mut command = project.command(arguments);
-    command.env("NERF_SR_EXECUTOR", "slurm").env_remove("NERF_SR_SITE").env("HOME", project.path("."));
+    command
+        .env("NERF_SR_EXECUTOR", "slurm")
+        .env_remove("NERF_SR_SITE")
+        .env("HOME", project.path("."));
     command
 }
 
 fn jobs(said: &str) -> BTreeMap<String, String> {
-    said.lines().filter_map(|line| line.rsplit_once(": job ")).map(|(label, id)| (label.to_owned(), id.to_owned())).collect()
+    said.lines()
+        .filter_map(|line| line.rsplit_once(": job "))
+        .map(|(label, id)| (label.to_owned(), id.to_owned()))
+        .collect()
 }
 
 /// How often stages ran.
 fn ran(project: &Project) -> Vec<String> {
-    std::fs::read_to_string(project.path("ran")).unwrap_or_default().lines().map(str::to_owned).collect()
+    std::fs::read_to_string(project.path("ran"))
+        .unwrap_or_default()
+        .lines()
+        .map(str::to_owned)
+        .collect()
 }
 
 /// The objects that a stage's nodes have now.
@@ -224,7 +256,8 @@ fn a_sweep_submitted_twice_at_once_runs_once_and_ends_as_locally() {
         command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     });
     let started = Instant::now();
-    let said: Vec<Finished> = both.into_iter().map(|child| Finished::of(child.wait_with_output().unwrap())).collect();
+    let said: Vec<Finished> =
+        both.into_iter().map(|child| Finished::of(child.wait_with_output().unwrap())).collect();
     for one in &said {
         assert_eq!(one.code, 0, "{}{}", one.stdout, one.stderr);
     }
@@ -239,10 +272,14 @@ fn a_sweep_submitted_twice_at_once_runs_once_and_ends_as_locally() {
     for stage in ["prep", "train", "eval"] {
         assert_eq!(outputs(&shared, stage, &SIX), outputs(&local, stage, &SIX), "{stage}");
     }
-    let page = |project: &Project| std::fs::read_to_string(project.path("out/page/index.html")).unwrap();
+    let page =
+        |project: &Project| std::fs::read_to_string(project.path("out/page/index.html")).unwrap();
     assert_eq!(page(&shared), page(&local));
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
-    assert!(cluster.ok(&shared, &[&["run"][..], &SIX].concat()).contains("nothing to run"), "and a page that is there");
+    assert!(
+        cluster.ok(&shared, &[&["run"][..], &SIX].concat()).contains("nothing to run"),
+        "and a page that is there"
+    );
     // `cpus` leads to as many threads.
     assert!(ran(&shared)[0].ends_with(" cpu 2"), "{:?}", ran(&shared));
 }
@@ -264,7 +301,12 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
         assert_eq!(cluster.state(&jobs[label]), state, "{label}");
     }
     let log = cluster.ok(&project, &[&["log", "train"][..], &arguments].concat());
-    assert!(log.contains("failed after") && log.contains("slurm/") && log.contains("ended with exit code 7"), "{log}");
+    assert!(
+        log.contains("failed after")
+            && log.contains("slurm/")
+            && log.contains("ended with exit code 7"),
+        "{log}"
+    );
     // Once more: what failed, and what needs it.
     let again = cluster.submit(&project, &arguments);
     assert_eq!(again.keys().collect::<Vec<_>>(), ["eval [fails=7]", "train [fails=7]"]);
@@ -275,11 +317,14 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
     assert_eq!(jobs.len(), 3);
     cluster.drain();
     assert_eq!(cluster.state(&jobs["eval"]), "COMPLETED 0:0");
-    assert!(cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: is cached"));
+    assert!(
+        cluster.ok(&project, &[&["log", "eval"][..], &hit].concat()).contains("eval: is cached")
+    );
     assert_eq!(ran(&project).len(), 6, "{:?}", ran(&project));
 }
 
-const ONE: &str = "default: [last]\nstages:\n  first: {run: ./step}\n  last: {run: ./step, inputs: {a: first}}\n";
+const ONE: &str =
+    "default: [last]\nstages:\n  first: {run: ./step}\n  last: {run: ./step, inputs: {a: first}}\n";
 
 #[test]
 fn an_outstanding_submission_is_seen_kept_and_cancelled() {
@@ -293,16 +338,28 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     let held = ["-p", "first.seed=5", "-p", "last.hold=hold"];
     let jobs = cluster.submit(&project, &held);
     assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "what is cached is not submitted");
-    let running = || cluster.ok(&project, &[&["status"][..], &held].concat()).contains(&format!("job {} running", jobs["last"]));
+    let running = || {
+        cluster
+            .ok(&project, &[&["status"][..], &held].concat())
+            .contains(&format!("job {} running", jobs["last"]))
+    };
     wait_until(running);
     assert!(running());
     let second = cluster.ok(&project, &[&["run"][..], &held].concat());
     assert!(second.contains("0 jobs submitted, 1 queued before"), "{second}");
     // What the job needs stays, though the plan without arguments doesn't name it.
     let said = cluster.ok(&project, &["gc", "other", "--keep-days", "0", "--drop-unfinished"]);
-    assert!(said.lines().any(|line| line.contains("first") && line.contains("a submitted job needs it")), "{said}");
-    // Edits meanwhile change nothing of what was submitted; a job that waits for the held one is queued with it.
-    let more = cluster.submit(&project, &[&["other"][..], &["-p", "other.hold=hold", "-p", "other.seed=1"]].concat());
+    assert!(
+        said.lines()
+            .any(|line| line.contains("first") && line.contains("a submitted job needs it")),
+        "{said}"
+    );
+    // Edits meanwhile change nothing of what was submitted; a job that waits for the held one is
+    // queued with it.
+    let more = cluster.submit(
+        &project,
+        &[&["other"][..], &["-p", "other.hold=hold", "-p", "other.seed=1"]].concat(),
+    );
     std::fs::write(
         project.path("pipeline.yaml"),
         ONE.replace("run: ./step, inputs", "parameters: {steps: 3}, run: ./step, inputs"),
@@ -310,28 +367,39 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     .unwrap();
     std::fs::remove_file(project.path("hold")).unwrap();
     cluster.drain();
-    assert_eq!([&jobs["last"], &more["other"]].map(|job| cluster.state(job)), ["COMPLETED 0:0", "COMPLETED 0:0"]);
+    assert_eq!(
+        [&jobs["last"], &more["other"]].map(|job| cluster.state(job)),
+        ["COMPLETED 0:0", "COMPLETED 0:0"]
+    );
     std::fs::write(project.path("pipeline.yaml"), ONE).unwrap();
     assert!(cluster.ok(&project, &[&["plan"][..], &held].concat()).matches("cached").count() >= 2);
     // Without jobs the submissions are runs like others.
     cluster.ok(&project, &["gc", "first", "--keep-days", "0"]);
-    assert!(std::fs::read_dir(project.path(".nerf-sr/slurm")).unwrap().all(|e| e.unwrap().file_name() == "lock"));
+    assert!(
+        std::fs::read_dir(project.path(".nerf-sr/slurm"))
+            .unwrap()
+            .all(|e| e.unwrap().file_name() == "lock")
+    );
     project.write("hold", "");
     let jobs = cluster.submit(&project, &["-p", "first.hold=hold"]);
     assert_eq!(jobs.len(), 2);
     let said = cluster.ok(&project, &["cancel", "first"]);
     assert!(said.contains("cancelled 1 job of first"), "{said}");
     cluster.drain();
-    assert!(cluster.state(&jobs["last"]).starts_with("CANCELLED") && cluster.state(&jobs["first"]).starts_with("CANCELLED"));
+    assert!(
+        cluster.state(&jobs["last"]).starts_with("CANCELLED")
+            && cluster.state(&jobs["first"]).starts_with("CANCELLED")
+    );
     assert!(cluster.ok(&project, &["cancel"]).contains("cancelled 0 jobs"));
 }
 
-/// Five ends of its time, the first by Slurm's own clock; the bytes are those of an undisturbed run.
+/// Five ends of its time, the first by Slurm's own clock; the bytes are those of an undisturbed
+/// run.
 #[test]
 fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     let Some(cluster) = Cluster::start() else { return };
-    let pipeline =
-        "default: [first]\nstages:\n  first: {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
+    let pipeline = "default: [first]\nstages:\n  first: \
+        {run: ./step, parameters: {steps: 60, hold: hold}, resources: {time: 1m}}\n";
     let (shared, local) = (project(pipeline), project(pipeline));
     shared.write("site.yaml", "notice: 56s\nsetup: ['echo set-up is done']\n");
     shared.write("hold", "10");
@@ -345,17 +413,22 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
             std::thread::sleep(Duration::from_millis(300));
             cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
         }
-        wait_until(|| log().matches("goes on from the checkpoint later").count() == round && state().starts_with("PENDING"));
+        wait_until(|| {
+            log().matches("goes on from the checkpoint later").count() == round
+                && state().starts_with("PENDING")
+        });
         assert!(state().starts_with("PENDING"), "{} {}", state(), log());
         shared.write("hold", &(10 * (round + 1)).to_string());
-        // Slurm waits two minutes with what is queued again. At once it would take the old credential for the new one's.
+        // Slurm waits two minutes with what is queued again. At once it would take the old
+        // credential for the new one's.
         cluster.slurm("scontrol", &["update", &format!("JobId={job}"), "StartTime=now+2"]);
     }
     std::fs::remove_file(shared.path("hold")).unwrap();
     cluster.drain();
     assert_eq!((ran(&shared).len(), state().as_str()), (6, "COMPLETED 0:0"), "{}", log());
     assert!(
-        log().contains("set-up is done") && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))),
+        log().contains("set-up is done")
+            && [10, 20, 30, 40, 50].iter().all(|n| log().contains(&format!("stopped at {n}"))),
         "{}",
         log()
     );
@@ -372,17 +445,22 @@ fn processes(project: &Project) -> Vec<String> {
         let words = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
         words.windows(folder.len()).any(|window| window == folder)
     };
-    let mut found: Vec<String> = entries.filter(names_it).map(|entry| entry.file_name().into_string().unwrap()).collect();
+    let mut found: Vec<String> =
+        entries.filter(names_it).map(|entry| entry.file_name().into_string().unwrap()).collect();
     found.sort();
     found
 }
 
-/// Ten times one of the jobs' processes ends at once, whichever it is, and the sweep is submitted again.
+/// Ten times one of the jobs' processes ends at once, whichever it is, and the sweep is submitted
+/// again.
 #[test]
 fn kills_at_random_moments_lose_nothing() {
     let Some(cluster) = Cluster::start() else { return };
     let step = "run: ./step, parameters: {steps: 60, pause: 0.02, keeps: 1, hold: hold}";
-    let pipeline = format!("default: [second]\nstages:\n  first: {{{step}}}\n  second: {{{step}, inputs: {{a: first}}}}\n");
+    let pipeline = format!(
+        "default: [second]\nstages:\n  first: {{{step}}}\n  second: {{{step}, inputs: \
+        {{a: first}}}}\n"
+    );
     let (shared, local) = (project(&pipeline), project(&pipeline));
     let sweep = ["-p", "first.seed=1,2"];
     let seed = std::env::var("NERF_SR_SEED").map_or(1, |text| text.parse().unwrap());
@@ -390,7 +468,8 @@ fn kills_at_random_moments_lose_nothing() {
     for kill in 0..10 {
         // No node is done before the last kill; each has a few steps to go before every kill.
         shared.write("hold", &(5 * (kill + 1)).to_string());
-        // A job that Slurm hasn't yet seen end counts as outstanding: the last kill's may have to be submitted once more.
+        // A job that Slurm hasn't yet seen end counts as outstanding: the last kill's may have to
+        // be submitted once more.
         let mut killed = false;
         wait_until(|| {
             cluster.submit(&shared, &sweep);
@@ -398,7 +477,9 @@ fn kills_at_random_moments_lose_nothing() {
             let running = processes(&shared);
             let chosen = running.get(draws.below(running.len().max(1) as u64) as usize);
             // It may end by itself before the signal comes.
-            killed = chosen.is_some_and(|process| Command::new("kill").args(["-KILL", process]).status().unwrap().success());
+            killed = chosen.is_some_and(|process| {
+                Command::new("kill").args(["-KILL", process]).status().unwrap().success()
+            });
             killed
         });
         assert!(killed, "seed {seed}, kill {kill}");
@@ -409,7 +490,11 @@ fn kills_at_random_moments_lose_nothing() {
     cluster.drain();
     local.ok(&[&["run"][..], &sweep].concat());
     for stage in ["first", "second"] {
-        assert_eq!(outputs(&shared, stage, &sweep), outputs(&local, stage, &sweep), "{stage}, seed {seed}");
+        assert_eq!(
+            outputs(&shared, stage, &sweep),
+            outputs(&local, stage, &sweep),
+            "{stage}, seed {seed}"
+        );
     }
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
 }
@@ -423,13 +508,21 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     // Both have gone: a hit of the last wouldn't need the first.
     let objects = ["first", "last"].map(|stage| project.artifact(stage, &[]));
     objects.iter().for_each(|object| std::fs::remove_dir_all(object).unwrap());
-    let submissions = std::fs::read_dir(project.path(".nerf-sr/slurm")).unwrap().map(|e| e.unwrap().path());
-    let script: PathBuf = submissions.filter(|path| path.is_dir()).map(|path| path.join("job.sh")).next().unwrap();
+    let submissions =
+        std::fs::read_dir(project.path(".nerf-sr/slurm")).unwrap().map(|e| e.unwrap().path());
+    let script: PathBuf =
+        submissions.filter(|path| path.is_dir()).map(|path| path.join("job.sh")).next().unwrap();
     let log = project.path("log");
     let output = format!("--output={}", log.display());
     // Slurm takes a job that it doesn't know for one that went well.
-    let arguments =
-        ["--parsable", "--dependency=afterok:99999", "--kill-on-invalid-dep=yes", &output, script.to_str().unwrap(), "1"];
+    let arguments = [
+        "--parsable",
+        "--dependency=afterok:99999",
+        "--kill-on-invalid-dep=yes",
+        &output,
+        script.to_str().unwrap(),
+        "1",
+    ];
     let job = cluster.slurm("sbatch", &arguments);
     cluster.drain();
     assert_eq!(cluster.state(&job), "FAILED 3:0");
@@ -437,7 +530,8 @@ fn a_dependency_that_slurm_has_forgotten_is_caught() {
     assert!(said.contains("last needs first, which isn't there"), "{said}");
 }
 
-/// A stage that asks for a GPU computes on the first of its own; here that is another kind of device, and so another key.
+/// A stage that asks for a GPU computes on the first of its own; here that is another kind of
+/// device, and so another key.
 #[test]
 fn a_stage_with_a_gpu_computes_on_it() {
     let Some(cluster) = Cluster::start() else { return };
@@ -445,7 +539,8 @@ fn a_stage_with_a_gpu_computes_on_it() {
     let jobs = cluster.submit(&project, &[]);
     cluster.drain();
     assert_eq!(cluster.state(&jobs["last"]), "COMPLETED 0:0");
-    let devices: Vec<String> = ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
+    let devices: Vec<String> =
+        ran(&project).iter().map(|line| line.split(' ').nth(1).unwrap().to_owned()).collect();
     assert_eq!(devices, ["cpu", "cuda:0"]);
     assert!(cluster.ok(&project, &["run"]).contains("nothing to run"));
     let why = project.ok(&["why", "last"]);
@@ -455,14 +550,19 @@ fn a_stage_with_a_gpu_computes_on_it() {
 /// A program of Slurm's that writes down how it was called.
 fn fake(project: &Project, name: &str, more: &str) {
     let here = project.path(".").display().to_string();
-    project.program(&format!("bin/{name}"), &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"));
+    project.program(
+        &format!("bin/{name}"),
+        &format!("#!/bin/sh\ncd '{here}'\necho \"$@\" >> {name}.called\n{more}\n"),
+    );
 }
 
 #[test]
 fn what_slurm_is_told() {
     let project = project(
-        "default: [page]\nstages:\n  first: {run: ./step, resources: {cpus: 4, mem: 8G, gpus: 1, time: 2h}}\n  \
-         last: {extends: first, inputs: {a: first}, resources: {gpus: 0}}\n  page: {run: ./page, inputs: {run: last}}\n",
+        "default: [page]\nstages:\n  first: \
+        {run: ./step, resources: {cpus: 4, mem: 8G, gpus: 1, time: 2h}}\n  \
+         last: {extends: first, inputs: {a: first}, resources: {gpus: 0}}\n  page: \
+         {run: ./page, inputs: {run: last}}\n",
     );
     fake(&project, "sbatch", "echo $((40 + $(wc -l < sbatch.called)))");
     fake(&project, "squeue", "cat queue 2>/dev/null || true");
@@ -482,7 +582,9 @@ fn what_slurm_is_told() {
         said.stderr
     );
     assert!(
-        said.stderr.contains("1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"),
+        said.stderr.contains(
+            "1 job left: at most 2 jobs are queued at once (max_submit); run this again to go on"
+        ),
         "{}",
         said.stderr
     );
@@ -492,21 +594,35 @@ fn what_slurm_is_told() {
         (lines[0], " --cpus-per-task=4 --mem=8192M --gres=gpu:1 --time=120 --partition=gpu /"),
         (
             lines[1],
-            " --cpus-per-task=4 --mem=8192M --time=120 --partition=gpu --dependency=afterok:41 --kill-on-invalid-dep=yes /",
+            " --cpus-per-task=4 --mem=8192M --time=120 --partition=gpu --dependency=afterok:41 \
+            --kill-on-invalid-dep=yes /",
         ),
     ] {
-        assert!(line.contains(words) && line.contains("--requeue") && line.contains("--signal=B:USR1@90"), "{line}");
+        assert!(
+            line.contains(words)
+                && line.contains("--requeue")
+                && line.contains("--signal=B:USR1@90"),
+            "{line}"
+        );
     }
     // The same again, while both are queued, and when there is room.
     let script = lines[0].split_whitespace().find(|word| word.ends_with("job.sh")).unwrap();
-    project.write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
+    project
+        .write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
     assert!(run(&["run"]).stdout.contains("0 jobs submitted, 2 queued before"));
     project.write("site.yaml", "max_submit: 3\n");
     let said = run(&["run"]);
     assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 queued before\n");
-    assert!(std::fs::read_to_string(project.path("sbatch.called")).unwrap().contains("--dependency=afterok:42 "));
+    assert!(
+        std::fs::read_to_string(project.path("sbatch.called"))
+            .unwrap()
+            .contains("--dependency=afterok:42 ")
+    );
     let status = run(&["status"]).stdout;
-    assert!(status.contains("job 41 running") && status.contains("job 42 pending: Dependency"), "{status}");
+    assert!(
+        status.contains("job 41 running") && status.contains("job 42 pending: Dependency"),
+        "{status}"
+    );
     let json: serde_json::Value = serde_json::from_str(&run(&["status", "--json"]).stdout).unwrap();
     assert_eq!(json["nodes"][0]["job"]["state"], "RUNNING", "{json}");
     assert!(run(&["cancel", "last"]).stdout.contains("cancelled 1 job of last"));
@@ -515,24 +631,38 @@ fn what_slurm_is_told() {
     fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
     run(&["run"]).fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
-    run(&["run", "-j", "2"]).fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
+    run(&["run", "-j", "2"])
+        .fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");
     run(&["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();
-    let mut alone = with_environment(command(&project, &["gc", "--keep-days", "0"]), "PATH", Path::new("/nowhere"));
+    let mut alone = with_environment(
+        command(&project, &["gc", "--keep-days", "0"]),
+        "PATH",
+        Path::new("/nowhere"),
+    );
     let said = Finished::of(alone.output().unwrap());
     assert_eq!(said.code, 0, "{}", said.stderr);
-    assert!(project.path(".nerf-sr/slurm").read_dir().unwrap().count() > 1, "where Slurm can't be asked, submissions stay");
+    assert!(
+        project.path(".nerf-sr/slurm").read_dir().unwrap().count() > 1,
+        "where Slurm can't be asked, submissions stay"
+    );
 }
 
 #[test]
 fn resources_are_checked_with_the_file() {
     for (block, words) in [
-        ("{mem: 8}", "pipeline.yaml:3: stages.first.resources.mem: \"8\" is no amount of memory; write a number with M, G or T"),
+        (
+            "{mem: 8}",
+            "pipeline.yaml:3: stages.first.resources.mem: \"8\" is no amount of memory; write a \
+            number with M, G or T",
+        ),
         ("{time: 2 hours}", "pipeline.yaml:3: stages.first.resources.time: \"2 hours\" is no time"),
         ("{cores: 2}", "unknown field `cores`, expected one of `cpus`, `mem`, `gpus`, `time`"),
     ] {
-        let project = project(&format!("default: [first]\nstages:\n  first: {{run: ./step, resources: {block}}}\n"));
+        let project = project(&format!(
+            "default: [first]\nstages:\n  first: {{run: ./step, resources: {block}}}\n"
+        ));
         project.run(&["plan"]).fails(2, &[words]);
     }
     // No resource is part of a key.

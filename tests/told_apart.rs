@@ -1,4 +1,5 @@
-//! Scenes on a background, forward-facing ones and such as go on are told apart, also without known depths.
+//! Scenes on a background, forward-facing ones and such as go on are told apart, also without known
+//! depths.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -30,18 +31,28 @@ fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, Strin
 fn on_white(source: &Path, folder: &Path) {
     for split in ["train", "test"] {
         std::fs::create_dir_all(folder.join(split)).unwrap();
-        let text = std::fs::read_to_string(source.join(format!("transforms_{split}.json"))).unwrap();
+        let text =
+            std::fs::read_to_string(source.join(format!("transforms_{split}.json"))).unwrap();
         let mut transforms: Value = serde_json::from_str(&text).unwrap();
         let frames = transforms["frames"].as_array_mut().unwrap();
         *frames = frames.iter().step_by(frames.len() / 10).take(10).cloned().collect();
-        std::fs::write(folder.join(format!("transforms_{split}.json")), transforms.to_string()).unwrap();
+        std::fs::write(folder.join(format!("transforms_{split}.json")), transforms.to_string())
+            .unwrap();
     }
     let chosen = |file: &str| -> Vec<String> {
-        let transforms: Value = serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
+        let transforms: Value =
+            serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
         let frames = transforms["frames"].as_array().unwrap();
         frames
             .iter()
-            .map(|frame| Path::new(frame["file_path"].as_str().unwrap()).file_name().unwrap().to_str().unwrap().to_owned())
+            .map(|frame| {
+                Path::new(frame["file_path"].as_str().unwrap())
+                    .file_name()
+                    .unwrap()
+                    .to_str()
+                    .unwrap()
+                    .to_owned()
+            })
             .collect()
     };
     let (train, test) = (chosen("transforms_train.json"), chosen("transforms_test.json"));
@@ -57,11 +68,16 @@ fn on_white(source: &Path, folder: &Path) {
             let image = frame.photograph().unwrap();
             let over = |p: &[u8]| {
                 let alpha = u32::from(p[3]);
-                let level = |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
+                let level =
+                    |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
                 [level(0), level(1), level(2), 255]
             };
             let data = image.data.chunks_exact(4).flat_map(over).collect();
-            write_png(&folder.join(split).join(format!("{name}.png")), &Rgba8::new(image.width, image.height, data)).unwrap();
+            write_png(
+                &folder.join(split).join(format!("{name}.png")),
+                &Rgba8::new(image.width, image.height, data),
+            )
+            .unwrap();
         }
     }
 }
@@ -73,9 +89,13 @@ fn objects_on_white_stay_in_a_box_on_white() {
     for scene in ["lego", "chair"] {
         let folder = project.path(scene);
         on_white(&data.join("nerf_synthetic").join(scene), &folder);
-        let (background, space, notes) = prepared(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
+        let (background, space, notes) =
+            prepared(&project, &folder, &json!({"lr_width": 50, "scale": 2}));
         assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{scene}: {notes}");
-        assert!(notes.contains("borders are one flat colour (255 255 255) in 10 of 10 views looked at"), "{notes}");
+        assert!(
+            notes.contains("borders are one flat colour (255 255 255) in 10 of 10 views looked at"),
+            "{notes}"
+        );
     }
 }
 
@@ -85,7 +105,8 @@ fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     let folder = project.path("photographs");
     let demo = |layout: &str, backdrop: bool| {
         std::fs::remove_dir_all(&folder).ok();
-        let params = json!({"form": "transforms", "backdrop": backdrop, "layout": layout, "size": 64, "aspect": 1.5, "train": 12, "test": 3,
+        let params = json!({"form": "transforms", "backdrop": backdrop, "layout": layout,
+            "size": 64, "aspect": 1.5, "train": 12, "test": 3,
             "samples_per_axis": 1});
         assert_eq!(stage("demo-scene", &params.to_string(), &[], &folder, &[]).code, 0);
         prepared(&project, &folder, &json!({}))
@@ -113,6 +134,7 @@ fn fern_without_points_is_forward() {
             std::os::unix::fs::symlink(entry.path(), folder.join(entry.file_name())).unwrap();
         }
     }
-    let (background, space, notes) = prepared(&project, &folder, &json!({"lr_width": 63, "scale": 2}));
+    let (background, space, notes) =
+        prepared(&project, &folder, &json!({"lr_width": 63, "scale": 2}));
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
 }

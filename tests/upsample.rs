@@ -1,4 +1,5 @@
-//! `upsample` in a pipeline, what it says to what it can't do, and `make table`, which puts every method side by side.
+//! `upsample` in a pipeline, what it says to what it can't do, and `make table`, which puts every
+//! method side by side.
 
 #![allow(missing_docs, reason = "a test")]
 mod common;
@@ -43,27 +44,48 @@ fn views_are_enlarged_and_scored() {
         let after = read_exr(&hr.join("images").join(&name)).unwrap();
         assert_eq!((after.width, after.height, after.channel("Z")), (48, 48, None));
         // Pillow's own bicubic filter on 8 bits, but for half precision.
-        let expected = Image::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
+        let expected =
+            Image::premultiplied(&resize_pillow(&before.to_rgba8(), 48, 48, Filter::Bicubic));
         let worst = (0..4).flat_map(|c| {
             let found = after.channel(["R", "G", "B", "A"][c]).unwrap();
-            expected.channel(c).into_iter().zip(found).map(|(a, b)| (a - b).abs()).collect::<Vec<_>>()
+            expected
+                .channel(c)
+                .into_iter()
+                .zip(found)
+                .map(|(a, b)| (a - b).abs())
+                .collect::<Vec<_>>()
         });
         assert!(worst.fold(0.0, f32::max) < 3e-4);
     }
     // A network of the same scale, and one of any: small ones with random weights.
     let weights = project.path("weights");
     std::fs::create_dir(&weights).unwrap();
-    std::fs::copy(goldens().join("swinir_light.safetensors"), weights.join("swinir_x2.safetensors")).unwrap();
+    std::fs::copy(
+        goldens().join("swinir_light.safetensors"),
+        weights.join("swinir_x2.safetensors"),
+    )
+    .unwrap();
     std::fs::copy(goldens().join("liif.safetensors"), weights.join("liif.safetensors")).unwrap();
-    let run = project.ok(&["run", "eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir,liif"]);
+    let run = project.ok(&[
+        "run",
+        "eval-upsampled",
+        "-i",
+        "upsample.weights=weights",
+        "-p",
+        "method=swinir,liif",
+    ]);
     assert!(run.contains("method=swinir") && run.contains("method=liif"), "{run}");
     // At any thread count the same bytes.
-    let outputs = project.output_of("upsample", &["eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir"]);
+    let outputs = project.output_of(
+        "upsample",
+        &["eval-upsampled", "-i", "upsample.weights=weights", "-p", "method=swinir"],
+    );
     let (views, cameras) = (lr, folder("prep").join("cameras"));
     for threads in ["1", "3"] {
         let output = project.path(&format!("threads-{threads}"));
         let inputs = [("views", views.as_path()), ("cameras", &cameras), ("weights", &weights)];
-        let done = stage("upsample", r#"{"method": "swinir"}"#, &inputs, &output, &["--threads", threads]);
+        let done =
+            stage("upsample", r#"{"method": "swinir"}"#, &inputs, &output, &["--threads", threads]);
         assert_eq!(done.code, 0, "{}", done.stderr);
         assert_eq!(manifest(&output), manifest(&project.object(&outputs[0])), "{threads} threads");
     }
@@ -77,10 +99,25 @@ fn views_are_enlarged_and_scored() {
     };
     fails(r#"{"method": "imdn"}"#, None, 2, &["weights is missing", "imdn", "convert-weights.py"]);
     fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["no file imdn_x2.safetensors"]);
-    fails(r#"{"method": "imdn", "file": "liif.safetensors"}"#, Some(&weights), 3, &["fea_conv", "the right network"]);
-    fails(r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#, Some(&weights), 2, &["no name of a file"]);
+    fails(
+        r#"{"method": "imdn", "file": "liif.safetensors"}"#,
+        Some(&weights),
+        3,
+        &["fea_conv", "the right network"],
+    );
+    fails(
+        r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#,
+        Some(&weights),
+        2,
+        &["no name of a file"],
+    );
     std::fs::copy(goldens().join("imdn.safetensors"), weights.join("imdn_x2.safetensors")).unwrap();
-    fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["enlarges 3 times", "48×48 of 24×24", "liif"]);
+    fails(
+        r#"{"method": "imdn"}"#,
+        Some(&weights),
+        3,
+        &["enlarges 3 times", "48×48 of 24×24", "liif"],
+    );
 }
 
 #[test]
@@ -102,7 +139,8 @@ fn the_table_has_every_method_side_by_side() {
     ] {
         assert!(table.contains(words), "no {words:?} in:\n{table}");
     }
-    let rows: Vec<serde_json::Value> = serde_json::from_str(&read("out/paper-table/rows.json")).unwrap();
+    let rows: Vec<serde_json::Value> =
+        serde_json::from_str(&read("out/paper-table/rows.json")).unwrap();
     assert_eq!(rows.len(), methods.len());
     let psnr = |method: &str| rows.iter().find(|r| r["method"] == method).unwrap()["psnr"].as_f64();
     assert!(psnr("NeRF-Swin").is_none());
@@ -111,10 +149,17 @@ fn the_table_has_every_method_side_by_side() {
     assert_eq!(read("out/paper-table/rows.csv").lines().count(), 1 + methods.len());
     assert!(read("out/paper-times/table.md").contains("(training / rendering)"));
     let page = read("out/paper-page/index.html");
-    assert!(page.contains("Side by side") && page.contains("eval-bicubic"), "the page compares nothing");
+    assert!(
+        page.contains("Side by side") && page.contains("eval-bicubic"),
+        "the page compares nothing"
+    );
     // Again: all is there.
     let again = project.ok(&arguments);
-    assert!(again.contains("paper-table (up to date)") && again.contains("nothing to run"), "{again}");
-    let unknown = project.run(&["plan", "paper-table", "--scene", "demo", "--show", "nerf,bicubik"]);
+    assert!(
+        again.contains("paper-table (up to date)") && again.contains("nothing to run"),
+        "{again}"
+    );
+    let unknown =
+        project.run(&["plan", "paper-table", "--scene", "demo", "--show", "nerf,bicubik"]);
     unknown.fails(2, &["--show bicubik", "did you mean bicubic?"]);
 }

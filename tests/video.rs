@@ -16,13 +16,17 @@ fn a_flight_is_rendered_and_filmed() {
     let first = project.run(&["run", "video", "-p", "render-depth.samples_per_axis=1"]);
     assert_eq!(first.code, 0, "{}", first.stderr);
     for i in 0..6 {
-        let frame = pixels::read_png(&project.path(&format!("out/video/frames/{i:05}.png"))).unwrap();
+        let frame =
+            pixels::read_png(&project.path(&format!("out/video/frames/{i:05}.png"))).unwrap();
         // Colour and depth, each of HR's size.
         assert_eq!((frame.width, frame.height), (96, 48));
         let levels = |half: usize| (0..48 * 48).map(move |k| (k / 48) * 96 + half * 48 + k % 48);
         for half in [0, 1] {
             let first = &frame.data[4 * levels(half).next().unwrap()..][..3];
-            assert!(levels(half).any(|p| &frame.data[4 * p..][..3] != first), "half {half} of frame {i} is one colour");
+            assert!(
+                levels(half).any(|p| &frame.data[4 * p..][..3] != first),
+                "half {half} of frame {i} is one colour"
+            );
         }
     }
     // Evaluation isn't part of a film.
@@ -31,7 +35,8 @@ fn a_flight_is_rendered_and_filmed() {
     if film.exists() {
         assert!(std::fs::read(&film).unwrap().windows(4).any(|w| w == b"ftyp"), "no MP4 file");
     } else {
-        let log = std::fs::read_to_string(project.path(".nerf-sr/sinks/video/log")).unwrap_or_default();
+        let log =
+            std::fs::read_to_string(project.path(".nerf-sr/sinks/video/log")).unwrap_or_default();
         assert!((first.stderr + &log).contains("no video.mp4"), "neither a film nor a reason");
     }
 }

@@ -1,4 +1,5 @@
-//! One builder for end-to-end tests: a folder with a pipeline of its own, the real runner and the real stages.
+//! One builder for end-to-end tests: a folder with a pipeline of its own, the real runner and the
+//! real stages.
 
 #![allow(dead_code, reason = "every test file uses a part of it")]
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
@@ -80,21 +81,28 @@ impl Project {
         Self::new(FAST)
     }
 
-    /// The tiny pipeline with shipped targets; `blocks` are changes of their blocks, and further ones.
+    /// The tiny pipeline with shipped targets; `blocks` are changes of their blocks, and further
+    /// ones.
     pub fn shipped(targets: &[&str], blocks: &str) -> Self {
         let project = Self { dir: tempfile::tempdir().unwrap() };
         project.write("base/pipeline.yaml", TINY);
         project.copy_folder("pipelines", "base");
-        let files: Vec<String> = targets.iter().map(|target| format!("base/pipelines/{target}.yaml")).collect();
+        let files: Vec<String> =
+            targets.iter().map(|target| format!("base/pipelines/{target}.yaml")).collect();
         let stages = if blocks.is_empty() { String::new() } else { format!("stages:\n{blocks}") };
-        project.write("pipeline.yaml", &format!("extends: [{}]\ndefault: [eval]\n{stages}", files.join(", ")));
+        project.write(
+            "pipeline.yaml",
+            &format!("extends: [{}]\ndefault: [eval]\n{stages}", files.join(", ")),
+        );
         project
     }
 
     /// The tiny pipeline with the shipped `pipelines/` and `experiments/`.
     pub fn experiments() -> Self {
         let project = Self::tiny();
-        ["pipelines", "experiments"].into_iter().for_each(|folder| project.copy_folder(folder, "."));
+        ["pipelines", "experiments"]
+            .into_iter()
+            .for_each(|folder| project.copy_folder(folder, "."));
         project
     }
 
@@ -103,7 +111,10 @@ impl Project {
         for entry in std::fs::read_dir(root().join(shipped)).unwrap() {
             let path = entry.unwrap().path();
             let name = path.file_name().unwrap().to_str().unwrap().to_owned();
-            self.write(&format!("{folder}/{shipped}/{name}"), &std::fs::read_to_string(&path).unwrap());
+            self.write(
+                &format!("{folder}/{shipped}/{name}"),
+                &std::fs::read_to_string(&path).unwrap(),
+            );
         }
     }
 
@@ -122,14 +133,23 @@ impl Project {
         self.write(".source", text);
         let to = self.path(file);
         std::fs::create_dir_all(to.parent().unwrap()).unwrap();
-        assert!(Command::new("install").args(["-m", "755"]).arg(self.path(".source")).arg(to).status().unwrap().success());
+        assert!(
+            Command::new("install")
+                .args(["-m", "755"])
+                .arg(self.path(".source"))
+                .arg(to)
+                .status()
+                .unwrap()
+                .success()
+        );
     }
 
     /// Changes the text of the pipeline, and of the tiny one that it extends.
     #[track_caller]
     pub fn replace(&self, from: &str, to: &str) {
         let files = ["pipeline.yaml", "base/pipeline.yaml"];
-        let texts = files.map(|file| (file, std::fs::read_to_string(self.path(file)).unwrap_or_default()));
+        let texts =
+            files.map(|file| (file, std::fs::read_to_string(self.path(file)).unwrap_or_default()));
         assert!(texts.iter().any(|(_, text)| text.contains(from)), "the pipeline has no {from:?}");
         for (file, text) in texts.iter().filter(|(_, text)| text.contains(from)) {
             self.write(file, &text.replace(from, to));
@@ -166,7 +186,15 @@ impl Project {
         let status = self.ok(&[&["status"], arguments].concat());
         let lines = status.lines().filter(|l| l.split_whitespace().next() == Some(stage));
         lines
-            .map(|l| l.split("cached").nth(1).unwrap_or_else(|| panic!("{l}")).split_whitespace().next().unwrap().to_owned())
+            .map(|l| {
+                l.split("cached")
+                    .nth(1)
+                    .unwrap_or_else(|| panic!("{l}"))
+                    .split_whitespace()
+                    .next()
+                    .unwrap()
+                    .to_owned()
+            })
             .collect()
     }
 
@@ -180,14 +208,17 @@ impl Project {
     #[track_caller]
     pub fn json(&self, stage: &str, file: &str, arguments: &[&str]) -> serde_json::Value {
         let path = self.artifact(stage, arguments).join(file);
-        serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap_or_else(|e| panic!("{}: {e}", path.display()))
+        serde_json::from_slice(&std::fs::read(&path).unwrap())
+            .unwrap_or_else(|e| panic!("{}: {e}", path.display()))
     }
 
     /// Folder of an artifact, by the beginning of its identity.
     #[track_caller]
     pub fn object(&self, start: &str) -> PathBuf {
         let objects = std::fs::read_dir(self.path(".nerf-sr/objects")).unwrap();
-        let found = objects.map(|e| e.unwrap().path()).find(|p| p.file_name().unwrap().to_str().unwrap().starts_with(start));
+        let found = objects
+            .map(|e| e.unwrap().path())
+            .find(|p| p.file_name().unwrap().to_str().unwrap().starts_with(start));
         found.unwrap_or_else(|| panic!("no object {start}"))
     }
 
@@ -203,7 +234,9 @@ impl Project {
     pub fn script(&self, script: &str, arguments: &[&str]) -> Finished {
         let mut command = Command::new("python3");
         command.arg(root().join("scripts").join(script)).args(arguments);
-        command.args(["--data", "data", "--nerf-sr", bin("nerf-sr").to_str().unwrap()]).current_dir(self.path("."));
+        command
+            .args(["--data", "data", "--nerf-sr", bin("nerf-sr").to_str().unwrap()])
+            .current_dir(self.path("."));
         Finished::of(command.output().unwrap())
     }
 
@@ -211,7 +244,9 @@ impl Project {
     pub fn store_listing(&self) -> Vec<String> {
         let mut names: Vec<String> = ["objects", "actions"]
             .into_iter()
-            .flat_map(|f| std::fs::read_dir(self.path(&format!(".nerf-sr/{f}"))).into_iter().flatten())
+            .flat_map(|f| {
+                std::fs::read_dir(self.path(&format!(".nerf-sr/{f}"))).into_iter().flatten()
+            })
             .map(|e| e.unwrap().path().display().to_string())
             .collect();
         names.sort();
@@ -246,18 +281,36 @@ impl Finished {
 }
 
 /// Runs a stage by the contract.
-pub fn stage(name: &str, params: &str, inputs: &[(&str, &Path)], output: &Path, more: &[&str]) -> Finished {
+pub fn stage(
+    name: &str,
+    params: &str,
+    inputs: &[(&str, &Path)],
+    output: &Path,
+    more: &[&str],
+) -> Finished {
     Finished::of(stage_command(name, params, inputs, output, more).output().unwrap())
 }
 
 /// The command of a stage by the contract; its parameters lie beside the output.
-pub fn stage_command(name: &str, params: &str, inputs: &[(&str, &Path)], output: &Path, more: &[&str]) -> Command {
+pub fn stage_command(
+    name: &str,
+    params: &str,
+    inputs: &[(&str, &Path)],
+    output: &Path,
+    more: &[&str],
+) -> Command {
     let file = output.with_extension("params.json");
     if let Some(folder) = file.parent().filter(|f| f.is_dir()) {
         std::fs::write(folder.join(file.file_name().unwrap()), params).ok();
     }
     let mut command = Command::new(bin(name));
-    command.arg("--params").arg(&file).arg("--output").arg(output).args(["--progress", "none"]).args(more);
+    command
+        .arg("--params")
+        .arg(&file)
+        .arg("--output")
+        .arg(output)
+        .args(["--progress", "none"])
+        .args(more);
     for (name, folder) in inputs {
         command.arg("--input").arg(format!("{name}={}", folder.display()));
     }
@@ -291,7 +344,10 @@ pub fn last_checkpoint(work: &Path) -> Option<SystemTime> {
 /// A work folder's checkpoints.
 pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
     let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
-    files.filter(|file| file.file_name() == "checkpoint.safetensors").map(walkdir::DirEntry::into_path).collect()
+    files
+        .filter(|file| file.file_name() == "checkpoint.safetensors")
+        .map(walkdir::DirEntry::into_path)
+        .collect()
 }
 
 /// Waits for what comes sooner or later, however slow the machine is just now.
@@ -304,8 +360,9 @@ pub fn wait_until(mut happened: impl FnMut() -> bool) {
     }
 }
 
-/// Kills a stage so many milliseconds after its start, and then each time so long after another checkpoint was written. How often there was
-/// one to go on from; the output may be there, if the stage was faster.
+/// Kills a stage so many milliseconds after its start, and then each time so long after another
+/// checkpoint was written. How often there was one to go on from; the output may be there, if the
+/// stage was faster.
 pub fn kill_again_and_again(
     name: &str,
     params: &str,
@@ -318,7 +375,10 @@ pub fn kill_again_and_again(
     for (round, pause) in milliseconds.iter().enumerate() {
         let before = last_checkpoint(work);
         let more = ["--work", work.to_str().unwrap()];
-        let mut child = stage_command(name, params, inputs, output, &more).stderr(Stdio::piped()).spawn().unwrap();
+        let mut child = stage_command(name, params, inputs, output, &more)
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
         if round > 0 {
             wait_until(|| last_checkpoint(work) != before || child.try_wait().unwrap().is_some());
         }
@@ -336,7 +396,8 @@ pub fn kill_again_and_again(
 
 /// The data folder with real scenes and weights; without it a test says so and ends.
 pub fn data() -> Option<PathBuf> {
-    let path = std::env::var("NERF_SR_DATA").map_or_else(|_| root().join("../shared/data"), PathBuf::from);
+    let path =
+        std::env::var("NERF_SR_DATA").map_or_else(|_| root().join("../shared/data"), PathBuf::from);
     if path.is_dir() {
         return Some(path);
     }

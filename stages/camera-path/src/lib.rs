@@ -1,4 +1,5 @@
-//! `camera-path`: cameras along a path through a scene, for `render-depth` to render and `video` to show.
+//! `camera-path`: cameras along a path through a scene, for `render-depth` to render and `video` to
+//! show.
 //!
 //! * [`Params`]: which [`Kind`] of path, how many frames.
 //! * [`poses`]: the poses of a path, from the cameras that saw the scene and its bounds.
@@ -16,7 +17,8 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Kind of path. Default: `list` with `poses`, `spiral` for cameras that look one way, else `orbit`.
+    /// Kind of path. Default: `list` with `poses`, `spiral` for cameras that look one way, else
+    /// `orbit`.
     #[schemars(extend("x-default" = "by cameras"))]
     pub kind: Option<Kind>,
     /// Number of frames. A list has a frame for each pose.
@@ -28,9 +30,11 @@ pub struct Params {
     /// Radius of a spiral or orbit, over that of the given cameras.
     #[schemars(range(min = 0.0, max = 10.0))]
     pub radius: f64,
-    /// Poses of `kind: list`: for each frame a `camera_to_world` of three rows of four numbers, as in `views.json`.
+    /// Poses of `kind: list`: for each frame a `camera_to_world` of three rows of four numbers, as
+    /// in `views.json`.
     pub poses: Vec<[[f64; 4]; 3]>,
-    /// Width of the frames; the height follows the first camera's aspect. Default: the width of the scene's HR images.
+    /// Width of the frames; the height follows the first camera's aspect. Default: the width of the
+    /// scene's HR images.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
     pub size: Option<u32>,
 }
@@ -45,7 +49,8 @@ impl Default for Params {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// Around the mean camera, to the sides as far as most cameras go, looking at one point: forward-facing photographs.
+    /// Around the mean camera, to the sides as far as most cameras go, looking at one point:
+    /// forward-facing photographs.
     Spiral,
     /// Around the middle of the scene's box, at the cameras' mean distance and height.
     Orbit,
@@ -64,8 +69,12 @@ impl Stage for CameraPath {
     const SUMMARY: &'static str = "Makes cameras along a path through a scene.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        let kinds = ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
-        vec![("cameras", Input::required(&kinds, "folder with views.json: the cameras that saw the scene"))]
+        let kinds =
+            ["scene/train", "scene/cameras", "scene/truth", "scene/references", "cameras", "views"];
+        vec![(
+            "cameras",
+            Input::required(&kinds, "folder with views.json: the cameras that saw the scene"),
+        )]
     }
 
     fn output() -> Output {
@@ -79,7 +88,8 @@ impl Stage for CameraPath {
         // Films are taken without lens distortion.
         first.intrinsics = first.intrinsics.pinhole().unwrap_or(first.intrinsics);
         let is_scene = input.path(DEGRADATION_FILE).exists();
-        let made: Option<Degradation> = if is_scene { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
+        let made: Option<Degradation> =
+            if is_scene { Some(input.read_json(DEGRADATION_FILE)?) } else { None };
         let width = params.size.or(made.map(|d| d.hr[0])).unwrap_or(first.intrinsics.width);
         let aspect = f64::from(first.intrinsics.height) / f64::from(first.intrinsics.width);
         let height = (f64::from(width) * aspect).round().max(1.0) as u32;
@@ -87,13 +97,20 @@ impl Stage for CameraPath {
         let kind = params.kind.unwrap_or_else(|| default_kind(&cameras, params));
         let poses = poses(kind, params, &cameras, &given.bounds);
         if poses.is_empty() {
-            return Err(Failure::Usage("parameter poses: kind list needs at least one".to_owned()).into());
+            return Err(
+                Failure::Usage("parameter poses: kind list needs at least one".to_owned()).into()
+            );
         }
         let view = |(i, pose): (usize, [[f64; 4]; 3])| {
-            let camera = Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
+            let camera =
+                Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
             View::camera_only(camera.resized(width, height))
         };
-        let views = Views::new(given.background, given.bounds, poses.into_iter().enumerate().map(view).collect());
+        let views = Views::new(
+            given.background,
+            given.bounds,
+            poses.into_iter().enumerate().map(view).collect(),
+        );
         views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
@@ -115,7 +132,12 @@ fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
 }
 
 /// The poses of a path: `camera_to_world` of each frame.
-pub fn poses(kind: Kind, params: &Params, cameras: &[Camera], bounds: &Bounds) -> Vec<[[f64; 4]; 3]> {
+pub fn poses(
+    kind: Kind,
+    params: &Params,
+    cameras: &[Camera],
+    bounds: &Bounds,
+) -> Vec<[[f64; 4]; 3]> {
     let shares = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
     match kind {
         Kind::Spiral => spiral(cameras, bounds, params, shares),
@@ -133,20 +155,28 @@ fn pose(axes: DMat3, centre: DVec3) -> [[f64; 4]; 3] {
     [0, 1, 2].map(|k| [axes.x_axis[k], axes.y_axis[k], axes.z_axis[k], centre[k]])
 }
 
-/// A camera at a place that looks at a point. Where it would look straight up or down, another axis is taken for its right.
+/// A camera at a place that looks at a point. Where it would look straight up or down, another axis
+/// is taken for its right.
 fn looking(from: DVec3, at: DVec3, up: DVec3) -> [[f64; 4]; 3] {
     let back = (from - at).normalize_or(DVec3::Z);
     let right = up.cross(back).try_normalize().unwrap_or_else(|| back.any_orthonormal_vector());
     pose(DMat3::from_cols(right, back.cross(right), back), from)
 }
 
-fn spiral(cameras: &[Camera], bounds: &Bounds, params: &Params, shares: impl Iterator<Item = f64>) -> Vec<[[f64; 4]; 3]> {
-    let (centre, forward) = (mean(cameras, Camera::centre), mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z));
+fn spiral(
+    cameras: &[Camera],
+    bounds: &Bounds,
+    params: &Params,
+    shares: impl Iterator<Item = f64>,
+) -> Vec<[[f64; 4]; 3]> {
+    let (centre, forward) =
+        (mean(cameras, Camera::centre), mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z));
     let right = forward.cross(mean(cameras, |c| c.rotation().y_axis)).normalize_or(DVec3::X);
     let up = right.cross(forward);
     // Nine in ten cameras lie within (as in LLFF's own spirals).
     let reach = |axis: DVec3| {
-        let mut offsets: Vec<f64> = cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
+        let mut offsets: Vec<f64> =
+            cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
         offsets.sort_by(f64::total_cmp);
         params.radius * offsets[(offsets.len() - 1) * 9 / 10]
     };
@@ -160,13 +190,20 @@ fn spiral(cameras: &[Camera], bounds: &Bounds, params: &Params, shares: impl Ite
     shares
         .map(|share| {
             let angle = TAU * params.turns * share;
-            let offset = aside * angle.cos() * right + above * angle.sin() * up + ahead * (0.5 * angle).sin() * forward;
+            let offset = aside * angle.cos() * right
+                + above * angle.sin() * up
+                + ahead * (0.5 * angle).sin() * forward;
             looking(centre + offset, focus, up)
         })
         .collect()
 }
 
-fn orbit(cameras: &[Camera], bounds: &Bounds, params: &Params, shares: impl Iterator<Item = f64>) -> Vec<[[f64; 4]; 3]> {
+fn orbit(
+    cameras: &[Camera],
+    bounds: &Bounds,
+    params: &Params,
+    shares: impl Iterator<Item = f64>,
+) -> Vec<[[f64; 4]; 3]> {
     let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
     let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let level = |c: &Camera| {
@@ -175,7 +212,8 @@ fn orbit(cameras: &[Camera], bounds: &Bounds, params: &Params, shares: impl Iter
     };
     let height = mean(cameras, |c| c.centre() - middle).dot(up);
     // As far away as the cameras are, all in all.
-    let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>() / cameras.len().max(1) as f64;
+    let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
+        / cameras.len().max(1) as f64;
     let around = (distance * distance - height * height).max(0.0).sqrt();
     let first = level(&cameras[0]).normalize_or(up.any_orthonormal_vector());
     shares
@@ -193,8 +231,13 @@ fn between(cameras: &[Camera], share: f64) -> [[f64; 4]; 3] {
     let (i, t) = (at as usize % count, at.fract());
     let camera = |k: usize| &cameras[(i + k) % count];
     let [a, b, c, d] = [count - 1, 0, 1, 2].map(|k| camera(k).centre());
-    let centre = 0.5 * (2.0 * b + (c - a) * t + (2.0 * a - 5.0 * b + 4.0 * c - d) * t * t + (3.0 * (b - c) + d - a) * t * t * t);
-    let (from, to) = (DQuat::from_mat3(&camera(0).rotation()), DQuat::from_mat3(&camera(1).rotation()));
+    let centre = 0.5
+        * (2.0 * b
+            + (c - a) * t
+            + (2.0 * a - 5.0 * b + 4.0 * c - d) * t * t
+            + (3.0 * (b - c) + d - a) * t * t * t);
+    let (from, to) =
+        (DQuat::from_mat3(&camera(0).rotation()), DQuat::from_mat3(&camera(1).rotation()));
     pose(DMat3::from_quat(from.slerp(to, t).normalize()), centre)
 }
 
@@ -213,17 +256,27 @@ mod tests {
     }
 
     fn ring() -> Vec<Camera> {
-        let places: Vec<DVec3> =
-            (0..7).map(|i| DVec3::new(4.0 * f64::from(i).cos(), 4.0 * f64::from(i).sin(), 1.0 + 0.1 * f64::from(i))).collect();
+        let places: Vec<DVec3> = (0..7)
+            .map(|i| {
+                DVec3::new(
+                    4.0 * f64::from(i).cos(),
+                    4.0 * f64::from(i).sin(),
+                    1.0 + 0.1 * f64::from(i),
+                )
+            })
+            .collect();
         cameras(&places, |_| DVec3::ZERO)
     }
 
     fn row() -> Vec<Camera> {
-        let places: Vec<DVec3> = (0..9).map(|i| DVec3::new(f64::from(i % 3) - 1.0, 0.0, 0.5 * f64::from(i / 3))).collect();
+        let places: Vec<DVec3> = (0..9)
+            .map(|i| DVec3::new(f64::from(i % 3) - 1.0, 0.0, 0.5 * f64::from(i / 3)))
+            .collect();
         cameras(&places, |p| p + DVec3::Y)
     }
 
-    const BOX: Bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
+    const BOX: Bounds =
+        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
 
     fn whole(poses: &[[[f64; 4]; 3]]) -> Vec<Camera> {
         let one = |pose: &[[f64; 4]; 3]| Camera {
@@ -260,7 +313,10 @@ mod tests {
         assert_eq!(default_kind(&cameras, &params), Kind::Spiral);
         for camera in whole(&poses(Kind::Spiral, &params, &cameras, &BOX)) {
             let off = camera.centre() - DVec3::new(0.0, 0.0, 0.5);
-            assert!(off.x.abs() <= 1.0 + 1e-9 && off.z.abs() <= 0.5 + 1e-9 && camera.forward().y > 0.8, "{off}");
+            assert!(
+                off.x.abs() <= 1.0 + 1e-9 && off.z.abs() <= 0.5 + 1e-9 && camera.forward().y > 0.8,
+                "{off}"
+            );
         }
     }
 
@@ -271,7 +327,10 @@ mod tests {
         let path = whole(&poses(Kind::Between, &params, &cameras, &BOX));
         for (i, camera) in cameras.iter().enumerate() {
             let frame = &path[10 * i];
-            assert!((frame.centre() - camera.centre()).length() < 1e-9 && frame.forward().dot(camera.forward()) > 1.0 - 1e-9);
+            assert!(
+                (frame.centre() - camera.centre()).length() < 1e-9
+                    && frame.forward().dot(camera.forward()) > 1.0 - 1e-9
+            );
         }
     }
 

@@ -1,8 +1,9 @@
-//! `demo-scene`: a small procedural scene, rendered in linear light and written as a data set: in Blender's form with exact depth, or as
-//! photographs are, in JPEG with a `transforms.json`.
+//! `demo-scene`: a small procedural scene, rendered in linear light and written as a data set: in
+//! Blender's form with exact depth, or as photographs are, in JPEG with a `transforms.json`.
 //!
-//! It is made to tell methods apart: fine texture (base, crate, sign), thin parts (cage, spring), gloss (ball, copper),
-//! occlusion (a striped ball inside the cage). Everything is arithmetic and `libm`, so equal parameters give equal bytes.
+//! It is made to tell methods apart: fine texture (base, crate, sign), thin parts (cage, spring),
+//! gloss (ball, copper), occlusion (a striped ball inside the cage). Everything is arithmetic and
+//! `libm`, so equal parameters give equal bytes.
 //!
 //! * `world`: shapes, where they stand, how they intersect a ray.
 //! * `material`: albedo and gloss of a point.
@@ -24,7 +25,8 @@ pub use render::RenderedImage;
 pub use world::World;
 use written::Written;
 
-/// Angle of view across the shorter side, as in NeRF's Blender scenes: the things stay in every view.
+/// Angle of view across the shorter side, as in NeRF's Blender scenes: the things stay in every
+/// view.
 const CAMERA_ANGLE: f64 = 0.691_111_2;
 /// Distance of every camera from the scene's centre.
 const DISTANCE: f64 = 4.0;
@@ -62,9 +64,11 @@ pub struct Params {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Form {
-    /// NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and `transforms_test.json`, depth of test views.
+    /// NeRF's synthetic scenes: PNG with alpha, `transforms_train.json` and `transforms_test.json`,
+    /// depth of test views.
     Blender,
-    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no depth.
+    /// Photographs with poses: JPEG on white, one `transforms.json` with the focal length, no
+    /// depth.
     Transforms,
 }
 
@@ -87,7 +91,17 @@ impl Params {
 impl Default for Params {
     fn default() -> Self {
         let (layout, form) = (Layout::Around, Form::Blender);
-        Self { size: 200, aspect: 1.0, train: 80, test: 10, samples_per_axis: 4, layout, backdrop: false, form, seed: 0 }
+        Self {
+            size: 200,
+            aspect: 1.0,
+            train: 80,
+            test: 10,
+            samples_per_axis: 4,
+            layout,
+            backdrop: false,
+            form,
+            seed: 0,
+        }
     }
 }
 
@@ -107,7 +121,8 @@ pub struct DemoScene;
 impl Stage for DemoScene {
     type Params = Params;
     const NAME: &'static str = "demo-scene";
-    const SUMMARY: &'static str = "Renders a small procedural scene as a data set, with exact depth in Blender's form.";
+    const SUMMARY: &'static str =
+        "Renders a small procedural scene as a data set, with exact depth in Blender's form.";
 
     fn output() -> Output {
         Output::kind("dataset")
@@ -120,14 +135,21 @@ impl Stage for DemoScene {
         let progress = context.progress("rendering", total);
         let mut written = Written::new(params);
         for (split, count) in [("train", params.train), ("test", params.test)] {
-            let poses: Vec<[[f64; 4]; 4]> = (0..count).map(|i| pose(params.layout, split, i, count)).collect();
+            let poses: Vec<[[f64; 4]; 4]> =
+                (0..count).map(|i| pose(params.layout, split, i, count)).collect();
             context.output_path(&format!("{}/.", params.form.folder(split)))?;
             (0..count)
                 .into_par_iter()
                 .map(|i| {
                     context.check_interrupt()?;
                     let pose = &poses[i as usize];
-                    let frame = render::render(&world, pose, params.angle_x(), params.sides(), params.samples_per_axis);
+                    let frame = render::render(
+                        &world,
+                        pose,
+                        params.angle_x(),
+                        params.sides(),
+                        params.samples_per_axis,
+                    );
                     params.form.write_view(context, split, i, &frame)?;
                     progress.add(1);
                     Ok(())
@@ -145,13 +167,17 @@ impl Stage for DemoScene {
     }
 }
 
-/// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test views on a wavy circle between them.
-/// Forward: training views fill a square by the golden ratio, test views lie on a circle in it.
+/// Camera `i` of `count`. Around: training views spread evenly over the upper hemisphere, test
+/// views on a wavy circle between them. Forward: training views fill a square by the golden ratio,
+/// test views lie on a circle in it.
 fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let share = (f64::from(i) + 0.5) / f64::from(count);
-    let row = |r: &DMat3, centre: DVec3, k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]];
-    let matrix = |r: DMat3, centre: DVec3| [row(&r, centre, 0), row(&r, centre, 1), row(&r, centre, 2), [0.0, 0.0, 0.0, 1.0]];
+    let row =
+        |r: &DMat3, centre: DVec3, k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]];
+    let matrix = |r: DMat3, centre: DVec3| {
+        [row(&r, centre, 0), row(&r, centre, 1), row(&r, centre, 2), [0.0, 0.0, 0.0, 1.0]]
+    };
     if layout == Layout::Forward {
         let (u, v) = if split == "train" {
             (share - 0.5, (f64::from(i) * 0.618_033_988_75 + 0.5) % 1.0 - 0.5)
@@ -169,7 +195,8 @@ fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
         (TAU * share, 0.42 + 0.28 * libm::sin(3.0 * TAU * share))
     };
     let level = (1.0 - height * height).sqrt();
-    let centre = DISTANCE * DVec3::new(level * libm::cos(azimuth), level * libm::sin(azimuth), height);
+    let centre =
+        DISTANCE * DVec3::new(level * libm::cos(azimuth), level * libm::sin(azimuth), height);
     let back = centre.normalize();
     let right = DVec3::Z.cross(back).normalize();
     let r = DMat3::from_cols(right, back.cross(right), back);
@@ -188,20 +215,32 @@ mod tests {
         let seen: Vec<f32> = frame.depth.iter().flatten().copied().collect();
         assert!(seen.len() > 64 * 64 / 8, "{} pixels see something", seen.len());
         assert!(seen.iter().all(|z| (2.0..6.0).contains(z)));
-        // Where all four rays of a pixel meet something, so does nearly every centre ray; where none does, hardly any.
-        let agree = frame.depth.iter().zip(frame.colour.data.chunks_exact(4)).filter(|(d, p)| d.is_some() == (p[3] >= 128));
+        // Where all four rays of a pixel meet something, so does nearly every centre ray; where
+        // none does, hardly any.
+        let agree = frame
+            .depth
+            .iter()
+            .zip(frame.colour.data.chunks_exact(4))
+            .filter(|(d, p)| d.is_some() == (p[3] >= 128));
         assert!(agree.count() > 64 * 64 * 95 / 100);
     }
 
     #[test]
     fn the_scene_stays_in_every_view() {
-        // What a test view sees must be inside the training views' frusta, or near/far and hull would be guesses.
+        // What a test view sees must be inside the training views' frusta, or near/far and hull
+        // would be guesses.
         let world = World::new(0);
         for aspect in [1.0, 1.5, 0.75] {
             let params = Params { size: 48, aspect, ..Params::default() };
             let [width, height] = params.sides();
             for i in 0..10 {
-                let frame = render::render(&world, &pose(Layout::Around, "test", i, 10), params.angle_x(), [width, height], 1);
+                let frame = render::render(
+                    &world,
+                    &pose(Layout::Around, "test", i, 10),
+                    params.angle_x(),
+                    [width, height],
+                    1,
+                );
                 let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
                 for (x, y) in rows.chain((0..height).flat_map(|y| [(0, y), (width - 1, y)])) {
                     let alpha = frame.colour.data[((y * width + x) * 4 + 3) as usize];
@@ -213,8 +252,16 @@ mod tests {
 
     #[test]
     fn seeds_differ() {
-        let view =
-            |seed| render::render(&World::new(seed), &pose(Layout::Around, "test", 0, 10), CAMERA_ANGLE, [32, 32], 1).colour;
+        let view = |seed| {
+            render::render(
+                &World::new(seed),
+                &pose(Layout::Around, "test", 0, 10),
+                CAMERA_ANGLE,
+                [32, 32],
+                1,
+            )
+            .colour
+        };
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
     }

@@ -48,7 +48,8 @@ fn cell(x: f64) -> i64 {
     x.floor() as i64
 }
 
-/// The surface of a material at a point in the shape's own space (centred, about 1 in size), with its normal there.
+/// The surface of a material at a point in the shape's own space (centred, about 1 in size), with
+/// its normal there.
 pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) -> Reflectance {
     let matt = |albedo| Reflectance { albedo, specular: 0.05, exponent: 12, mirror: 0.0 };
     match material {
@@ -65,7 +66,8 @@ pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) ->
             let joint = (radius * 14.0).fract().min((angle * around).fract()) < 0.08;
             let tone = hash(ring, tile, 2, seed);
             let light = if (ring + tile) % 2 == 0 { 0.62 } else { 0.16 };
-            let tint = DVec3::new(0.95, 0.93, 0.85).lerp(DVec3::new(0.35, 0.55, 0.75), hash(ring, tile, 3, seed));
+            let tint = DVec3::new(0.95, 0.93, 0.85)
+                .lerp(DVec3::new(0.35, 0.55, 0.75), hash(ring, tile, 3, seed));
             matt(if joint { DVec3::splat(0.05) } else { tint * (light * (0.75 + 0.5 * tone)) })
         }
         Material::Crate => {
@@ -82,21 +84,31 @@ pub(crate) fn surface(material: Material, p: DVec3, normal: DVec3, seed: u32) ->
                 return matt(DVec3::new(0.45, 0.30, 0.10));
             }
             let set = hash(cell(u * 11.0), cell(v * 11.0), face, seed) < 0.45;
-            let ground = DVec3::new(0.75, 0.62, 0.30).lerp(DVec3::new(0.25, 0.60, 0.35), hash(face, 7, 7, seed));
+            let ground = DVec3::new(0.75, 0.62, 0.30)
+                .lerp(DVec3::new(0.25, 0.60, 0.35), hash(face, 7, 7, seed));
             matt(if set { DVec3::new(0.04, 0.05, 0.10) } else { ground })
         }
         Material::Ball => {
-            let wave = libm::sin(9.0 * p.x + 3.0 * libm::sin(5.0 * p.y + 2.0 * p.z) + f64::from(seed));
+            let wave =
+                libm::sin(9.0 * p.x + 3.0 * libm::sin(5.0 * p.y + 2.0 * p.z) + f64::from(seed));
             let vein = (1.0 - wave.abs()).powi(6);
-            let albedo = DVec3::new(0.62, 0.05, 0.05).lerp(DVec3::new(0.85, 0.70, 0.55), 0.8 * vein);
+            let albedo =
+                DVec3::new(0.62, 0.05, 0.05).lerp(DVec3::new(0.85, 0.70, 0.55), 0.8 * vein);
             Reflectance { albedo, specular: 0.9, exponent: 120, mirror: 0.12 }
         }
         Material::Stripes => {
             let stripe = (p.z * 7.0 + 0.3 * libm::sin(6.0 * p.x)).floor().rem_euclid(2.0) < 1.0;
             matt(if stripe { DVec3::new(0.85, 0.70, 0.10) } else { DVec3::new(0.08, 0.20, 0.50) })
         }
-        Material::Rod => Reflectance { albedo: DVec3::splat(0.12), specular: 0.35, exponent: 30, mirror: 0.0 },
-        Material::Copper => Reflectance { albedo: DVec3::new(0.55, 0.24, 0.10), specular: 0.7, exponent: 50, mirror: 0.05 },
+        Material::Rod => {
+            Reflectance { albedo: DVec3::splat(0.12), specular: 0.35, exponent: 30, mirror: 0.0 }
+        }
+        Material::Copper => Reflectance {
+            albedo: DVec3::new(0.55, 0.24, 0.10),
+            specular: 0.7,
+            exponent: 50,
+            mirror: 0.05,
+        },
         Material::Sign => {
             let line = cell(p.z * 6.0);
             let gap = (p.z * 6.0).rem_euclid(1.0);

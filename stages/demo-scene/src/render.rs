@@ -15,7 +15,8 @@ pub struct RenderedImage {
 /// Where the sun stands.
 const SUN: DVec3 = DVec3::new(0.48, 0.36, 0.8);
 
-/// Renders one view of `width`×`height` pixels with `samples`² rays a pixel, averaged in linear light over the pixel's square.
+/// Renders one view of `width`×`height` pixels with `samples`² rays a pixel, averaged in linear
+/// light over the pixel's square.
 pub(crate) fn render(
     world: &World,
     pose: &[[f64; 4]; 4],
@@ -27,7 +28,9 @@ pub(crate) fn render(
     let focal = half_x / libm::tan(0.5 * angle_x);
     let column = |c: usize| DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
     let (right, up, back, centre) = (column(0), column(1), column(2), column(3));
-    let direction = |x: f64, y: f64| (((x - half_x) / focal) * right - ((y - half_y) / focal) * up - back).normalize();
+    let direction = |x: f64, y: f64| {
+        (((x - half_x) / focal) * right - ((y - half_y) / focal) * up - back).normalize()
+    };
     let mut colour = Vec::with_capacity((width * height * 4) as usize);
     let mut depth = Vec::with_capacity((width * height) as usize);
     for j in 0..height {
@@ -47,7 +50,12 @@ pub(crate) fn render(
             let mean = if hits == 0 { DVec3::ZERO } else { light / f64::from(hits) };
             let level = |v: f64| (srgb_from_linear(v) * 255.0 + 0.5) as u8;
             let alpha = f64::from(hits) / f64::from(samples * samples);
-            colour.extend([level(mean.x), level(mean.y), level(mean.z), (alpha * 255.0 + 0.5) as u8]);
+            colour.extend([
+                level(mean.x),
+                level(mean.y),
+                level(mean.z),
+                (alpha * 255.0 + 0.5) as u8,
+            ]);
             let d = direction(f64::from(i) + 0.5, f64::from(j) + 0.5);
             depth.push(world.first_hit(centre, d).map(|hit| (hit.t * -d.dot(back)) as f32));
         }
@@ -67,7 +75,8 @@ fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option
     let sun = normal.dot(SUN).max(0.0);
     let lit = if sun > 0.0 && world.first_hit(start, SUN).is_none() { sun } else { 0.0 };
     let sky = 0.32 + 0.18 * normal.z;
-    let mut light = look.albedo * (DVec3::new(0.80, 0.76, 0.68) * lit + DVec3::new(0.85, 0.95, 1.10) * sky);
+    let mut light =
+        look.albedo * (DVec3::new(0.80, 0.76, 0.68) * lit + DVec3::new(0.85, 0.95, 1.10) * sky);
     let mirrored = direction - 2.0 * direction.dot(normal) * normal;
     if lit > 0.0 {
         light += look.specular * mirrored.dot(SUN).max(0.0).powi(look.exponent) * DVec3::ONE;
@@ -75,7 +84,8 @@ fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option
     if look.mirror > 0.0 && bounces > 0 {
         let grazing = (1.0 + direction.dot(normal)).clamp(0.0, 1.0).powi(5);
         let share = look.mirror + (1.0 - look.mirror) * grazing * 0.5;
-        let seen = shade(world, start, mirrored, bounces - 1).unwrap_or_else(|| sky_light(mirrored));
+        let seen =
+            shade(world, start, mirrored, bounces - 1).unwrap_or_else(|| sky_light(mirrored));
         light = light * (1.0 - share) + seen * share;
     }
     Some(light)
@@ -84,10 +94,13 @@ fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option
 /// Bands of cloud, so that the sky has something to be seen by.
 fn clouds(direction: DVec3) -> f64 {
     let azimuth = libm::atan2(direction.y, direction.x);
-    1.0 + 0.25 * libm::sin(7.0 * azimuth + 3.0 * libm::sin(9.0 * direction.z)) * (1.0 - direction.z.abs())
+    1.0 + 0.25
+        * libm::sin(7.0 * azimuth + 3.0 * libm::sin(9.0 * direction.z))
+        * (1.0 - direction.z.abs())
 }
 
 /// What a mirror sees where nothing stands.
 fn sky_light(direction: DVec3) -> DVec3 {
-    DVec3::new(0.55, 0.52, 0.48).lerp(DVec3::new(0.45, 0.65, 0.95), (0.5 + 0.5 * direction.z).clamp(0.0, 1.0))
+    DVec3::new(0.55, 0.52, 0.48)
+        .lerp(DVec3::new(0.45, 0.65, 0.95), (0.5 + 0.5 * direction.z).clamp(0.0, 1.0))
 }

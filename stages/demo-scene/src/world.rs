@@ -59,15 +59,22 @@ pub struct World {
 const FLOOR: f64 = -0.5;
 
 impl World {
-    /// The scene of a seed: the seed turns the arrangement, moves things between places and changes textures.
+    /// The scene of a seed: the seed turns the arrangement, moves things between places and changes
+    /// textures.
     pub fn new(seed: u32) -> Self {
         let turn = f64::from(seed % 360) * 2.4;
         let place = |slot: u32, distance: f64| {
-            let angle = turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * std::f64::consts::TAU / 5.0;
+            let angle =
+                turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * std::f64::consts::TAU / 5.0;
             DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), FLOOR)
         };
-        let thing = |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
-        let mut groups = vec![group(vec![thing(Shape::Drum(1.1, 0.06), DVec3::new(0.0, 0.0, FLOOR - 0.06), Material::Tiles)])];
+        let thing =
+            |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
+        let mut groups = vec![group(vec![thing(
+            Shape::Drum(1.1, 0.06),
+            DVec3::new(0.0, 0.0, FLOOR - 0.06),
+            Material::Tiles,
+        )])];
 
         let crate_half = 0.26;
         let spin = 0.5 + turn;
@@ -84,7 +91,11 @@ impl World {
             material: Material::Crate,
         }]));
 
-        groups.push(group(vec![thing(Shape::Ball(0.3), place(1, 0.62) + DVec3::Z * 0.3, Material::Ball)]));
+        groups.push(group(vec![thing(
+            Shape::Ball(0.3),
+            place(1, 0.62) + DVec3::Z * 0.3,
+            Material::Ball,
+        )]));
 
         // A cage of rods around a striped ball.
         let foot = place(2, 0.64);
@@ -100,7 +111,11 @@ impl World {
         for height in [0.02, 0.36, 0.7] {
             for k in 0..20 {
                 let (a, b) = (on_circle(k, 20, 0.27), on_circle(k + 1, 20, 0.27));
-                cage.push(thing(Shape::Rod(a + DVec3::Z * height, b + DVec3::Z * height, 0.013), foot, Material::Rod));
+                cage.push(thing(
+                    Shape::Rod(a + DVec3::Z * height, b + DVec3::Z * height, 0.013),
+                    foot,
+                    Material::Rod,
+                ));
             }
         }
         groups.push(group(cage));
@@ -115,8 +130,9 @@ impl World {
             let radius = 0.20 - 0.08 * share;
             DVec3::new(radius * libm::cos(angle), radius * libm::sin(angle), 0.02 + 0.95 * share)
         };
-        let rods: Vec<Thing> =
-            (0..pieces as usize).map(|k| thing(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper)).collect();
+        let rods: Vec<Thing> = (0..pieces as usize)
+            .map(|k| thing(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper))
+            .collect();
         groups.extend(rods.chunks(16).map(|piece| group(piece.to_vec())));
 
         // A sign on a thin post.
@@ -142,15 +158,24 @@ impl World {
     /// The same things with a world around them that doesn't end: ground, towers far away, sky.
     #[must_use]
     pub fn with_backdrop(mut self) -> Self {
-        let thing = |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
+        let thing =
+            |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
         let ground = FLOOR - 0.2;
-        self.groups.push(group(vec![thing(Shape::Drum(60.0, 0.05), DVec3::Z * (ground - 0.05), Material::Tiles)]));
+        self.groups.push(group(vec![thing(
+            Shape::Drum(60.0, 0.05),
+            DVec3::Z * (ground - 0.05),
+            Material::Tiles,
+        )]));
         for k in 0..9u32 {
             // Scattered by the golden angle, between 7 and 20 units away.
             let (angle, distance) = (f64::from(k + self.seed % 9) * 2.4, 7.0 + 1.6 * f64::from(k));
             let half = DVec3::new(0.7, 0.9, 1.2 + 0.35 * f64::from(k % 4));
             let foot = DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), ground);
-            self.groups.push(group(vec![thing(Shape::Block(half), foot + DVec3::Z * half.z, Material::Crate)]));
+            self.groups.push(group(vec![thing(
+                Shape::Block(half),
+                foot + DVec3::Z * half.z,
+                Material::Crate,
+            )]));
         }
         self.sky = true;
         self
@@ -241,7 +266,8 @@ impl Shape {
     fn intersect(self, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
         match self {
             Self::Ball(r) => {
-                let (near, far) = quadratic(d.length_squared(), o.dot(d), o.length_squared() - r * r)?;
+                let (near, far) =
+                    quadratic(d.length_squared(), o.dot(d), o.length_squared() - r * r)?;
                 let t = if near > EPSILON { near } else { far };
                 (t > EPSILON).then(|| (t, (o + t * d) / r))
             }
@@ -271,7 +297,11 @@ impl Shape {
                         best = Some((t, normal));
                     }
                 };
-                let roots = quadratic(d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y, o.x * o.x + o.y * o.y - r * r);
+                let roots = quadratic(
+                    d.x * d.x + d.y * d.y,
+                    o.x * d.x + o.y * d.y,
+                    o.x * o.x + o.y * o.y - r * r,
+                );
                 for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
                     let p = o + t * d;
                     if p.z.abs() <= h {

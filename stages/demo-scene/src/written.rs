@@ -27,10 +27,17 @@ impl Form {
     }
 
     /// Writes a view's files.
-    pub(crate) fn write_view(self, context: &Context, split: &str, number: u32, frame: &RenderedImage) -> anyhow::Result<()> {
+    pub(crate) fn write_view(
+        self,
+        context: &Context,
+        split: &str,
+        number: u32,
+        frame: &RenderedImage,
+    ) -> anyhow::Result<()> {
         if self == Self::Transforms {
             let path = context.output_path(&photograph(split, number))?;
-            return write_jpeg(&path, &frame.colour).with_context(|| format!("cannot write {}", path.display()));
+            return write_jpeg(&path, &frame.colour)
+                .with_context(|| format!("cannot write {}", path.display()));
         }
         write_png(&context.output_path(&format!("{split}/r_{number}.png"))?, &frame.colour)?;
         if split == "test" {
@@ -62,16 +69,26 @@ impl Written {
     }
 
     /// Takes in a split's cameras.
-    pub(crate) fn add(&mut self, context: &Context, split: &str, poses: &[[[f64; 4]; 4]]) -> anyhow::Result<()> {
+    pub(crate) fn add(
+        &mut self,
+        context: &Context,
+        split: &str,
+        poses: &[[[f64; 4]; 4]],
+    ) -> anyhow::Result<()> {
         if self.form == Form::Transforms {
-            let names: Vec<String> = (0..poses.len() as u32).map(|number| photograph(split, number)).collect();
-            let frames = names.iter().zip(poses).map(|(name, pose)| json!({"file_path": name, "transform_matrix": pose}));
+            let names: Vec<String> =
+                (0..poses.len() as u32).map(|number| photograph(split, number)).collect();
+            let frames = names
+                .iter()
+                .zip(poses)
+                .map(|(name, pose)| json!({"file_path": name, "transform_matrix": pose}));
             self.frames.extend(frames);
             self.splits.push((format!("{split}_filenames"), names));
             return Ok(());
         }
         let frame = |(number, pose): (usize, &[[f64; 4]; 4])| {
-            let mut frame = json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
+            let mut frame =
+                json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
             if split == "test" {
                 frame["depth_file_path"] = json!(format!("./test/r_{number}_depth.exr"));
             }
@@ -79,7 +96,10 @@ impl Written {
         };
         let frames: Vec<Value> = poses.iter().enumerate().map(frame).collect();
         context
-            .write_json(&format!("transforms_{split}.json"), &json!({"camera_angle_x": self.angle_x, "frames": frames}))
+            .write_json(
+                &format!("transforms_{split}.json"),
+                &json!({"camera_angle_x": self.angle_x, "frames": frames}),
+            )
             .context("cannot write the cameras")
     }
 
@@ -91,7 +111,8 @@ impl Written {
         let [width, height] = self.sides;
         let focal = 0.5 * f64::from(width) / libm::tan(0.5 * self.angle_x);
         let [cx, cy] = self.sides.map(|side| 0.5 * f64::from(side));
-        let mut file = json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx, "cy": cy, "frames": self.frames});
+        let mut file = json!({"w": width, "h": height, "fl_x": focal, "fl_y": focal, "cx": cx,
+            "cy": cy, "frames": self.frames});
         for (key, names) in self.splits {
             file[key] = json!(names);
         }
@@ -107,12 +128,20 @@ fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
     };
     let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(over_white).collect();
     let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), QUALITY);
-    Ok(encoder.write_image(&rgb, image.width as u32, image.height as u32, ExtendedColorType::Rgb8)?)
+    Ok(encoder.write_image(
+        &rgb,
+        image.width as u32,
+        image.height as u32,
+        ExtendedColorType::Rgb8,
+    )?)
 }
 
 /// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.
 fn write_depth(path: &Path, frame: &RenderedImage) -> Result<(), PixelError> {
-    let channels = [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+    let channels = [
+        Channel { name: "A", sample_type: SampleType::Half },
+        Channel { name: "Z", sample_type: SampleType::Float },
+    ];
     let (width, height) = (frame.colour.width, frame.colour.height);
     write_exr(
         path,
@@ -122,7 +151,8 @@ fn write_depth(path: &Path, frame: &RenderedImage) -> Result<(), PixelError> {
         |first, rows, samples| {
             let band = &frame.depth[first * width..(first + rows) * width];
             for (sample, depth) in samples.chunks_exact_mut(2).zip(band) {
-                sample.copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
+                sample
+                    .copy_from_slice(&[f32::from(u8::from(depth.is_some())), depth.unwrap_or(0.0)]);
             }
             Ok(())
         },

@@ -14,8 +14,8 @@ pub struct DepthError {
     pub missed: f64,
 }
 
-/// Errors of z-depth over the pixels where the truth sees a surface (`A` at least one half). `None` where channels `Z` and `A`
-/// are missing, sizes differ or nothing is seen.
+/// Errors of z-depth over the pixels where the truth sees a surface (`A` at least one half). `None`
+/// where channels `Z` and `A` are missing, sizes differ or nothing is seen.
 pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> {
     if (found.width, found.height) != (expected.width, expected.height) {
         return None;
@@ -26,7 +26,8 @@ pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> 
     if seen.is_empty() {
         return Some(DepthError::default());
     }
-    let mut errors: Vec<f64> = seen.iter().map(|&i| (f64::from(z[i]) - f64::from(true_z[i])).abs()).collect();
+    let mut errors: Vec<f64> =
+        seen.iter().map(|&i| (f64::from(z[i]) - f64::from(true_z[i])).abs()).collect();
     errors.sort_by(f64::total_cmp);
     let count = seen.len() as f64;
     Some(DepthError {
@@ -48,8 +49,11 @@ mod tests {
             channels: vec![("A".into(), a.to_vec()), ("Z".into(), z.to_vec())],
         };
         let truth = image([4.0, 5.0, 3.0, 0.0], [1.0, 1.0, 1.0, 0.0]);
-        let error = depth_error(&image([4.5, 5.0, 3.1, 9.0], [1.0, 0.2, 1.0, 1.0]), &truth).unwrap();
-        assert!((error.mean_absolute - 0.2).abs() < 1e-6 && (error.median_absolute - 0.1).abs() < 1e-6);
+        let error =
+            depth_error(&image([4.5, 5.0, 3.1, 9.0], [1.0, 0.2, 1.0, 1.0]), &truth).unwrap();
+        assert!(
+            (error.mean_absolute - 0.2).abs() < 1e-6 && (error.median_absolute - 0.1).abs() < 1e-6
+        );
         assert!((error.missed - 1.0 / 3.0).abs() < 1e-12);
         assert!(depth_error(&ExrImage { width: 1, height: 1, channels: vec![] }, &truth).is_none());
     }

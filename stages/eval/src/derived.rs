@@ -20,13 +20,20 @@ pub struct NearReferences {
     pub psnr: f64,
 }
 
-/// What the view that fares worst gains over the same view of another result, in dB. Views without HR truth are left out.
-pub(crate) fn least_gain(scored: &[ViewScores], baseline: &GivenInput) -> anyhow::Result<Option<f64>> {
+/// What the view that fares worst gains over the same view of another result, in dB. Views without
+/// HR truth are left out.
+pub(crate) fn least_gain(
+    scored: &[ViewScores],
+    baseline: &GivenInput,
+) -> anyhow::Result<Option<f64>> {
     let other: Metrics = baseline.read_json("metrics.json")?;
     let mut least: Option<f64> = None;
     for view in scored {
         let Some(before) = other.views.iter().find(|before| before.name == view.name) else {
-            let message = format!("input baseline: it has no view {}; score both on the same views", view.name);
+            let message = format!(
+                "input baseline: it has no view {}; score both on the same views",
+                view.name
+            );
             return Err(Failure::BadInput(message).into());
         };
         if let (Some(now), Some(before)) = (view.scores.psnr, before.scores.psnr) {
@@ -37,14 +44,23 @@ pub(crate) fn least_gain(scored: &[ViewScores], baseline: &GivenInput) -> anyhow
 }
 
 /// The scores of views near a reference; none where no view is.
-pub(crate) fn near_references(scored: &[ViewScores], truth: &Views, references: &Views) -> Option<NearReferences> {
+pub(crate) fn near_references(
+    scored: &[ViewScores],
+    truth: &Views,
+    references: &Views,
+) -> Option<NearReferences> {
     let least = NEAR.to_radians().cos();
-    let is_near = |camera: &Camera| references.views.iter().any(|other| cosine(camera, &other.camera) >= least);
+    let is_near = |camera: &Camera| {
+        references.views.iter().any(|other| cosine(camera, &other.camera) >= least)
+    };
     let near: Vec<f64> = (scored.iter().zip(&truth.views))
         .filter(|(_, view)| is_near(&view.camera))
         .filter_map(|(scores, _)| scores.scores.psnr)
         .collect();
-    (!near.is_empty()).then(|| NearReferences { views: near.len(), psnr: near.iter().sum::<f64>() / near.len() as f64 })
+    (!near.is_empty()).then(|| NearReferences {
+        views: near.len(),
+        psnr: near.iter().sum::<f64>() / near.len() as f64,
+    })
 }
 
 /// The cosine between two cameras' optical axes.
@@ -60,7 +76,12 @@ mod tests {
     use scene::{Background, Bounds, Distortion, Intrinsics, View};
 
     fn scores(name: &str, psnr: Option<f64>) -> ViewScores {
-        ViewScores { name: name.to_owned(), scores: Scores { psnr, ..Scores::default() }, error_map: String::new(), warp: None }
+        ViewScores {
+            name: name.to_owned(),
+            scores: Scores { psnr, ..Scores::default() },
+            error_map: String::new(),
+            warp: None,
+        }
     }
 
     /// Cameras that look along z, each turned about y by so many degrees.
@@ -68,8 +89,15 @@ mod tests {
         let camera = |degrees: &f64| {
             let (sine, cosine) = degrees.to_radians().sin_cos();
             let pose = [[cosine, 0.0, sine, 0.0], [0.0, 1.0, 0.0, 0.0], [-sine, 0.0, cosine, 0.0]];
-            let intrinsics =
-                Intrinsics { width: 4, height: 4, fx: 4.0, fy: 4.0, cx: 2.0, cy: 2.0, distortion: Distortion::default() };
+            let intrinsics = Intrinsics {
+                width: 4,
+                height: 4,
+                fx: 4.0,
+                fy: 4.0,
+                cx: 2.0,
+                cy: 2.0,
+                distortion: Distortion::default(),
+            };
             Camera { name: degrees.to_string(), intrinsics, camera_to_world: pose }
         };
         let view = |degrees: &f64| View::camera_only(camera(degrees));
@@ -78,8 +106,14 @@ mod tests {
 
     #[test]
     fn views_within_sixty_degrees_are_near() {
-        let scored = [scores("0", Some(30.0)), scores("59", Some(32.0)), scores("61", Some(50.0)), scores("180", Some(60.0))];
-        let near = near_references(&scored, &views(&[0.0, 59.0, 61.0, 180.0]), &views(&[0.0])).unwrap();
+        let scored = [
+            scores("0", Some(30.0)),
+            scores("59", Some(32.0)),
+            scores("61", Some(50.0)),
+            scores("180", Some(60.0)),
+        ];
+        let near =
+            near_references(&scored, &views(&[0.0, 59.0, 61.0, 180.0]), &views(&[0.0])).unwrap();
         assert_eq!((near.views, near.psnr), (2, 31.0));
         assert_eq!(near_references(&scored[3..], &views(&[180.0]), &views(&[0.0])), None);
         assert_eq!(near_references(&[scores("0", None)], &views(&[0.0]), &views(&[0.0])), None);
@@ -89,9 +123,21 @@ mod tests {
     fn the_least_gain_is_the_worst_views() {
         let folder = tempfile::tempdir().unwrap();
         let write = |names: &[(&str, f64)]| {
-            let views: Vec<ViewScores> = names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
-            let conventions = conventions(&Params::default(), &self::views(&[0.0]), &Perceptual::new(None).unwrap(), None);
-            let metrics = Metrics { conventions, mean: Scores::default(), least_gain: None, near_references: None, views };
+            let views: Vec<ViewScores> =
+                names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
+            let conventions = conventions(
+                &Params::default(),
+                &self::views(&[0.0]),
+                &Perceptual::new(None).unwrap(),
+                None,
+            );
+            let metrics = Metrics {
+                conventions,
+                mean: Scores::default(),
+                least_gain: None,
+                near_references: None,
+                views,
+            };
             artifact::write_json(&folder.path().join("metrics.json"), &metrics).unwrap();
             GivenInput::open("baseline", folder.path()).unwrap()
         };

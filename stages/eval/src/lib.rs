@@ -2,14 +2,16 @@
 //!
 //! * [`psnr`]: of the mean squared error over all samples; predictions clamped to [0, 1].
 //! * [`ssim`]: Gaussian window, reflected at the border and valid pixels only.
-//! * `lpips`: by SqueezeNet, AlexNet and VGG-16, each where its weights are given and the build has libtorch.
+//! * `lpips`: by SqueezeNet, AlexNet and VGG-16, each where its weights are given and the build has
+//!   libtorch.
 //! * [`depth_error`]: where the truth has depth.
 //! * [`WarpScore`]: a view's neighbour, brought over by the rendered depths, against the view.
-//! * [`LrScores`]: the same of the render shrunk to LR, by the kernel that made the LR images or is taken to have made them. Where
-//!   photographs are all there is, no HR truth exists, and this alone can be known.
+//! * [`LrScores`]: the same of the render shrunk to LR, by the kernel that made the LR images or is
+//!   taken to have made them. Where photographs are all there is, no HR truth exists, and this
+//!   alone can be known.
 //!
-//! Means over views are means of per-view values. Open backgrounds are scored on white. Where a view has a mask, what doesn't count is taken
-//! as right, and PSNR is that of the rest.
+//! Means over views are means of per-view values. Open backgrounds are scored on white. Where a
+//! view has a mask, what doesn't count is taken as right, and PSNR is that of the rest.
 
 mod depth;
 mod derived;
@@ -26,8 +28,8 @@ use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Sta
 use derived::{least_gain, near_references};
 use perceptual::{MISSING, Perceptual};
 use pixels::{
-    DEGRADATION_FILE, Degradation, Filter, Image, Mask, Palette, Resampling, Rgba8, heat, psnr_of, read_exr, read_premultiplied,
-    write_png,
+    DEGRADATION_FILE, Degradation, Filter, Image, Mask, Palette, Resampling, Rgba8, heat, psnr_of,
+    read_exr, read_premultiplied, write_png,
 };
 use rayon::prelude::*;
 use scene::{Background, View, Views};
@@ -104,7 +106,8 @@ pub struct Scores {
     /// Peak signal-to-noise ratio in dB, where there is HR truth; higher is better.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub psnr: Option<f64>,
-    /// Structural similarity, where there is HR truth; higher is better. Images are reflected at their borders, as PyTorch pads.
+    /// Structural similarity, where there is HR truth; higher is better. Images are reflected at
+    /// their borders, as PyTorch pads.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub ssim: Option<f64>,
     /// The same over pixels whose window is whole, as scikit-image has it.
@@ -122,7 +125,8 @@ pub struct Scores {
     /// Depth errors, where there is true depth.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<DepthError>,
-    /// The neighbour's true image brought over by depth, where there is HR truth and rendered depth.
+    /// The neighbour's true image brought over by depth, where there is HR truth and rendered
+    /// depth.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub warp: Option<WarpScore>,
     /// The shrunk render against the view's LR image, where there is one.
@@ -167,13 +171,26 @@ impl Stage for Eval {
         vec![
             ("views", Input::required(&["views"], "rendered views")),
             ("truth", Input::required(&["scene/truth"], "ground truth, views of the same names")),
-            ("baseline", Input::optional(&["metrics"], "scores of the same views to compare with, for the least gain of a view")),
-            ("references", Input::optional(&["scene/references"], "HR references, for scores of the views near one")),
+            (
+                "baseline",
+                Input::optional(
+                    &["metrics"],
+                    "scores of the same views to compare with, for the least gain of a view",
+                ),
+            ),
+            (
+                "references",
+                Input::optional(
+                    &["scene/references"],
+                    "HR references, for scores of the views near one",
+                ),
+            ),
             (
                 "weights",
                 Input::optional(
                     &["weights"],
-                    "folder with networks and their heads, for LPIPS: squeezenet1_1.safetensors and lpips_linear_squeeze_v0.1.safetensors, likewise alexnet and vgg16",
+                    "folder with networks and their heads, for LPIPS: squeezenet1_1.safetensors \
+                    and lpips_linear_squeeze_v0.1.safetensors, likewise alexnet and vgg16",
                 ),
             ),
         ]
@@ -188,10 +205,17 @@ impl Stage for Eval {
         let (views, truth) = (Views::read(views_in)?, Views::read(truth_in)?);
         let perceptual = Perceptual::new(context.optional_input("weights"))?;
         let is_known = truth_in.path(DEGRADATION_FILE).exists();
-        let made: Option<Degradation> = if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
+        let made: Option<Degradation> =
+            if is_known { Some(truth_in.read_json(DEGRADATION_FILE)?) } else { None };
         let filter = made.map_or(Filter::Box, |d| d.kernel.filter());
-        let job =
-            ScoringJob { context, params, perceptual: &perceptual, filter, views: (views_in, &views), truth: (truth_in, &truth) };
+        let job = ScoringJob {
+            context,
+            params,
+            perceptual: &perceptual,
+            filter,
+            views: (views_in, &views),
+            truth: (truth_in, &truth),
+        };
         let progress = context.progress("scoring", truth.views.len() as u64);
         let score = |view: &View| -> anyhow::Result<ViewScores> {
             context.check_interrupt()?;
@@ -205,8 +229,12 @@ impl Stage for Eval {
         let metrics = Metrics {
             conventions: conventions(params, &truth, &perceptual, made),
             mean: mean_of(&scored),
-            least_gain: baseline.map(|baseline| least_gain(&scored, baseline)).transpose()?.flatten(),
-            near_references: references.and_then(|references| near_references(&scored, &truth, &references)),
+            least_gain: baseline
+                .map(|baseline| least_gain(&scored, baseline))
+                .transpose()?
+                .flatten(),
+            near_references: references
+                .and_then(|references| near_references(&scored, &truth, &references)),
             views: scored,
         };
         context.write_json("metrics.json", &metrics)?;
@@ -230,24 +258,38 @@ impl ScoringJob<'_> {
         let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
         let name = &true_view.camera.name;
         let view = views.views.iter().find(|v| v.camera.name == *name);
-        let view = view.ok_or_else(|| Failure::BadInput(format!("views: none is named {name}, which the truth has")))?;
-        let image = view.image.as_ref().with_context(|| format!("view {name}: it has no image")).bad_input("views")?;
+        let view = view.ok_or_else(|| {
+            Failure::BadInput(format!("views: none is named {name}, which the truth has"))
+        })?;
+        let image = view
+            .image
+            .as_ref()
+            .with_context(|| format!("view {name}: it has no image"))
+            .bad_input("views")?;
         let found = read_view(views_in, view, image, views.background)?;
         let read_true = |file: &Option<String>| -> anyhow::Result<Option<Image>> {
             file.as_ref().map(|f| read_view(truth_in, true_view, f, truth.background)).transpose()
         };
-        let (mut expected, mut lr) = (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
-        let wanted = (true_view.camera.intrinsics.width as usize, true_view.camera.intrinsics.height as usize);
+        let (mut expected, mut lr) =
+            (read_true(&true_view.image)?, read_true(&true_view.low_resolution)?);
+        let wanted = (
+            true_view.camera.intrinsics.width as usize,
+            true_view.camera.intrinsics.height as usize,
+        );
         if wanted != (found.width, found.height) {
             let message = format!(
-                "view {name}: rendered at {}×{} where the truth has {}×{}; set size in render-depth",
+                "view {name}: rendered at {}×{} where the truth has {}×{}; set size in \
+                render-depth",
                 found.width, found.height, wanted.0, wanted.1
             );
             return Err(Failure::BadInput(message).into());
         }
         let size = |p: &Image| (p.width, p.height);
         if let Some(expected) = expected.as_ref().filter(|e| size(e) != wanted) {
-            let message = format!("view {name}: its image has {}×{} pixels, its camera others", expected.width, expected.height);
+            let message = format!(
+                "view {name}: its image has {}×{} pixels, its camera others",
+                expected.width, expected.height
+            );
             return Err(Failure::BadInput(message).into());
         }
         let shrunk = lr.as_ref().map(|lr| {
@@ -269,7 +311,10 @@ impl ScoringJob<'_> {
                     let mask = mask.resized(size(truth), 0);
                     mask.fill(truth, found);
                     if mask.share() == 0.0 {
-                        let message = format!("view {name}: its mask leaves no pixel to score; remove the view or its mask");
+                        let message = format!(
+                            "view {name}: its mask leaves no pixel to score; remove the view or \
+                            its mask"
+                        );
                         return Err(Failure::BadInput(message).into());
                     }
                     *decibels = 10.0 * mask.share().log10();
@@ -279,13 +324,21 @@ impl ScoringJob<'_> {
         let (shown, against) = match (&expected, &shrunk, &lr) {
             (Some(expected), ..) => (&found, expected),
             (None, Some(shrunk), Some(lr)) => (shrunk, lr),
-            _ => return Err(Failure::BadInput(format!("truth: view {name} has no image at all")).into()),
+            _ => {
+                return Err(
+                    Failure::BadInput(format!("truth: view {name} has no image at all")).into()
+                );
+            }
         };
         let error_map = format!("errors/{name}.png");
-        write_png(&self.context.output_path(&error_map)?, &draw_error(shown, against, self.params.error_range as f32))?;
+        write_png(
+            &self.context.output_path(&error_map)?,
+            &draw_error(shown, against, self.params.error_range as f32),
+        )?;
         let warped = expected.as_ref().map(|e| self.warp(view, e)).transpose()?.flatten();
         let similar = expected.as_ref().map(|e| ssim(&found, e));
-        let distances = expected.as_ref().map(|e| self.perceptual.distances(&found, e)).transpose()?;
+        let distances =
+            expected.as_ref().map(|e| self.perceptual.distances(&found, e)).transpose()?;
         let [lpips, lpips_alex, lpips_vgg] = distances.unwrap_or_default();
         let scores = Scores {
             psnr: expected.as_ref().map(|e| psnr(&found, e) + counted[0]),
@@ -299,26 +352,37 @@ impl ScoringJob<'_> {
             low_resolution: shrunk
                 .iter()
                 .zip(&lr)
-                .map(|(shrunk, lr)| LrScores { psnr: psnr(shrunk, lr) + counted[1], ssim: ssim(shrunk, lr).reflected })
+                .map(|(shrunk, lr)| LrScores {
+                    psnr: psnr(shrunk, lr) + counted[1],
+                    ssim: ssim(shrunk, lr).reflected,
+                })
                 .next(),
         };
         Ok(ViewScores { name: name.clone(), scores, error_map, warp: warped.map(|(_, file)| file) })
     }
 
-    /// The true image of a view's nearest neighbour, seen from the view by the rendered depths: its score and its file.
+    /// The true image of a view's nearest neighbour, seen from the view by the rendered depths: its
+    /// score and its file.
     fn warp(&self, view: &View, expected: &Image) -> anyhow::Result<Option<(WarpScore, String)>> {
         let ((views_in, views), (truth_in, truth)) = (self.views, self.truth);
         let Some(other) = warp::neighbour(&view.camera, &views.views) else { return Ok(None) };
         let other_truth = truth.views.iter().find(|v| v.camera.name == other.camera.name);
-        let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else { return Ok(None) };
-        let (Some(own), Some(theirs)) = (warp::read_surface(views_in, view)?, warp::read_surface(views_in, other)?) else {
+        let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?)))
+        else {
+            return Ok(None);
+        };
+        let (Some(own), Some(theirs)) =
+            (warp::read_surface(views_in, view)?, warp::read_surface(views_in, other)?)
+        else {
             return Ok(None);
         };
         let image = read_view(truth_in, other_view, file, truth.background)?;
         if (image.width, image.height) != (theirs.width, theirs.height) {
             return Ok(None);
         }
-        let Some((score, warped)) = warp::warp((&view.camera, &own, expected), (&other.camera, &theirs, &image)) else {
+        let Some((score, warped)) =
+            warp::warp((&view.camera, &own, expected), (&other.camera, &theirs, &image))
+        else {
             return Ok(None);
         };
         let file = format!("warps/{}.png", view.camera.name);
@@ -327,15 +391,26 @@ impl ScoringJob<'_> {
     }
 }
 
-/// Peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all samples. Predictions are clamped to [0, 1] by
-/// [`read_view`]; equal images, which have no PSNR, count as 100 dB.
+/// Peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all samples.
+/// Predictions are clamped to [0, 1] by [`read_view`]; equal images, which have no PSNR, count as
+/// 100 dB.
 pub fn psnr(found: &Image, expected: &Image) -> f64 {
-    let sum: f64 = found.data.iter().zip(&expected.data).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
+    let sum: f64 = found
+        .data
+        .iter()
+        .zip(&expected.data)
+        .map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2))
+        .sum();
     psnr_of(sum / found.data.len() as f64)
 }
 
 /// An image of a view over its background, clamped to [0, 1].
-fn read_view(input: &GivenInput, view: &View, file: &str, background: Background) -> anyhow::Result<Image> {
+fn read_view(
+    input: &GivenInput,
+    view: &View,
+    file: &str,
+    background: Background,
+) -> anyhow::Result<Image> {
     let place = format!("view {}", view.camera.name);
     let path = input.path(file);
     let mut image = read_premultiplied(&path).bad_input(&place)?.over(background.shown());
@@ -350,7 +425,8 @@ fn draw_error(found: &Image, expected: &Image, range: f32) -> Rgba8 {
         let [r, g, b] = heat(Palette::Error, error / range);
         [r, g, b, 255]
     };
-    let data = found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).flat_map(pixel).collect();
+    let data =
+        found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).flat_map(pixel).collect();
     Rgba8::new(found.width, found.height, data)
 }
 
@@ -392,8 +468,17 @@ fn mean_of(views: &[ViewScores]) -> Scores {
     }
 }
 
-fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Option<Degradation>) -> MetricConventions {
-    let masked = if truth.views.iter().any(|v| v.mask.is_some()) { "; of the pixels that masks leave" } else { "" };
+fn conventions(
+    params: &Params,
+    truth: &Views,
+    perceptual: &Perceptual,
+    made: Option<Degradation>,
+) -> MetricConventions {
+    let masked = if truth.views.iter().any(|v| v.mask.is_some()) {
+        "; of the pixels that masks leave"
+    } else {
+        ""
+    };
     let on = match truth.background {
         Background::Black => "black",
         Background::White | Background::Alpha => "white",
@@ -401,18 +486,31 @@ fn conventions(params: &Params, truth: &Views, perceptual: &Perceptual, made: Op
     };
     MetricConventions {
         background: on.to_owned(),
-        psnr: format!("-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in half precision, clamped; mean of per-view values{masked}"),
-        ssim: "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels; borders reflected (ssim), or pixels \
+        psnr: format!(
+            "-10 log10 of the mean squared error over pixels and channels in [0, 1]; \
+            prediction in half precision, clamped; mean of per-view values{masked}"
+        ),
+        ssim: "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and \
+            pixels; borders reflected (ssim), or pixels \
                whose window is whole (ssim_valid)"
             .to_owned(),
         lpips: perceptual.convention(),
-        depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one half there".to_owned(),
-        warp: "the true picture of the view whose camera is nearest, brought over by both rendered depths, against the view's own, where \
-               both see the same surface (depths within 2 %, or within a pixel as the view sees them; opacity at least one half)"
+        depth: "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity \
+            below one half there"
+            .to_owned(),
+        warp: "the true picture of the view whose camera is nearest, brought over by both \
+            rendered depths, against the view's own, where \
+               both see the same surface (depths within 2 %, or within a pixel as the view sees \
+               them; opacity at least one half)"
             .to_owned(),
         low_resolution: format!(
             "the render shrunk by {}, against the view's LR picture",
-            made.map_or_else(|| "a box, for want of a better guess".to_owned(), |d| format!("{:?}", d.kernel).to_lowercase())
+            made.map_or_else(
+                || "a box, for want of a better \
+                guess"
+                    .to_owned(),
+                |d| format!("{:?}", d.kernel).to_lowercase()
+            )
         ),
         error_maps: format!("mean absolute error of R, G, B; brightest at {}", params.error_range),
     }
@@ -423,11 +521,20 @@ fn summary(metrics: &Metrics) -> String {
     let mut parts = Vec::new();
     if let (Some(psnr), Some(ssim)) = (mean.psnr, mean.ssim) {
         parts.push(format!("PSNR {psnr:.2} dB · SSIM {ssim:.4}"));
-        let by = [("LPIPS", mean.lpips), ("LPIPS (AlexNet)", mean.lpips_alex), ("LPIPS (VGG-16)", mean.lpips_vgg)];
-        let known: Vec<String> = by.iter().filter_map(|(name, value)| Some(format!("{name} {:.4}", (*value)?))).collect();
+        let by = [
+            ("LPIPS", mean.lpips),
+            ("LPIPS (AlexNet)", mean.lpips_alex),
+            ("LPIPS (VGG-16)", mean.lpips_vgg),
+        ];
+        let known: Vec<String> = by
+            .iter()
+            .filter_map(|(name, value)| Some(format!("{name} {:.4}", (*value)?)))
+            .collect();
         parts.push(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") });
     }
-    parts.extend(mean.depth.map(|d| format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)));
+    parts.extend(mean.depth.map(|d| {
+        format!("depth error {:.4} mean, {:.4} median", d.mean_absolute, d.median_absolute)
+    }));
     if let (Some(lr), None) = (mean.low_resolution, mean.psnr) {
         parts.push(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", lr.psnr, lr.ssim));
     }

@@ -1,4 +1,5 @@
-//! LPIPS v0.1 (Zhang et al. 2018): distances of a network's normalised features after each of its stages, weighted by learned heads.
+//! LPIPS v0.1 (Zhang et al. 2018): distances of a network's normalised features after each of its
+//! stages, weighted by learned heads.
 
 use std::path::Path;
 
@@ -20,7 +21,8 @@ pub struct Lpips {
 enum LpipsLayer {
     /// A convolution and a ReLU.
     Conv { conv: Conv, stride: i64, padding: i64 },
-    /// SqueezeNet's: squeezed to few channels, expanded by 1×1 and 3×3 side by side; a ReLU after each.
+    /// SqueezeNet's: squeezed to few channels, expanded by 1×1 and 3×3 side by side; a ReLU after
+    /// each.
     Fire { squeeze: Conv, expand1: Conv, expand3: Conv },
     /// The largest of a square; at the border of what is left of one, or of whole ones alone.
     Pool { size: i64, border: bool },
@@ -39,15 +41,28 @@ struct LayerReader<'a> {
 
 impl LayerReader<'_> {
     /// A convolution with torchvision's index in `features`.
-    fn conv(&mut self, index: usize, outputs: i64, size: i64, stride: i64, padding: i64) -> Result<(), WeightsError> {
-        let conv = Conv::read(self.weights, &format!("features.{index}"), [outputs, self.channels, size, size])?;
+    fn conv(
+        &mut self,
+        index: usize,
+        outputs: i64,
+        size: i64,
+        stride: i64,
+        padding: i64,
+    ) -> Result<(), WeightsError> {
+        let conv = Conv::read(
+            self.weights,
+            &format!("features.{index}"),
+            [outputs, self.channels, size, size],
+        )?;
         self.layers.push(LpipsLayer::Conv { conv, stride, padding });
         self.channels = outputs;
         Ok(())
     }
 
     fn fire(&mut self, index: usize, squeezed: i64, expanded: i64) -> Result<(), WeightsError> {
-        let conv = |part: &str, shape| Conv::read(self.weights, &format!("features.{index}.{part}"), shape);
+        let conv = |part: &str, shape| {
+            Conv::read(self.weights, &format!("features.{index}.{part}"), shape)
+        };
         self.layers.push(LpipsLayer::Fire {
             squeeze: conv("squeeze", [squeezed, self.channels, 1, 1])?,
             expand1: conv("expand1x1", [expanded, squeezed, 1, 1])?,
@@ -76,7 +91,9 @@ impl LayerReader<'_> {
             self.stage();
         }
         self.pool(3, true);
-        for (index, squeezed, expanded) in [(9, 48, 192), (10, 48, 192), (11, 64, 256), (12, 64, 256)] {
+        for (index, squeezed, expanded) in
+            [(9, 48, 192), (10, 48, 192), (11, 64, 256), (12, 64, 256)]
+        {
             self.fire(index, squeezed, expanded)?;
             self.stage();
         }
@@ -100,8 +117,13 @@ impl LayerReader<'_> {
 
     /// VGG-16.
     fn vgg(&mut self) -> Result<(), WeightsError> {
-        let blocks: [(i64, &[usize]); 5] =
-            [(64, &[0, 2]), (128, &[5, 7]), (256, &[10, 12, 14]), (512, &[17, 19, 21]), (512, &[24, 26, 28])];
+        let blocks: [(i64, &[usize]); 5] = [
+            (64, &[0, 2]),
+            (128, &[5, 7]),
+            (256, &[10, 12, 14]),
+            (512, &[17, 19, 21]),
+            (512, &[24, 26, 28]),
+        ];
         for (block, (outputs, convs)) in blocks.into_iter().enumerate() {
             if block > 0 {
                 self.pool(2, false);
@@ -123,9 +145,14 @@ impl LpipsLayer {
             Self::Conv { conv, stride, padding } => relu(conv, x, *stride, *padding),
             Self::Fire { squeeze, expand1, expand3 } => {
                 let squeezed = relu(squeeze, x, 1, 0)?;
-                Tensor::f_cat(&[relu(expand1, &squeezed, 1, 0)?, relu(expand3, &squeezed, 1, 1)?], 1)
+                Tensor::f_cat(
+                    &[relu(expand1, &squeezed, 1, 0)?, relu(expand3, &squeezed, 1, 1)?],
+                    1,
+                )
             }
-            Self::Pool { size, border } => x.f_max_pool2d([*size; 2], [2, 2], [0, 0], [1, 1], *border),
+            Self::Pool { size, border } => {
+                x.f_max_pool2d([*size; 2], [2, 2], [0, 0], [1, 1], *border)
+            }
             Self::Stage => Ok(x.shallow_clone()),
         }
     }
@@ -136,14 +163,18 @@ impl Lpips {
     pub fn read(folder: &Path, network: LpipsNetwork) -> Result<Self, WeightsError> {
         nets::deterministic();
         let [net, linear] = network.files();
-        let (net, linear) = (Weights::read(&folder.join(net))?, Weights::read(&folder.join(linear))?);
-        let mut reader = LayerReader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
+        let (net, linear) =
+            (Weights::read(&folder.join(net))?, Weights::read(&folder.join(linear))?);
+        let mut reader =
+            LayerReader { weights: &net, layers: Vec::new(), channels: 3, stages: Vec::new() };
         let least = match network {
             LpipsNetwork::Squeeze => reader.squeeze().map(|()| 17),
             LpipsNetwork::Alex => reader.alex().map(|()| 31),
             LpipsNetwork::Vgg => reader.vgg().map(|()| 16),
         }?;
-        let head = |(k, &channels): (usize, &i64)| linear.tensor(&format!("lin{k}.model.1.weight"), &[1, channels, 1, 1]);
+        let head = |(k, &channels): (usize, &i64)| {
+            linear.tensor(&format!("lin{k}.model.1.weight"), &[1, channels, 1, 1])
+        };
         let heads = reader.stages.iter().enumerate().map(head).collect::<Result<_, _>>()?;
         Ok(Self { layers: reader.layers, heads, least })
     }
@@ -169,7 +200,8 @@ impl Lpips {
                 && let Some(head) = heads.next()
             {
                 let difference = normalised(&a)?.f_sub(&normalised(&b)?)?.f_square()?;
-                let weighted = difference.f_conv2d::<Tensor>(head, None, [1, 1], [0, 0], [1, 1], 1)?;
+                let weighted =
+                    difference.f_conv2d::<Tensor>(head, None, [1, 1], [0, 0], [1, 1], 1)?;
                 sum += weighted.f_mean(Kind::Float)?.f_double_value(&[])?;
             }
         }

@@ -4,7 +4,8 @@ use pixels::Image;
 #[cfg(feature = "torch")]
 use crate::Lpips;
 
-/// Networks whose features LPIPS compares. Their distances differ: name the network beside the figure.
+/// Networks whose features LPIPS compares. Their distances differ: name the network beside the
+/// figure.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LpipsNetwork {
     /// SqueezeNet 1.1.
@@ -19,7 +20,8 @@ impl LpipsNetwork {
     /// All of them, in the order in which their distances are given.
     pub const ALL: [Self; 3] = [Self::Squeeze, Self::Alex, Self::Vgg];
 
-    /// Names of the files with its weights (torchvision's names of tensors) and with the learned heads.
+    /// Names of the files with its weights (torchvision's names of tensors) and with the learned
+    /// heads.
     pub fn files(self) -> [&'static str; 2] {
         match self {
             Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
@@ -45,7 +47,8 @@ pub(crate) struct Perceptual {
     readers: Vec<LpipsPool>,
 }
 
-/// A network's files, and copies of it that are free; a thread that finds none reads another, since libtorch's tensors can't be shared.
+/// A network's files, and copies of it that are free; a thread that finds none reads another, since
+/// libtorch's tensors can't be shared.
 #[cfg(feature = "torch")]
 struct LpipsPool {
     folder: std::path::PathBuf,
@@ -56,7 +59,8 @@ struct LpipsPool {
 #[cfg(feature = "torch")]
 impl LpipsPool {
     fn new(folder: &std::path::Path, network: LpipsNetwork) -> anyhow::Result<Self> {
-        let reader = Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
+        let reader =
+            Self { folder: folder.to_path_buf(), network, free: std::sync::Mutex::default() };
         reader.keep(reader.take()?);
         Ok(reader)
     }
@@ -80,19 +84,33 @@ impl LpipsPool {
 impl Perceptual {
     /// Those of a folder. One that has no whole network is refused.
     pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
-        let Some(folder) = weights.map(GivenInput::folder) else { return Ok(Self { given: Vec::new(), readers: Vec::new() }) };
-        let is_there = |network: &LpipsNetwork| network.files().iter().all(|file| folder.join(file).is_file());
+        let Some(folder) = weights.map(GivenInput::folder) else {
+            return Ok(Self { given: Vec::new(), readers: Vec::new() });
+        };
+        let is_there =
+            |network: &LpipsNetwork| network.files().iter().all(|file| folder.join(file).is_file());
         let given: Vec<LpipsNetwork> = LpipsNetwork::ALL.into_iter().filter(is_there).collect();
         if given.is_empty() {
-            let message = format!("input weights: {}: no network is there; {}", folder.display(), wanted(&LpipsNetwork::ALL));
+            let message = format!(
+                "input weights: {}: no network is there; {}",
+                folder.display(),
+                wanted(&LpipsNetwork::ALL)
+            );
             return Err(Failure::BadInput(message).into());
         }
-        let readers = given.iter().map(|&network| LpipsPool::new(folder, network)).collect::<anyhow::Result<_>>()?;
+        let readers = given
+            .iter()
+            .map(|&network| LpipsPool::new(folder, network))
+            .collect::<anyhow::Result<_>>()?;
         Ok(Self { given, readers })
     }
 
     /// Distances by each network, in the order of [`LpipsNetwork::ALL`].
-    pub(crate) fn distances(&self, found: &Image, expected: &Image) -> anyhow::Result<[Option<f64>; 3]> {
+    pub(crate) fn distances(
+        &self,
+        found: &Image,
+        expected: &Image,
+    ) -> anyhow::Result<[Option<f64>; 3]> {
         let mut distances = [None; 3];
         for reader in &self.readers {
             let lpips = reader.take()?;
@@ -104,11 +122,16 @@ impl Perceptual {
 }
 
 #[cfg(not(feature = "torch"))]
-#[allow(clippy::unused_self, clippy::unnecessary_wraps, reason = "the same face with and without libtorch")]
+#[allow(
+    clippy::unused_self,
+    clippy::unnecessary_wraps,
+    reason = "the same face with and without libtorch"
+)]
 impl Perceptual {
     pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
         if weights.is_some() {
-            let message = "input weights: this build has no libtorch, which LPIPS needs; build eval with its default features";
+            let message = "input weights: this build has no libtorch, which LPIPS needs; build \
+                eval with its default features";
             return Err(Failure::Usage(message.to_owned()).into());
         }
         Ok(Self { given: Vec::new() })
@@ -125,12 +148,17 @@ pub(crate) const MISSING: &str = "weights not given";
 impl Perceptual {
     /// Which networks there are, and what is lacking for the others.
     pub(crate) fn convention(&self) -> String {
-        let lacking: Vec<LpipsNetwork> = LpipsNetwork::ALL.into_iter().filter(|network| !self.given.contains(network)).collect();
+        let lacking: Vec<LpipsNetwork> =
+            LpipsNetwork::ALL.into_iter().filter(|network| !self.given.contains(network)).collect();
         if self.given.is_empty() {
             return format!("{MISSING}: {}", wanted(&lacking));
         }
         let by: Vec<&str> = self.given.iter().map(|network| network.title()).collect();
-        let missing = if lacking.is_empty() { String::new() } else { format!("; {MISSING} for others: {}", wanted(&lacking)) };
+        let missing = if lacking.is_empty() {
+            String::new()
+        } else {
+            format!("; {MISSING} for others: {}", wanted(&lacking))
+        };
         format!("v0.1, inputs in [-1, 1], by {}{missing}", by.join(", "))
     }
 }
@@ -143,7 +171,8 @@ fn wanted(networks: &[LpipsNetwork]) -> String {
     };
     let pairs: Vec<String> = networks.iter().map(pair).collect();
     format!(
-        "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as safetensors)",
+        "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as \
+        safetensors)",
         pairs.join(", or ")
     )
 }

@@ -5,17 +5,20 @@ use pixels::Image;
 pub struct Ssim {
     /// The image is mirrored without repeating its edge, as PyTorch pads: every pixel counts.
     pub reflected: f64,
-    /// Only pixels whose window lies inside count: scikit-image's scalar. Where there is none, all count.
+    /// Only pixels whose window lies inside count: scikit-image's scalar. Where there is none, all
+    /// count.
     pub valid: f64,
 }
 
 const RADIUS: usize = 5;
 
-/// Mean structural similarity (Wang et al. 2004): Gaussian window of 11×11 with σ 1.5, data range 1, in f64; mean over the
-/// channels. An image narrower than the window is reflected as often as it takes.
+/// Mean structural similarity (Wang et al. 2004): Gaussian window of 11×11 with σ 1.5, data range
+/// 1, in f64; mean over the channels. An image narrower than the window is reflected as often as it
+/// takes.
 pub fn ssim(a: &Image, b: &Image) -> Ssim {
     let channel = |c: usize| {
-        let plane = |p: &Image| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
+        let plane =
+            |p: &Image| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
         of_planes(&plane(a), &plane(b), a.width, a.height)
     };
     let channels: Vec<Ssim> = (0..a.channels).map(channel).collect();
@@ -24,17 +27,20 @@ pub fn ssim(a: &Image, b: &Image) -> Ssim {
 }
 
 fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize) -> Ssim {
-    let product = |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
+    let product =
+        |a: &[f64], b: &[f64]| -> Vec<f64> { a.iter().zip(b).map(|(a, b)| a * b).collect() };
     let blurred = |plane: &[f64]| blur(plane, width, height);
     let (mx, my) = (blurred(x), blurred(y));
     let (xx, yy, xy) = (blurred(&product(x, x)), blurred(&product(y, y)), blurred(&product(x, y)));
     let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
     let at = |i: usize| {
         let (vx, vy, cov) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
-        ((2.0 * mx[i] * my[i] + c1) * (2.0 * cov + c2)) / ((mx[i] * mx[i] + my[i] * my[i] + c1) * (vx + vy + c2))
+        ((2.0 * mx[i] * my[i] + c1) * (2.0 * cov + c2))
+            / ((mx[i] * mx[i] + my[i] * my[i] + c1) * (vx + vy + c2))
     };
     let inside = |margin: usize| {
-        let pixels = (margin..height - margin).flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
+        let pixels = (margin..height - margin)
+            .flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
         pixels.map(at).sum::<f64>() / ((width - 2 * margin) * (height - 2 * margin)) as f64
     };
     let reflected = inside(0);
@@ -44,7 +50,9 @@ fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize) -> Ssim {
 
 /// Gaussian blur, reflected at the border.
 fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
-    let raw: Vec<f64> = (0..=2 * RADIUS).map(|k| (-((k as f64 - RADIUS as f64).powi(2)) / (2.0 * 1.5 * 1.5)).exp()).collect();
+    let raw: Vec<f64> = (0..=2 * RADIUS)
+        .map(|k| (-((k as f64 - RADIUS as f64).powi(2)) / (2.0 * 1.5 * 1.5)).exp())
+        .collect();
     let sum: f64 = raw.iter().sum();
     let taps: Vec<f64> = raw.iter().map(|w| w / sum).collect();
     let along = |plane: &[f64], stride: usize, length: usize| -> Vec<f64> {
@@ -52,7 +60,10 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
             .map(|i| {
                 let at = i / stride % length;
                 let line = i - at * stride;
-                taps.iter().enumerate().map(|(k, w)| w * plane[line + stride * reflected(at + k, length)]).sum()
+                taps.iter()
+                    .enumerate()
+                    .map(|(k, w)| w * plane[line + stride * reflected(at + k, length)])
+                    .sum()
             })
             .collect()
     };

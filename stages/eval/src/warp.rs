@@ -4,7 +4,8 @@ use scene::{Camera, Surface, View};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A view's true image against its neighbour's, brought over by the rendered depths: depth is right where colours agree.
+/// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
+/// where colours agree.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct WarpScore {
@@ -29,9 +30,13 @@ pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Op
     Ok((whole && image.channel("Z").is_some() && image.channel("A").is_some()).then_some(image))
 }
 
-/// Brings the neighbour's image over to a view and compares. The image shows what was brought over; what the neighbour doesn't
-/// see is red. Images have the sizes of the views. `None` where it sees nothing.
-pub(crate) fn warp(view: (&Camera, &ExrImage, &Image), other: (&Camera, &ExrImage, &Image)) -> Option<(WarpScore, Rgba8)> {
+/// Brings the neighbour's image over to a view and compares. The image shows what was brought over;
+/// what the neighbour doesn't see is red. Images have the sizes of the views. `None` where it sees
+/// nothing.
+pub(crate) fn warp(
+    view: (&Camera, &ExrImage, &Image),
+    other: (&Camera, &ExrImage, &Image),
+) -> Option<(WarpScore, Rgba8)> {
     const UNSEEN: [u8; 4] = [120, 20, 30, 255];
     let from = surface(view.0, view.1)?;
     let places = from.seen_from(&surface(other.0, other.1)?);
@@ -49,7 +54,8 @@ pub(crate) fn warp(view: (&Camera, &ExrImage, &Image), other: (&Camera, &ExrImag
     }
     let share = seen as f64 / places.len().max(1) as f64;
     let psnr = psnr_of(sum / (3 * seen) as f64);
-    (seen > 0).then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
+    (seen > 0)
+        .then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
 }
 
 fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
@@ -90,7 +96,9 @@ mod tests {
             Image::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
         };
         let (a, b) = (camera("a", 0.0), camera("b", 0.1));
-        let score = |depth: f32| warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap();
+        let score = |depth: f32| {
+            warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap()
+        };
         let (right, shown) = score(2.0);
         assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
         // What lies left of the neighbour's shown isn't seen.
@@ -101,7 +109,9 @@ mod tests {
 
     #[test]
     fn the_neighbour_is_the_nearest_other_view() {
-        let views: Vec<View> = [("a", 0.0), ("b", 1.0), ("c", 1.2)].map(|(n, x)| View::camera_only(camera(n, x))).into();
+        let views: Vec<View> = [("a", 0.0), ("b", 1.0), ("c", 1.2)]
+            .map(|(n, x)| View::camera_only(camera(n, x)))
+            .into();
         assert_eq!(neighbour(&views[0].camera, &views).unwrap().camera.name, "b");
         assert_eq!(neighbour(&views[1].camera, &views).unwrap().camera.name, "c");
         assert!(neighbour(&views[0].camera, &views[..1]).is_none());

@@ -10,10 +10,15 @@ use pixels::Image;
 
 /// f64 in the goldens, f32 in an image: the blend is rounded here, which costs about 1e-8.
 fn images(width: usize, height: usize, seed: u32) -> (Image, Image) {
-    let bytes = |seed| -> Vec<f64> { pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect() };
+    let bytes = |seed| -> Vec<f64> {
+        pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect()
+    };
     let (a, other) = (bytes(seed), bytes(seed + 100));
     let b = a.iter().zip(&other).map(|(a, o)| (0.7 * a + 0.3 * o) as f32).collect();
-    (Image::new(width, height, 3, a.iter().map(|&v| v as f32).collect()), Image::new(width, height, 3, b))
+    (
+        Image::new(width, height, 3, a.iter().map(|&v| v as f32).collect()),
+        Image::new(width, height, 3, b),
+    )
 }
 
 #[test]
@@ -43,8 +48,10 @@ fn one_pixel_and_narrow_images_have_an_ssim() {
 #[cfg(feature = "torch")]
 #[test]
 fn lpips_gives_the_published_distances() {
-    let data = std::env::var("NERF_SR_DATA")
-        .map_or_else(|_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into(), std::path::PathBuf::from);
+    let data = std::env::var("NERF_SR_DATA").map_or_else(
+        |_| concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data").into(),
+        std::path::PathBuf::from,
+    );
     let weights = data.join("weights");
     if !weights.is_dir() {
         eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", weights.display());
@@ -73,18 +80,30 @@ fn lpips_is_that_of_pytorch_with_every_network() {
         for (part, file) in ["weights", "heads"].iter().zip(network.files()) {
             let tensors = case[part].as_array().unwrap().iter().map(|entry| {
                 let shape: Vec<i64> = serde_json::from_value(entry["shape"].clone()).unwrap();
-                let (scale, shift) = (entry["scale"].as_f64().unwrap() as f32, entry["shift"].as_f64().unwrap() as f32);
+                let (scale, shift) = (
+                    entry["scale"].as_f64().unwrap() as f32,
+                    entry["shift"].as_f64().unwrap() as f32,
+                );
                 let count = shape.iter().product::<i64>() as u64;
-                let values: Vec<f32> = (0..count).map(|i| scale * counter_rng::uniform(7, purpose, i) + shift).collect();
+                let values: Vec<f32> = (0..count)
+                    .map(|i| scale * counter_rng::uniform(7, purpose, i) + shift)
+                    .collect();
                 purpose += 1;
-                (entry["name"].as_str().unwrap().to_owned(), tch::Tensor::from_slice(&values).reshape(&shape))
+                (
+                    entry["name"].as_str().unwrap().to_owned(),
+                    tch::Tensor::from_slice(&values).reshape(&shape),
+                )
             });
             nets::write(&folder.path().join(file), &tensors.collect::<Vec<_>>()).unwrap();
         }
         let lpips = eval::Lpips::read(folder.path(), network).unwrap();
         let (a, b) = images(45, 37, 9);
-        let (found, expected) = (lpips.distance(&a, &b).unwrap(), case["distance"].as_f64().unwrap());
-        assert!((found / expected - 1.0).abs() < 1e-4, "{name}: {found} where PyTorch has {expected}");
+        let (found, expected) =
+            (lpips.distance(&a, &b).unwrap(), case["distance"].as_f64().unwrap());
+        assert!(
+            (found / expected - 1.0).abs() < 1e-4,
+            "{name}: {found} where PyTorch has {expected}"
+        );
         let (a, b) = images(15, 15, 9);
         assert!(lpips.distance(&a, &b).unwrap_err().to_string().contains("at least"));
     }

@@ -12,7 +12,8 @@ use crate::frame_name;
 
 /// Views that are looked at, spread evenly: enough to tell nine of ten.
 pub(crate) const LOOKED_AT: usize = 20;
-/// Levels by which a flat colour may vary: JPEG's noise beside nothing else. A clear sky varies by more from corner to corner.
+/// Levels by which a flat colour may vary: JPEG's noise beside nothing else. A clear sky varies by
+/// more from corner to corner.
 const NOISE: u8 = 8;
 
 /// What lies behind a scene.
@@ -44,9 +45,12 @@ impl Border {
             return Self::Transparent;
         }
         let (width, height) = (image.width, image.height);
-        let pixel = |x: usize, y: usize| -> [u8; 3] { std::array::from_fn(|c| image.data[4 * (y * width + x) + c]) };
+        let pixel = |x: usize, y: usize| -> [u8; 3] {
+            std::array::from_fn(|c| image.data[4 * (y * width + x) + c])
+        };
         let rows = (0..width).flat_map(|x| [pixel(x, 0), pixel(x, height - 1)]);
-        let border: Vec<[u8; 3]> = rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
+        let border: Vec<[u8; 3]> =
+            rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
         let middle = median(&border);
         let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
         if 10 * alike >= 9 * border.len() { Self::Flat(middle) } else { Self::Mixed }
@@ -63,21 +67,25 @@ pub(crate) struct Borders {
 }
 
 impl Borders {
-    /// Of all that were looked at. One image with alpha makes all transparent. A flat colour must be that of nine in ten views.
+    /// Of all that were looked at. One image with alpha makes all transparent. A flat colour must
+    /// be that of nine in ten views.
     pub(crate) fn new(borders: &[Border]) -> Self {
         let views = borders.len();
         if borders.contains(&Border::Transparent) {
             return Self { behind: Behind::Transparent, flat: 0, views };
         }
-        let colour = |border: &Border| if let Border::Flat(colour) = border { Some(*colour) } else { None };
+        let colour =
+            |border: &Border| if let Border::Flat(colour) = border { Some(*colour) } else { None };
         let known: Vec<[u8; 3]> = borders.iter().filter_map(colour).collect();
         let common = median(&known);
         let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
-        let behind = if views > 0 && 10 * flat >= 9 * views { Behind::Flat(common) } else { Behind::Scene };
+        let behind =
+            if views > 0 && 10 * flat >= 9 * views { Behind::Flat(common) } else { Behind::Scene };
         Self { behind, flat, views }
     }
 
-    /// What rays see behind everything. A flat colour that is neither white nor black counts as a wall, a part of the scene.
+    /// What rays see behind everything. A flat colour that is neither white nor black counts as a
+    /// wall, a part of the scene.
     pub(crate) fn background(&self) -> Background {
         match self.behind {
             Behind::Transparent => Background::White,
@@ -96,12 +104,17 @@ impl Display for Borders {
         match self.behind {
             Behind::Transparent => write!(f, "images have alpha"),
             Behind::Flat([r, g, b]) => {
-                write!(f, "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of {of} looked at")
+                write!(
+                    f,
+                    "images have no alpha; borders are one flat colour ({r} {g} {b}) in {flat} of \
+                    {of} looked at"
+                )
             }
             Behind::Scene => {
                 write!(
                     f,
-                    "images have no alpha, and borders of one flat colour in {flat} of {of} looked at: the scene goes on behind"
+                    "images have no alpha, and borders of one flat colour in {flat} of {of} \
+                    looked at: the scene goes on behind"
                 )
             }
         }
@@ -121,10 +134,12 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
     })
 }
 
-/// Looks at the borders of training views, spread evenly; where the first has alpha, at no other. No more images than threads are
-/// held at once.
+/// Looks at the borders of training views, spread evenly; where the first has alpha, at no other.
+/// No more images than threads are held at once.
 pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
-    let look = |frame: &Frame| -> anyhow::Result<Border> { Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?)) };
+    let look = |frame: &Frame| -> anyhow::Result<Border> {
+        Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?))
+    };
     let count = frames.len().min(LOOKED_AT);
     if count > 0 && look(frames[0])? == Border::Transparent {
         return Ok(Borders::new(&[Border::Transparent]));
@@ -137,12 +152,17 @@ pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
 mod tests {
     use super::*;
 
-    /// A picture of 20×10 pixels: a border of a colour with some noise, and something in the middle, which may touch the border.
+    /// A picture of 20×10 pixels: a border of a colour with some noise, and something in the
+    /// middle, which may touch the border.
     fn picture(border: [u8; 3], noise: u8, touching: usize) -> Rgba8 {
         let pixel = |at: usize| -> [u8; 4] {
             let (x, y) = (at % 20, at / 20);
             let inside = (5..15).contains(&x) && (3..7).contains(&y) || y == 0 && x < touching;
-            let [r, g, b] = if inside { [90, 40, 200] } else { border.map(|v| v.saturating_sub(at as u8 % (noise + 1))) };
+            let [r, g, b] = if inside {
+                [90, 40, 200]
+            } else {
+                border.map(|v| v.saturating_sub(at as u8 % (noise + 1)))
+            };
             [r, g, b, u8::MAX]
         };
         Rgba8::new(20, 10, (0..200).flat_map(pixel).collect())
@@ -159,7 +179,8 @@ mod tests {
         assert_eq!(white.background(), Background::White);
         assert_eq!(
             white.to_string(),
-            "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 views looked at"
+            "images have no alpha; borders are one flat colour (251 251 251) in 3 of 3 views \
+            looked at"
         );
         assert_eq!(of(&views(&picture([3; 3], 3, 0), 1)).background(), Background::Black);
         // A tenth of a border may be something else, and a tenth of the views.
@@ -183,6 +204,9 @@ mod tests {
         let mut image = picture([10, 200, 30], 90, 0);
         image.data[7] = 254;
         let borders = of(&[picture([0; 3], 0, 0), image]);
-        assert_eq!((borders.behind, borders.background()), (Behind::Transparent, Background::White));
+        assert_eq!(
+            (borders.behind, borders.background()),
+            (Behind::Transparent, Background::White)
+        );
     }
 }

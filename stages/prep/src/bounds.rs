@@ -20,7 +20,8 @@ pub enum SpaceKind {
 pub enum SpaceError {
     /// Nothing says how near the scene comes.
     #[error(
-        "parameter space: ndc needs to know how near and far each view sees, and the data set doesn't say; give near and far, or choose box"
+        "parameter space: ndc needs to know how near and far each view sees, and the data set \
+        doesn't say; give near and far, or choose box"
     )]
     NoDepths,
     /// Cameras that look every way.
@@ -34,10 +35,12 @@ const BEYOND: f64 = 2.5;
 /// A posed view, and between which depths it sees anything, where that is known.
 pub type SeenDepths = (Camera, Option<[f64; 2]>);
 
-/// Where the scene is, and the space that suits it. It is NDC where all cameras look one way and the depths they see are known, the
-/// contraction where something is known to lie far outside the box, else the box. Where images say that the scene goes on behind what is looked
-/// at (`goes_on`) and depths aren't known, no box is known to hold it: depths are guessed where cameras look one way, and elsewhere it is the
-/// contraction. A `kind` that is given is taken. The box is that of the training views; `others` are cameras that will look, too.
+/// Where the scene is, and the space that suits it. It is NDC where all cameras look one way and
+/// the depths they see are known, the contraction where something is known to lie far outside the
+/// box, else the box. Where images say that the scene goes on behind what is looked at (`goes_on`)
+/// and depths aren't known, no box is known to hold it: depths are guessed where cameras look one
+/// way, and elsewhere it is the contraction. A `kind` that is given is taken. The box is that of
+/// the training views; `others` are cameras that will look, too.
 pub fn place(
     training: &[SeenDepths],
     others: &[SeenDepths],
@@ -59,31 +62,39 @@ pub fn place(
         Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
         None => Ok(match ndc() {
             Ok(bounds) => bounds,
-            Err(_) if goes_on_unseen || reaches_beyond(&boxed, training) => contracted(boxed, training),
+            Err(_) if goes_on_unseen || reaches_beyond(&boxed, training) => {
+                contracted(boxed, training)
+            }
             Err(_) => boxed,
         }),
     }
 }
 
-/// Share of the distance to what cameras look at before which nothing is taken to lie, and how many times as far they see.
+/// Share of the distance to what cameras look at before which nothing is taken to lie, and how many
+/// times as far they see.
 const GUESSED: [f64; 2] = [0.25, 50.0];
 
-/// Depths that cameras which look one way may see, by the cameras alone: around the point that they look at, or where their axes are parallel,
-/// around a place four times as far away as they stand apart. Too near a guess costs detail and loses nothing. `None` where they look every
-/// way, or stand in one place.
+/// Depths that cameras which look one way may see, by the cameras alone: around the point that they
+/// look at, or where their axes are parallel, around a place four times as far away as they stand
+/// apart. Too near a guess costs detail and loses nothing. `None` where they look every way, or
+/// stand in one place.
 fn guessed_depths(sights: &[SeenDepths]) -> Option<[f64; 2]> {
     let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
     let forward = common_direction(cameras.iter().copied())?;
     let mean = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
     let apart = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
-    let focus = crossing(&cameras, PARALLEL).map(|point| (point - mean).dot(forward)).filter(|distance| *distance > apart);
+    let focus = crossing(&cameras, PARALLEL)
+        .map(|point| (point - mean).dot(forward))
+        .filter(|distance| *distance > apart);
     let distance = focus.unwrap_or(4.0 * apart);
     (distance > 0.0).then(|| GUESSED.map(|factor| factor * distance))
 }
 
 /// What all cameras see, from the middle of them: the frustum of NDC.
 fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
-    let mean = |f: &dyn Fn(&Camera) -> DVec3| sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64;
+    let mean = |f: &dyn Fn(&Camera) -> DVec3| {
+        sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64
+    };
     let forward = common_direction(sights.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
     let up = mean(&|c| c.rotation().y_axis);
     let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
@@ -105,7 +116,8 @@ fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
                 return Err(SpaceError::NotForward);
             }
             for (i, slope) in [p.x / p.z, p.y / p.z].into_iter().enumerate() {
-                (frustum.min[i], frustum.max[i]) = (frustum.min[i].min(slope), frustum.max[i].max(slope));
+                (frustum.min[i], frustum.max[i]) =
+                    (frustum.min[i].min(slope), frustum.max[i].max(slope));
             }
             (frustum.near, frustum.far) = (frustum.near.min(p.z), frustum.far.max(p.z));
         }
@@ -123,19 +135,31 @@ fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
     2 * sights.iter().filter(|s| far(s)).count() > sights.len()
 }
 
-/// The same box with all around it: from where the nearest view sees something to far beyond the farthest. Where cameras look outwards, away
-/// from the box's middle, it reaches twice as far as they stand: to what is near them.
+/// The same box with all around it: from where the nearest view sees something to far beyond the
+/// farthest. Where cameras look outwards, away from the box's middle, it reaches twice as far as
+/// they stand: to what is near them.
 fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
     let centre = 0.5 * (DVec3::from(boxed.min) + DVec3::from(boxed.max));
     let outwards = |(camera, _): &&SeenDepths| camera.forward().dot(camera.centre() - centre) > 0.0;
     let looks_out = 2 * sights.iter().filter(outwards).count() > sights.len();
-    let stands = sights.iter().map(|(camera, _)| (camera.centre() - centre).length()).fold(0.0, f64::max);
+    let stands =
+        sights.iter().map(|(camera, _)| (camera.centre() - centre).length()).fold(0.0, f64::max);
     let radius = (0.5 * boxed.longest_side()).max(if looks_out { 2.0 * stands } else { 0.0 });
-    let half = if looks_out { DVec3::splat(radius) } else { 0.5 * (DVec3::from(boxed.max) - DVec3::from(boxed.min)) };
-    let known = |pick: &dyn Fn([f64; 2]) -> f64| sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>();
+    let half = if looks_out {
+        DVec3::splat(radius)
+    } else {
+        0.5 * (DVec3::from(boxed.max) - DVec3::from(boxed.min))
+    };
+    let known = |pick: &dyn Fn([f64; 2]) -> f64| {
+        sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>()
+    };
     let near = known(&|d| 0.5 * d[0]).into_iter().fold(0.05 * radius, f64::min);
     let far = known(&|d| 10.0 * d[1]).into_iter().fold(100.0 * radius, f64::max);
-    let (min, max) = if looks_out { ((centre - half).to_array(), (centre + half).to_array()) } else { (boxed.min, boxed.max) };
+    let (min, max) = if looks_out {
+        ((centre - half).to_array(), (centre + half).to_array())
+    } else {
+        (boxed.min, boxed.max)
+    };
     Bounds { min, max, near, far, space: Space::Contraction }
 }
 
@@ -147,10 +171,12 @@ fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_
 
 /// A box around what all cameras look at, from the cameras alone where they say enough.
 ///
-/// The centre is the point nearest to all optical axes; the box reaches as far as the widest camera sees at that distance, so
-/// that a scene which fits into its views fits into the box. Cameras that look past each other (one view, a forward-facing
-/// row) leave the centre open along their axes. Then the box is around all that they see between the nearest and the farthest depth
-/// that is known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender scenes' habit.
+/// The centre is the point nearest to all optical axes; the box reaches as far as the widest camera
+/// sees at that distance, so that a scene which fits into its views fits into the box. Cameras that
+/// look past each other (one view, a forward-facing row) leave the centre open along their axes.
+/// Then the box is around all that they see between the nearest and the farthest depth that is
+/// known of each; where nothing is known, it is put at distance 4 of the mean camera, the Blender
+/// scenes' habit.
 fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
     let count = cameras.len().max(1) as f64;
@@ -159,7 +185,8 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     } else if let Some(bounds) = around_frusta(sights) {
         return bounds;
     } else {
-        let mean = |f: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| f(c)).sum::<DVec3>() / count;
+        let mean =
+            |f: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| f(c)).sum::<DVec3>() / count;
         mean(&|c| c.centre()) + 4.0 * mean(&|c| c.forward()).normalize_or(DVec3::NEG_Z)
     };
     let reach = |camera: &&Camera| {
@@ -182,8 +209,8 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
 /// The determinant of axes that say nothing of where they cross.
 const PARALLEL: f64 = 1e-9;
 
-/// The point nearest to all optical axes, where they cross well enough: the determinant is 0 for parallel axes and 8/27 for axes from all
-/// sides.
+/// The point nearest to all optical axes, where they cross well enough: the determinant is 0 for
+/// parallel axes and 8/27 for axes from all sides.
 fn crossing(cameras: &[&Camera], least: f64) -> Option<DVec3> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for camera in cameras {
@@ -196,7 +223,8 @@ fn crossing(cameras: &[&Camera], least: f64) -> Option<DVec3> {
     (mean.determinant() > least).then(|| normal.inverse() * right)
 }
 
-/// A box around what each camera sees between its depths, a tenth more to either side. `None` where a camera has none.
+/// A box around what each camera sees between its depths, a tenth more to either side. `None` where
+/// a camera has none.
 fn around_frusta(sights: &[SeenDepths]) -> Option<Bounds> {
     let (mut min, mut max) = (DVec3::INFINITY, DVec3::NEG_INFINITY);
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
@@ -213,7 +241,10 @@ fn around_frusta(sights: &[SeenDepths]) -> Option<Bounds> {
 }
 
 /// The same box with near and far from its nearest and farthest point over all cameras.
-pub(crate) fn with_range<'a>(bounds: Bounds, cameras: impl IntoIterator<Item = &'a Camera>) -> Bounds {
+pub(crate) fn with_range<'a>(
+    bounds: Bounds,
+    cameras: impl IntoIterator<Item = &'a Camera>,
+) -> Bounds {
     let (min, max) = (DVec3::from(bounds.min), DVec3::from(bounds.max));
     let (mut near, mut far) = (f64::INFINITY, 0.0f64);
     for camera in cameras {
@@ -246,7 +277,10 @@ mod tests {
         (0..12)
             .map(|i| {
                 let a = f64::from(i) * std::f64::consts::FRAC_PI_6;
-                looking_at(target + distance * DVec3::new(a.cos(), a.sin(), 0.4).normalize(), target)
+                looking_at(
+                    target + distance * DVec3::new(a.cos(), a.sin(), 0.4).normalize(),
+                    target,
+                )
             })
             .collect()
     }
@@ -270,7 +304,8 @@ mod tests {
         assert!(bounds.near > 0.0 && bounds.far > bounds.near && bounds.far.is_finite());
     }
 
-    /// Whatever a camera of a row sees between its depths lies in the box, and between near and far.
+    /// Whatever a camera of a row sees between its depths lies in the box, and between near and
+    /// far.
     #[test]
     fn a_row_of_cameras_has_what_it_sees() {
         let row: Vec<Camera> = (0..5)
@@ -286,7 +321,10 @@ mod tests {
                 for depth in [2.0, 5.0, 10.0] {
                     let distance = depth / camera.depth_per_distance(&ray);
                     let p = ray.at(distance).to_array();
-                    assert!((0..3).all(|i| (bounds.min[i]..=bounds.max[i]).contains(&p[i])), "{p:?} {bounds:?}");
+                    assert!(
+                        (0..3).all(|i| (bounds.min[i]..=bounds.max[i]).contains(&p[i])),
+                        "{p:?} {bounds:?}"
+                    );
                     assert!((bounds.near..=bounds.far).contains(&distance));
                 }
             }
@@ -300,12 +338,18 @@ mod tests {
         cameras.iter().map(|c| (c.clone(), depths)).collect()
     }
 
-    /// What each camera sees between its depths lies in the frustum's cube, whatever the world's scale.
+    /// What each camera sees between its depths lies in the frustum's cube, whatever the world's
+    /// scale.
     #[test]
     fn cameras_that_look_one_way_get_ndc() {
         for scale in [1e-3, 1.0, 1e3] {
             let row: Vec<Camera> = (0..5)
-                .map(|i| looking_at(scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.1), scale * DVec3::new(0.4, 6.0, 0.0)))
+                .map(|i| {
+                    looking_at(
+                        scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.1),
+                        scale * DVec3::new(0.4, 6.0, 0.0),
+                    )
+                })
                 .collect();
             let bounds = place(
                 &sights(&row[1..], Some([2.0 * scale, 10.0 * scale])),
@@ -315,7 +359,10 @@ mod tests {
             );
             let bounds = bounds.unwrap();
             let Space::Ndc(frustum) = bounds.space else { panic!("{bounds:?}") };
-            assert!(bounds.is_valid() && frustum.near > 1.5 * scale && frustum.far < 21.0 * scale, "{frustum:?}");
+            assert!(
+                bounds.is_valid() && frustum.near > 1.5 * scale && frustum.far < 21.0 * scale,
+                "{frustum:?}"
+            );
             for camera in &row {
                 for corner in border(camera, [2.0 * scale, 15.0 * scale]) {
                     let p = frustum.to_cube(frustum.to_camera(corner)).to_array();
@@ -328,7 +375,8 @@ mod tests {
     #[test]
     fn the_space_is_what_the_cameras_see() {
         let ring = circle(DVec3::ZERO, 4.0);
-        let chosen = |depths, kind| place(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
+        let chosen =
+            |depths, kind| place(&sights(&ring, depths), &[], false, kind).map(|b| b.space);
         assert_eq!(chosen(None, None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 5.0]), None), Ok(Space::Box));
         assert_eq!(chosen(Some([3.0, 40.0]), None), Ok(Space::Contraction));
@@ -336,7 +384,10 @@ mod tests {
         assert_eq!(chosen(None, Some(SpaceKind::Contraction)), Ok(Space::Contraction));
         assert_eq!(chosen(Some([3.0, 5.0]), Some(SpaceKind::Ndc)), Err(SpaceError::NotForward));
         let one = [looking_at(DVec3::Y, DVec3::ZERO)];
-        assert_eq!(place(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)), Err(SpaceError::NoDepths));
+        assert_eq!(
+            place(&sights(&one, None), &[], false, Some(SpaceKind::Ndc)),
+            Err(SpaceError::NoDepths)
+        );
         assert_eq!(place(&sights(&one, None), &[], false, None).map(|b| b.space), Ok(Space::Box));
     }
 
@@ -348,30 +399,53 @@ mod tests {
             let around = place(&sights(&ring, None), &[], true, None).unwrap();
             assert_eq!(around.space, Space::Contraction);
             let half = 0.5 * around.longest_side() / scale;
-            assert!((1.4..1.7).contains(&half) && around.far > 100.0 * scale && around.near < 0.1 * scale, "{around:?}");
+            assert!(
+                (1.4..1.7).contains(&half)
+                    && around.far > 100.0 * scale
+                    && around.near < 0.1 * scale,
+                "{around:?}"
+            );
             // Where depths are known they decide.
-            let known = place(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None).unwrap();
+            let known =
+                place(&sights(&ring, Some([3.0 * scale, 5.0 * scale])), &[], true, None).unwrap();
             assert_eq!(known.space, Space::Box);
             // From within: a room.
-            let outwards: Vec<Camera> = ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
+            let outwards: Vec<Camera> =
+                ring.iter().map(|c| looking_at(c.centre(), 2.0 * c.centre())).collect();
             let room = place(&sights(&outwards, None), &[], true, None).unwrap();
             assert_eq!(room.space, Space::Contraction);
             assert!((7.9..8.5).contains(&(0.5 * room.longest_side() / scale)), "{room:?}");
             // Forward: parallel axes, and axes that meet at a distance of 6.
             let parallel = |i: u32| {
-                looking_at(scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.0), scale * DVec3::new(0.2 * f64::from(i), 9.0, 0.0))
+                looking_at(
+                    scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.0),
+                    scale * DVec3::new(0.2 * f64::from(i), 9.0, 0.0),
+                )
             };
-            let meeting =
-                |i: u32| looking_at(scale * DVec3::new(0.2 * f64::from(i) - 0.4, 0.0, 0.0), scale * DVec3::new(0.0, 6.0, 0.0));
-            let forward: [(Vec<Camera>, f64); 2] = [((0..5).map(parallel).collect(), 3.2), ((0..5).map(meeting).collect(), 6.0)];
+            let meeting = |i: u32| {
+                looking_at(
+                    scale * DVec3::new(0.2 * f64::from(i) - 0.4, 0.0, 0.0),
+                    scale * DVec3::new(0.0, 6.0, 0.0),
+                )
+            };
+            let forward: [(Vec<Camera>, f64); 2] =
+                [((0..5).map(parallel).collect(), 3.2), ((0..5).map(meeting).collect(), 6.0)];
             for (cameras, distance) in forward {
-                let seen = place(&sights(&cameras, None), &sights(&cameras[1..2], None), true, None).unwrap();
+                let seen =
+                    place(&sights(&cameras, None), &sights(&cameras[1..2], None), true, None)
+                        .unwrap();
                 let Space::Ndc(frustum) = seen.space else { panic!("{seen:?}") };
-                assert!(frustum.near < 0.3 * distance * scale && frustum.near > 0.1 * distance * scale, "{frustum:?}");
+                assert!(
+                    frustum.near < 0.3 * distance * scale && frustum.near > 0.1 * distance * scale,
+                    "{frustum:?}"
+                );
                 assert!(frustum.far > 40.0 * distance * scale && seen.is_valid(), "{frustum:?}");
             }
             // One camera says nothing of how far anything is.
-            assert_eq!(place(&sights(&ring[..1], None), &[], true, None).unwrap().space, Space::Contraction);
+            assert_eq!(
+                place(&sights(&ring[..1], None), &[], true, None).unwrap().space,
+                Space::Contraction
+            );
         }
     }
 }

@@ -7,7 +7,8 @@ pub(crate) fn extension(kernel: Kernel) -> &'static str {
     if kernel == Kernel::Average { "exr" } else { "png" }
 }
 
-/// LR pixels beside one that its mask has to be clear of, too: beyond them lie a kernel's last lobe and less than a tenth of its weight.
+/// LR pixels beside one that its mask has to be clear of, too: beyond them lie a kernel's last lobe
+/// and less than a tenth of its weight.
 pub(crate) fn mask_reach(kernel: Kernel) -> usize {
     match kernel {
         Kernel::Lanczos | Kernel::Bicubic => 1,
@@ -30,7 +31,8 @@ impl LrImage {
         match self {
             Self::Bytes(image) => Self::Bytes(resize_pillow(image, width, height, kernel.filter())),
             Self::Floats(image) => {
-                let shrink = Resampling::new(kernel.filter(), (image.width, image.height), (width, height));
+                let shrink =
+                    Resampling::new(kernel.filter(), (image.width, image.height), (width, height));
                 Self::Floats(shrink.apply(image))
             }
         }
@@ -45,7 +47,8 @@ impl LrImage {
     }
 }
 
-/// The HR image by Lanczos from the photograph, and the LR image from that 8-bit HR one: two steps, as the paper's code does.
+/// The HR image by Lanczos from the photograph, and the LR image from that 8-bit HR one: two steps,
+/// as the paper's code does.
 ///
 /// # Panics
 /// With [`Kernel::Average`] when the sizes aren't whole multiples.

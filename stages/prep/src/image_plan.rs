@@ -6,7 +6,8 @@ use scene::{Camera, Intrinsics};
 use crate::params::{LrSource, Params};
 use crate::sizes::{Sizes, enlarged, sizes};
 
-/// Which images are made of photographs: whether there is HR truth, at which sizes, by which kernel.
+/// Which images are made of photographs: whether there is HR truth, at which sizes, by which
+/// kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct ImagePlan {
     /// Whether LR images are made from HR ones.
@@ -28,11 +29,16 @@ impl ImagePlan {
         };
         if !has_truth && params.lr_width.is_some() {
             return Err(
-                "parameter lr_width: with lr_source photographs their own width is the LR width; leave lr_width out".to_owned()
+                "parameter lr_width: with lr_source photographs their own width is the LR width; \
+                leave lr_width out"
+                    .to_owned(),
             );
         }
         if !has_truth && params.kernel == Some(Kernel::Average) {
-            return Err("parameter kernel: average makes LR images and can't be assumed; choose box".to_owned());
+            return Err(
+                "parameter kernel: average makes LR images and can't be assumed; choose box"
+                    .to_owned(),
+            );
         }
         let kernel = params.kernel.unwrap_or(if has_truth { Kernel::Lanczos } else { Kernel::Box });
         let first = set.frames[split.train[0]].intrinsics();
@@ -42,9 +48,18 @@ impl ImagePlan {
         } else {
             enlarged(native, params.hr_width, params.scale)
         };
-        let plan = Self { has_truth, kernel, sizes: sizes.map_err(|e| format!("parameters: {e}"))?, native };
+        let plan = Self {
+            has_truth,
+            kernel,
+            sizes: sizes.map_err(|e| format!("parameters: {e}"))?,
+            native,
+        };
         if kernel == Kernel::Average {
-            let mut all = split.train.iter().chain(&split.test).map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
+            let mut all = split
+                .train
+                .iter()
+                .chain(&split.test)
+                .map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
             if let Some(odd) = all.find(|sizes| !sizes.is_integer()) {
                 return Err(format!(
                     "parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box",
@@ -60,7 +75,9 @@ impl ImagePlan {
         let of = |length: u32, first: u32, target: u32| {
             ((f64::from(length) * f64::from(target) / f64::from(first)).round() as u32).max(1)
         };
-        let size = |target: (u32, u32)| (of(native.width, self.native.0, target.0), of(native.height, self.native.1, target.1));
+        let size = |target: (u32, u32)| {
+            (of(native.width, self.native.0, target.0), of(native.height, self.native.1, target.1))
+        };
         Sizes { lr: size(self.sizes.lr), hr: size(self.sizes.hr) }
     }
 
@@ -79,7 +96,9 @@ impl ImagePlan {
     /// Size of an LR image shrunk as HR images were to make LR ones.
     pub(crate) fn one_size_down(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let Sizes { lr, hr } = self.sizes;
-        let shrunk = |length: u32, lr: u32, hr: u32| ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1);
+        let shrunk = |length: u32, lr: u32, hr: u32| {
+            ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1)
+        };
         (shrunk(width, lr.0, hr.0), shrunk(height, lr.1, hr.1))
     }
 
@@ -94,10 +113,14 @@ impl ImagePlan {
             _ => format!("{train} to train on, {test} for testing, {both} of them for both"),
         };
         if self.has_truth {
-            format!("{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}", lr.0, lr.1, hr.0, hr.1)
+            format!(
+                "{parts}; LR images of {}×{} are made from HR ones of {}×{} by {kernel}",
+                lr.0, lr.1, hr.0, hr.1
+            )
         } else {
             format!(
-                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR is {}×{}",
+                "{parts}; the photographs are the LR images ({}×{}), as if made by {kernel}; HR \
+                is {}×{}",
                 lr.0, lr.1, hr.0, hr.1
             )
         }

@@ -1,7 +1,9 @@
-//! `prep`: posed images → scene. Makes HR ground truth and, from it, the LR images that training may see.
+//! `prep`: posed images → scene. Makes HR ground truth and, from it, the LR images that training
+//! may see.
 //!
-//! * [`Params`]; `split`: which views are for what; `image_plan`: which images are made; `scene_plan`: all that is decided before
-//!   anything is written; `writer`: writes it, a function a subtree; `summary`: what was found and chosen, for people.
+//! * [`Params`]; `split`: which views are for what; `image_plan`: which images are made;
+//!   `scene_plan`: all that is decided before anything is written; `writer`: writes it, a function
+//!   a subtree; `summary`: what was found and chosen, for people.
 //! * `sizes`: LR and HR size from `lr_width`, `hr_width`, `scale`.
 //! * `degrade`: HR and LR images of one photograph, through Pillow's exact kernels.
 //! * `bounds`: where the scene is, from what the cameras see.
@@ -9,9 +11,10 @@
 //!
 //! The photographs are read by the crate `dataset`, whatever form their folder has.
 //!
-//! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images, cameras, bounds), `downscaled/` (the
-//! same, shrunk once more: what refinement learns from, since `train/` is its HR truth), `train-cameras/` and `cameras/` (the training
-//! and the test cameras at HR size, no images), `truth/` (HR test images, depth), `references/` (HR training images).
+//! The scene has six subtrees, so that a stage sees what it may and no more: `train/` (LR images,
+//! cameras, bounds), `downscaled/` (the same, shrunk once more: what refinement learns from, since
+//! `train/` is its HR truth), `train-cameras/` and `cameras/` (the training and the test cameras at
+//! HR size, no images), `truth/` (HR test images, depth), `references/` (HR training images).
 
 mod borders;
 mod bounds;
@@ -48,10 +51,17 @@ pub struct Prep;
 impl Stage for Prep {
     type Params = Params;
     const NAME: &'static str = "prep";
-    const SUMMARY: &'static str = "Makes a scene of posed images: LR images to train on, HR ground truth, cameras and bounds.";
+    const SUMMARY: &'static str = "Makes a scene of posed images: LR images to train on, HR \
+        ground truth, cameras and bounds.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("dataset", Input::required(&["dataset"], "posed photographs: Blender's form, transforms.json, LLFF or COLMAP"))]
+        vec![(
+            "dataset",
+            Input::required(
+                &["dataset"],
+                "posed photographs: Blender's form, transforms.json, LLFF or COLMAP",
+            ),
+        )]
     }
 
     fn output() -> Output {
@@ -65,20 +75,29 @@ impl Stage for Prep {
     }
 
     fn rules() -> Vec<Rule> {
-        let whole = Rule::new("parameter kernel: average needs a whole scale; choose box, or another scale");
-        vec![whole.when("kernel", json!({"const": "average"})).must("scale", json!({"multipleOf": 1}))]
+        let whole = Rule::new(
+            "parameter kernel: average needs a whole scale; choose box, or another scale",
+        );
+        vec![
+            whole
+                .when("kernel", json!({"const": "average"}))
+                .must("scale", json!({"multipleOf": 1})),
+        ]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let set = dataset(context, params)?;
         let split = split(&set, params).map_err(Failure::Usage)?;
-        let warnings = warnings_of_poses(&set, &split).map_err(|reason| Failure::BadInput(format!("dataset: {reason}")))?;
+        let warnings = warnings_of_poses(&set, &split)
+            .map_err(|reason| Failure::BadInput(format!("dataset: {reason}")))?;
         let images = ImagePlan::new(&set, &split, params).map_err(Failure::Usage)?;
-        let mut notes: Vec<String> = set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
+        let mut notes: Vec<String> =
+            set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let (background, sign) = background(params, &training)?;
-        let plan = ScenePlan::new(&set, &split, params, images, background).map_err(Failure::Usage)?;
+        let plan =
+            ScenePlan::new(&set, &split, params, images, background).map_err(Failure::Usage)?;
         for note in sign.into_iter().chain([space_note(&plan.bounds, background)]) {
             context.say(&note);
             notes.push(note);
@@ -90,15 +109,20 @@ impl Stage for Prep {
     }
 }
 
-/// The data set, with its lenses treated as asked, and all its views together where it isn't its own split that counts.
+/// The data set, with its lenses treated as asked, and all its views together where it isn't its
+/// own split that counts.
 fn dataset(context: &Context, params: &Params) -> anyhow::Result<Dataset> {
     let set = Dataset::read(context.input("dataset")?.folder()).bad_input("dataset")?;
     let set = match params.lens {
         LensHandling::Follow => {
-            let wrong = set.frames.iter().find_map(|frame| frame.camera().check().err().map(|e| (frame, e)));
+            let wrong = set
+                .frames
+                .iter()
+                .find_map(|frame| frame.camera().check().err().map(|e| (frame, e)));
             if let Some((frame, e)) = wrong {
                 let frame = frame_name(frame);
-                let message = format!("dataset: {frame}: {e} (parameter lens: undo keeps what has its ray)");
+                let message =
+                    format!("dataset: {frame}: {e} (parameter lens: undo keeps what has its ray)");
                 return Err(Failure::BadInput(message).into());
             }
             set

@@ -9,28 +9,31 @@ use crate::bounds::SpaceKind;
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Width of the LR images in pixels; the height follows the aspect. Default: the HR width divided by `scale`.
+    /// Width of the LR images in pixels; the height follows the aspect. Default: the HR width
+    /// divided by `scale`.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub lr_width: Option<u32>,
-    /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the images given.
+    /// Width of the HR images in pixels. Default: `lr_width` times `scale`, or the width of the
+    /// images given.
     #[schemars(range(min = 1), extend("x-group" = "output", "x-default" = "by data set"))]
     pub hr_width: Option<u32>,
     /// HR width over LR width. It needn't be given beside both widths.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
     pub scale: Option<f64>,
-    /// Where LR images come from: `photographs` as given, without HR ground truth, or `downscaled` from HR images by `kernel`. Default:
-    /// `photographs` for COLMAP and transforms.json without `lr_width`, else `downscaled`.
+    /// Where LR images come from: `photographs` as given, without HR ground truth, or `downscaled`
+    /// from HR images by `kernel`. Default: `photographs` for COLMAP and transforms.json without
+    /// `lr_width`, else `downscaled`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub lr_source: Option<LrSource>,
-    /// Kernel that makes LR images from HR ones. With `lr_source: photographs`, the kernel that is assumed to have made them. Default: `lanczos`
-    /// for downscaled images, `box` for photographs.
+    /// Kernel that makes LR images from HR ones. With `lr_source: photographs`, the kernel that is
+    /// assumed to have made them. Default: `lanczos` for downscaled images, `box` for photographs.
     #[schemars(extend("x-group" = "data", "x-default" = "by `lr_source`"))]
     pub kernel: Option<Kernel>,
     /// Treatment of lens distortion, where the data set states it.
     #[schemars(extend("x-group" = "data"))]
     pub lens: LensHandling,
-    /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white` or `black` where the borders of nine in ten
-    /// views are that colour, else `opaque`.
+    /// What lies behind the scene. Default: `white` where images have alpha. Without alpha `white`
+    /// or `black` where the borders of nine in ten views are that colour, else `opaque`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub background: Option<Background>,
     /// Distance along rays before which nothing lies. Default: from the cameras.
@@ -39,18 +42,20 @@ pub struct Params {
     /// Distance along rays behind which nothing lies. Default: from the cameras.
     #[schemars(range(min = 0.0), extend("x-group" = "field", "x-default" = "by data set"))]
     pub far: Option<f64>,
-    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way and the nearest depth is known or the background
-    /// is `opaque`, `contraction` where else it is `opaque` or points are known far outside the space that the cameras look at, else `box`.
+    /// Space that the field keeps in its unit cube. Default: `ndc` where all cameras look one way
+    /// and the nearest depth is known or the background is `opaque`, `contraction` where else it is
+    /// `opaque` or points are known far outside the space that the cameras look at, else `box`.
     #[schemars(extend("x-group" = "field", "x-default" = "by data set"))]
     pub space: Option<SpaceKind>,
-    /// Which views are for training and which for testing. Default: the data set's own split, else `holdout`.
+    /// Which views are for training and which for testing. Default: the data set's own split, else
+    /// `holdout`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub split: Option<SplitKind>,
     /// Maximum number of test views, spread evenly.
     #[schemars(range(min = 1), extend("x-group" = "data", "x-default" = "all"))]
     pub test_views: Option<u32>,
-    /// Number of training views that are kept at HR, as references. The first view is one; each further one has the camera farthest from those
-    /// before.
+    /// Number of training views that are kept at HR, as references. The first view is one; each
+    /// further one has the camera farthest from those before.
     #[schemars(extend("x-group" = "data"))]
     pub hr_references: u32,
 }
@@ -79,11 +84,13 @@ impl Default for Params {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum LensHandling {
-    /// Rays follow it: photographs stay as they were taken, to the last pixel, and so do rendered views.
+    /// Rays follow it: photographs stay as they were taken, to the last pixel, and so do rendered
+    /// views.
     Follow,
     /// Photographs are resampled to what pinhole cameras would have taken, and lose a border.
     Undo,
-    /// Photographs are taken for a pinhole's: the habit with LLFF's scenes, whose files don't speak of lenses. To compare with.
+    /// Photographs are taken for a pinhole's: the habit with LLFF's scenes, whose files don't speak
+    /// of lenses. To compare with.
     Ignore,
 }
 
@@ -103,8 +110,10 @@ pub enum LrSource {
 pub enum SplitKind {
     /// As the data set itself says.
     Given,
-    /// Every eighth view, the first among them, is for testing alone: what a figure needs to be honest.
+    /// Every eighth view, the first among them, is for testing alone: what a figure needs to be
+    /// honest.
     Holdout,
-    /// All views are for both, references excepted, which aren't tested: the paper's way with photographs.
+    /// All views are for both, references excepted, which aren't tested: the paper's way with
+    /// photographs.
     Paper,
 }

@@ -2,24 +2,31 @@ use artifact::counted;
 use glam::DVec3;
 use scene::Camera;
 
-/// Cameras that are so many times as far from the middle of all as half of them are, at least, are far off. One that is doubles the box as
-/// often as that; walks through a room have 2 to 5.
+/// Cameras that are so many times as far from the middle of all as half of them are, at least, are
+/// far off. One that is doubles the box as often as that; walks through a room have 2 to 5.
 const FAR_OFF: f64 = 20.0;
 /// Fewer cameras say too little of where the others stand.
 const FEWEST: usize = 4;
-/// A principal point farther from the middle of the image, as a share of its length, is far from it. Real lenses have a
-/// hundredth.
+/// A principal point farther from the middle of the image, as a share of its length, is far from
+/// it. Real lenses have a hundredth.
 const OFF_CENTRE: f64 = 0.2;
-/// Centres nearer to each other than this share of their distance from the origin are one place: they were the same before they were rounded.
+/// Centres nearer to each other than this share of their distance from the origin are one place:
+/// they were the same before they were rounded.
 const ONE_PLACE: f64 = 1e-7;
 
-/// Refuses training views that were all taken by the same camera at the same place: whatever they show, it isn't one scene seen from several
-/// sides.
+/// Refuses training views that were all taken by the same camera at the same place: whatever they
+/// show, it isn't one scene seen from several sides.
 pub(crate) fn check(training: &[Camera]) -> Result<(), String> {
     match training {
-        [first, others @ ..] if !others.is_empty() && others.iter().all(|c| c.camera_to_world == first.camera_to_world) => {
+        [first, others @ ..]
+            if !others.is_empty()
+                && others.iter().all(|c| c.camera_to_world == first.camera_to_world) =>
+        {
             let count = training.len();
-            Err(format!("all {count} training views have the same pose: nothing tells how far anything is; are the poses right?"))
+            Err(format!(
+                "all {count} training views have the same pose: nothing tells how far anything \
+                is; are the poses right?"
+            ))
         }
         _ => Ok(()),
     }
@@ -29,13 +36,20 @@ pub(crate) fn check(training: &[Camera]) -> Result<(), String> {
 pub(crate) fn warnings(training: &[Camera], test: &[Camera]) -> Vec<String> {
     let mut found = Vec::new();
     if training.len() == 1 {
-        found.push("there is 1 training view: nothing tells how far anything is; add views from other sides".to_owned());
+        found.push(
+            "there is 1 training view: nothing tells how far anything is; add views from \
+            other sides"
+                .to_owned(),
+        );
     } else if stand_in_one_place(training) {
         let count = training.len();
-        found.push(format!("all {count} training cameras stand in one place: nothing tells how far anything is"));
+        found.push(format!(
+            "all {count} training cameras stand in one place: nothing tells how far anything is"
+        ));
     }
     let named = |kind: &'static str| move |camera| Named { camera, kind };
-    let all: Vec<Named> = training.iter().map(named("training")).chain(test.iter().map(named("test"))).collect();
+    let all: Vec<Named> =
+        training.iter().map(named("training")).chain(test.iter().map(named("test"))).collect();
     found.extend(far_off(&all));
     found.extend(off_centre(&all));
     found
@@ -69,10 +83,20 @@ fn far_off(all: &[Named]) -> Option<String> {
         return None;
     }
     let far: Vec<usize> = (0..all.len()).filter(|&i| away[i] > FAR_OFF * usual).collect();
-    let times =
-        |i: usize| format!("{} is {:.0} times as far from the middle of all cameras as half of them", all[i], away[i] / usual);
+    let times = |i: usize| {
+        format!(
+            "{} is {:.0} times as far from the middle of all cameras as half of them",
+            all[i],
+            away[i] / usual
+        )
+    };
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
-    far.first().map(|&first| format!("{}{more}; is its pose right? The scene's bounds follow from all poses", times(first)))
+    far.first().map(|&first| {
+        format!(
+            "{}{more}; is its pose right? The scene's bounds follow from all poses",
+            times(first)
+        )
+    })
 }
 
 /// The middle of some numbers in order; 0 of none.
@@ -93,7 +117,8 @@ fn off_centre(all: &[Named]) -> Option<String> {
     let first = off.first()?;
     let k = &first.camera.intrinsics;
     Some(format!(
-        "{} of {} have a principal point far from the middle, first {first}: ({:.1}, {:.1}) in {}×{} pixels; are cx, cy, w and h for one size?",
+        "{} of {} have a principal point far from the middle, first {first}: ({:.1}, {:.1}) in \
+        {}×{} pixels; are cx, cy, w and h for one size?",
         off.len(),
         counted(all.len(), "view"),
         k.cx,
@@ -121,7 +146,11 @@ mod tests {
     fn ring(count: u32, scale: f64, middle: f64) -> Vec<Camera> {
         let at = |i: u32| {
             let angle = f64::from(i);
-            camera(&format!("r_{i}"), angle, [middle + 4.0 * scale * angle.cos(), 4.0 * scale * angle.sin(), scale])
+            camera(
+                &format!("r_{i}"),
+                angle,
+                [middle + 4.0 * scale * angle.cos(), 4.0 * scale * angle.sin(), scale],
+            )
         };
         (0..count).map(at).collect()
     }
@@ -152,10 +181,16 @@ mod tests {
                 continue;
             }
             let set = dataset::Dataset::read(&folder).unwrap();
-            let split = set.split.clone().unwrap_or_else(|| dataset::Split::hold_out(set.frames.len(), 8));
-            let cameras = |of: &[usize]| of.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
+            let split =
+                set.split.clone().unwrap_or_else(|| dataset::Split::hold_out(set.frames.len(), 8));
+            let cameras =
+                |of: &[usize]| of.iter().map(|&i| set.frames[i].camera()).collect::<Vec<_>>();
             let (training, test) = (cameras(&split.train), cameras(&split.test));
-            assert_eq!((check(&training), warnings(&training, &test)), (Ok(()), Vec::new()), "{scene}");
+            assert_eq!(
+                (check(&training), warnings(&training, &test)),
+                (Ok(()), Vec::new()),
+                "{scene}"
+            );
         }
     }
 
@@ -172,8 +207,13 @@ mod tests {
             let found = warnings(training, test);
             assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");
         };
-        one(&ring(1, 1.0, 0.0), &ring(3, 1.0, 0.0), "there is 1 training view: nothing tells how far");
-        let turning: Vec<Camera> = (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
+        one(
+            &ring(1, 1.0, 0.0),
+            &ring(3, 1.0, 0.0),
+            "there is 1 training view: nothing tells how far",
+        );
+        let turning: Vec<Camera> =
+            (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
         one(&turning, &[], "all 5 training cameras stand in one place");
         let mut far = ring(8, 1.0, 0.0);
         far[5].camera_to_world[0][3] = 1e6;
@@ -189,7 +229,8 @@ mod tests {
         one(
             &shrunk,
             &ring(2, 1.0, 0.0),
-            "4 of 8 views have a principal point far from the middle, first training view r_2: (8.0, 6.0) in 32×24",
+            "4 of 8 views have a principal point far from the middle, first training view r_2: \
+            (8.0, 6.0) in 32×24",
         );
     }
 }

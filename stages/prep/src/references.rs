@@ -1,17 +1,21 @@
 use glam::DVec3;
 
-/// Which views are references: the first, then each time the one whose camera stands farthest from those there are, so that together they see as
-/// much of the scene as so many can. Fewer are the first of more.
+/// Which views are references: the first, then each time the one whose camera stands farthest from
+/// those there are, so that together they see as much of the scene as so many can. Fewer are the
+/// first of more.
 pub(crate) fn choose(centres: impl Iterator<Item = DVec3>, count: usize) -> Vec<usize> {
     let centres: Vec<DVec3> = centres.collect();
     let mut away = vec![f64::INFINITY; centres.len()];
     let mut chosen = Vec::with_capacity(count.min(centres.len()));
     while chosen.len() < count.min(centres.len()) {
         // Of equals the first; what is chosen is no distance away.
-        let next =
-            (0..centres.len()).filter(|i| !chosen.contains(i)).reduce(|best, i| if away[i] > away[best] { i } else { best });
+        let next = (0..centres.len())
+            .filter(|i| !chosen.contains(i))
+            .reduce(|best, i| if away[i] > away[best] { i } else { best });
         let Some(next) = next else { break };
-        away.iter_mut().zip(&centres).for_each(|(away, centre)| *away = away.min(centre.distance(centres[next])));
+        away.iter_mut()
+            .zip(&centres)
+            .for_each(|(away, centre)| *away = away.min(centre.distance(centres[next])));
         chosen.push(next);
     }
     chosen
@@ -23,7 +27,9 @@ mod tests {
 
     #[test]
     fn references_are_spread() {
-        let along = |places: &[f64]| places.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter();
+        let along = |places: &[f64]| {
+            places.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter()
+        };
         let cameras = || along(&[0.0, 1.0, 2.0, 3.0, 9.0, 10.0]);
         assert_eq!(choose(cameras(), 4), [0, 5, 3, 1]);
         assert_eq!(choose(cameras(), 2), [0, 5]);

@@ -31,19 +31,34 @@ impl<'a> ScenePlan<'a> {
         let test: Vec<&Frame> = split.test.iter().map(|&i| &set.frames[i]).collect();
         let bounds = bounds(&train, &test, params, background)?;
         let count = if images.has_truth { params.hr_references as usize } else { 0 };
-        let references = references::choose(train.iter().map(|frame| frame.camera().centre()), count);
+        let references =
+            references::choose(train.iter().map(|frame| frame.camera().centre()), count);
         Ok(Self { images, background, bounds, train, references, test })
     }
 }
 
 /// Where a scene is, by what its cameras see and by what the user says of it.
-fn bounds(train: &[&Frame], test: &[&Frame], params: &Params, background: Background) -> Result<Bounds, String> {
+fn bounds(
+    train: &[&Frame],
+    test: &[&Frame],
+    params: &Params,
+    background: Background,
+) -> Result<Bounds, String> {
     // What the user says of all views stands in for what isn't known of each.
-    let given = params.near.zip(params.far).map(|(near, far)| [near, far]).filter(|[near, far]| 0.0 < *near && near < far);
-    let sights = |frames: &[&Frame]| -> Vec<_> { frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect() };
+    let given = params
+        .near
+        .zip(params.far)
+        .map(|(near, far)| [near, far])
+        .filter(|[near, far]| 0.0 < *near && near < far);
+    let sights = |frames: &[&Frame]| -> Vec<_> {
+        frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect()
+    };
     let goes_on = background == Background::Opaque;
-    let mut bounds = place(&sights(train), &sights(test), goes_on, params.space).map_err(|e| e.to_string())?;
-    for (name, given, bound) in [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)] {
+    let mut bounds =
+        place(&sights(train), &sights(test), goes_on, params.space).map_err(|e| e.to_string())?;
+    for (name, given, bound) in
+        [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
+    {
         if let Some(value) = given {
             if !value.is_finite() {
                 return Err(format!("parameter {name}: {value} is not a distance"));
@@ -64,9 +79,13 @@ fn bounds(train: &[&Frame], test: &[&Frame], params: &Params, background: Backgr
 pub(crate) fn warnings_of_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, String> {
     let camera = |&i: &usize| set.frames[i].camera();
     let training: Vec<Camera> = split.train.iter().map(camera).collect();
-    let test: Vec<Camera> = split.test.iter().filter(|i| !split.train.contains(i)).map(camera).collect();
+    let test: Vec<Camera> =
+        split.test.iter().filter(|i| !split.train.contains(i)).map(camera).collect();
     pose_warnings::check(&training)?;
-    Ok(pose_warnings::warnings(&training, &test).into_iter().map(|text| format!("{WARNING}{text}")).collect())
+    Ok(pose_warnings::warnings(&training, &test)
+        .into_iter()
+        .map(|text| format!("{WARNING}{text}"))
+        .collect())
 }
 
 /// Space and background, in words.
@@ -79,11 +98,23 @@ pub(crate) fn space_note(bounds: &Bounds, background: Background) -> String {
     };
     let space = match bounds.space {
         Space::Box => {
-            format!("space: a box of {:.3} units, seen from {:.3} to {:.3}", bounds.longest_side(), bounds.near, bounds.far)
+            format!(
+                "space: a box of {:.3} units, seen from {:.3} to {:.3}",
+                bounds.longest_side(),
+                bounds.near,
+                bounds.far
+            )
         }
-        Space::Ndc(f) => format!("space: all cameras look one way, so NDC, from depth {:.3} to {:.3}", f.near, f.far),
+        Space::Ndc(f) => format!(
+            "space: all cameras look one way, so NDC, from depth {:.3} to {:.3}",
+            f.near, f.far
+        ),
         Space::Contraction => {
-            format!("space: a ball of {:.3} units, and all around it up to {:.0}, contracted", bounds.longest_side(), bounds.far)
+            format!(
+                "space: a ball of {:.3} units, and all around it up to {:.0}, contracted",
+                bounds.longest_side(),
+                bounds.far
+            )
         }
     };
     format!("{space}; {behind}")
@@ -104,7 +135,8 @@ mod tests {
     fn ring(format: Format, count: usize) -> Dataset {
         let frame = |i: usize| {
             let (sin, cos) = (i as f64 / count as f64 * std::f64::consts::TAU).sin_cos();
-            let camera_to_world = [[-sin, 0.0, cos, 4.0 * cos], [cos, 0.0, sin, 4.0 * sin], [0.0, 1.0, 0.0, 0.0]];
+            let camera_to_world =
+                [[-sin, 0.0, cos, 4.0 * cos], [cos, 0.0, sin, 4.0 * sin], [0.0, 1.0, 0.0, 0.0]];
             Frame {
                 name: format!("r_{i}"),
                 image: PathBuf::from(format!("r_{i}.png")),
@@ -120,22 +152,33 @@ mod tests {
         Dataset { format, frames: (0..count).map(frame).collect(), split: None, notes: Vec::new() }
     }
 
-    fn planned(set: &Dataset, params: &Params, background: Background) -> Result<(ImagePlan, Bounds, Vec<usize>), String> {
+    fn planned(
+        set: &Dataset,
+        params: &Params,
+        background: Background,
+    ) -> Result<(ImagePlan, Bounds, Vec<usize>), String> {
         let split = split(set, params)?;
         let images = ImagePlan::new(set, &split, params)?;
         let plan = ScenePlan::new(set, &split, params, images, background)?;
         Ok((plan.images, plan.bounds, plan.references))
     }
 
-    /// A benchmark's images are HR truth, photographs are LR images as they are; sizes, kernel and references follow.
+    /// A benchmark's images are HR truth, photographs are LR images as they are; sizes, kernel and
+    /// references follow.
     #[test]
     fn images_follow_from_the_form() {
-        let params = Params { hr_references: 2, split: Some(SplitKind::Holdout), ..Params::default() };
-        let (made, _, references) = planned(&ring(Format::Blender, 16), &params, Background::White).unwrap();
+        let params =
+            Params { hr_references: 2, split: Some(SplitKind::Holdout), ..Params::default() };
+        let (made, _, references) =
+            planned(&ring(Format::Blender, 16), &params, Background::White).unwrap();
         assert_eq!((made.has_truth, made.sizes.lr, made.sizes.hr), (true, (40, 30), (80, 60)));
         assert_eq!(references.len(), 2);
-        let (given, _, references) = planned(&ring(Format::Transforms, 16), &params, Background::White).unwrap();
-        assert_eq!((given.has_truth, given.sizes.lr, given.sizes.hr), (false, (80, 60), (160, 120)));
+        let (given, _, references) =
+            planned(&ring(Format::Transforms, 16), &params, Background::White).unwrap();
+        assert_eq!(
+            (given.has_truth, given.sizes.lr, given.sizes.hr),
+            (false, (80, 60), (160, 120))
+        );
         assert_eq!((given.kernel, references.len()), (pixels::Kernel::Box, 0));
     }
 
@@ -145,23 +188,37 @@ mod tests {
         let set = ring(Format::Blender, 8);
         let asked = |near, far| {
             let params = Params { near, far, ..Params::default() };
-            planned(&set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
+            planned(&set, &params, Background::White)
+                .map(|(_, bounds, _)| (bounds.near, bounds.far))
         };
         assert_eq!(asked(Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
-        assert_eq!(asked(Some(7.0), Some(1.5)).unwrap_err(), "parameter near: 7 is not before far = 1.5");
-        assert_eq!(asked(None, Some(f64::INFINITY)).unwrap_err(), "parameter far: inf is not a distance");
+        assert_eq!(
+            asked(Some(7.0), Some(1.5)).unwrap_err(),
+            "parameter near: 7 is not before far = 1.5"
+        );
+        assert_eq!(
+            asked(None, Some(f64::INFINITY)).unwrap_err(),
+            "parameter far: inf is not a distance"
+        );
     }
 
     /// What can't be is said by the parameter's name.
     #[test]
     fn what_cannot_be_is_refused() {
-        let refused = |format, params: Params| planned(&ring(format, 8), &params, Background::White).unwrap_err();
+        let refused = |format, params: Params| {
+            planned(&ring(format, 8), &params, Background::White).unwrap_err()
+        };
         let width = refused(
             Format::Transforms,
-            Params { lr_source: Some(crate::params::LrSource::Photographs), lr_width: Some(40), ..Params::default() },
+            Params {
+                lr_source: Some(crate::params::LrSource::Photographs),
+                lr_width: Some(40),
+                ..Params::default()
+            },
         );
         assert!(width.starts_with("parameter lr_width: with lr_source photographs"), "{width}");
-        let kernel = Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
+        let kernel =
+            Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
         let kernel = refused(Format::Blender, kernel);
         assert!(kernel.starts_with("parameter kernel: average needs a whole scale"), "{kernel}");
     }

@@ -23,7 +23,9 @@ fn all_views(set: &Dataset, params: &Params) -> Result<Split, String> {
     match (params.split, &set.split) {
         (Some(SplitKind::Given) | None, Some(given)) => Ok(given.clone()),
         (Some(SplitKind::Given), None) => {
-            Err("parameter split: the data set doesn't say which views are for testing; choose holdout or paper".to_owned())
+            Err("parameter split: the data set doesn't say which views are for testing; choose \
+                holdout or paper"
+                .to_owned())
         }
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {

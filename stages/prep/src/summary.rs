@@ -64,12 +64,14 @@ impl SceneSummary {
 
     /// A line for people, and warnings after it.
     pub(crate) fn in_words(&self) -> String {
-        let warnings: Vec<String> = self.notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
+        let warnings: Vec<String> =
+            self.notes.iter().filter_map(|n| n.strip_prefix(WARNING)).map(str::to_owned).collect();
         let ([lr_width, lr_height], [hr_width, hr_height]) = (self.lr, self.hr);
         let (train, test) = (counted(self.train, "training view"), counted(self.test, "test view"));
         let (kernel, near, far) = (self.kernel, self.bounds.near, self.bounds.far);
         let summary = format!(
-            "{train} at {lr_width}×{lr_height} from {hr_width}×{hr_height} ({kernel:?}), {test}; rays from {near:.2} to {far:.2}"
+            "{train} at {lr_width}×{lr_height} from {hr_width}×{hr_height} ({kernel:?}), {test}; \
+            rays from {near:.2} to {far:.2}"
         );
         with_warnings(&summary, &warnings)
     }

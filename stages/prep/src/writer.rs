@@ -3,7 +3,10 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{Context, FailureExt as _, Progress, printable};
 use dataset::Frame;
-use pixels::{Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr, write_png};
+use pixels::{
+    Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr,
+    write_png,
+};
 use rayon::prelude::*;
 use scene::{VIEWS_FILE, View, Views};
 
@@ -39,8 +42,16 @@ impl<'a> SceneWriter<'a> {
         self.context.write_json(&format!("{subtree}/{VIEWS_FILE}"), &views)
     }
 
-    fn write_degradation(&self, subtree: &str, kernel: Kernel, hr: (u32, u32)) -> anyhow::Result<()> {
-        self.context.write_json(&format!("{subtree}/{DEGRADATION_FILE}"), &Degradation { kernel, hr: hr.into() })
+    fn write_degradation(
+        &self,
+        subtree: &str,
+        kernel: Kernel,
+        hr: (u32, u32),
+    ) -> anyhow::Result<()> {
+        self.context.write_json(
+            &format!("{subtree}/{DEGRADATION_FILE}"),
+            &Degradation { kernel, hr: hr.into() },
+        )
     }
 
     /// `train`: LR images; `downscaled`: the same task one size down, where its solution is known.
@@ -67,7 +78,11 @@ impl<'a> SceneWriter<'a> {
 
     /// `train-cameras`: the training cameras at HR size.
     fn write_train_cameras(&self) -> anyhow::Result<()> {
-        let views = self.plan.train.iter().map(|frame| View::camera_only(self.plan.images.at_hr(&frame.camera())));
+        let views = self
+            .plan
+            .train
+            .iter()
+            .map(|frame| View::camera_only(self.plan.images.at_hr(&frame.camera())));
         self.write_views("train-cameras", views.collect())
     }
 
@@ -93,12 +108,23 @@ impl<'a> SceneWriter<'a> {
         let view = |frame: &&Frame| View {
             image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
             mask: mask_name(frame),
-            depth: frame.depth.as_ref().filter(|_| images.has_truth).map(|_| format!("depth/{}.exr", frame.name)),
-            low_resolution: Some(format!("low/{}.{}", frame.name, degrade::extension(images.kernel))),
+            depth: frame
+                .depth
+                .as_ref()
+                .filter(|_| images.has_truth)
+                .map(|_| format!("depth/{}.exr", frame.name)),
+            low_resolution: Some(format!(
+                "low/{}.{}",
+                frame.name,
+                degrade::extension(images.kernel)
+            )),
             ..View::camera_only(images.at_hr(&frame.camera()))
         };
         let truth: Vec<View> = self.plan.test.iter().map(view).collect();
-        self.write_views("cameras", truth.iter().map(|view| View::camera_only(view.camera.clone())).collect())?;
+        self.write_views(
+            "cameras",
+            truth.iter().map(|view| View::camera_only(view.camera.clone())).collect(),
+        )?;
         self.write_degradation("truth", images.kernel, images.sizes.hr)?;
         self.write_views("truth", truth)
     }
@@ -121,7 +147,8 @@ impl<'a> SceneWriter<'a> {
         })
     }
 
-    /// Writes all that is made of a frame to train on: LR image, the same one size down, HR reference, and their masks.
+    /// Writes all that is made of a frame to train on: LR image, the same one size down, HR
+    /// reference, and their masks.
     fn write_training_image(&self, frame: &Frame, is_reference: bool) -> anyhow::Result<()> {
         let (hr, lr) = self.images(frame)?;
         let name = &frame.name;
@@ -131,7 +158,9 @@ impl<'a> SceneWriter<'a> {
         lr_mask.iter().try_for_each(|mask| self.write_mask("train", name, mask))?;
         if let Some(hr) = hr.filter(|_| is_reference) {
             self.write_hr("references", name, &hr)?;
-            mask.iter().try_for_each(|m| self.write_mask("references", name, &m.resized((hr.width, hr.height), 0)))?;
+            mask.iter().try_for_each(|m| {
+                self.write_mask("references", name, &m.resized((hr.width, hr.height), 0))
+            })?;
         }
         let lr_size = self.plan.images.sizes_of(&frame.intrinsics()).lr;
         let (width, height) = self.plan.images.one_size_down(lr_size);
@@ -156,7 +185,8 @@ impl<'a> SceneWriter<'a> {
             self.write_mask("truth", &frame.name, &mask)?;
         }
         if let (Some(depth), Some(hr)) = (&frame.depth, hr) {
-            self.write_depth(depth, &frame.name, (hr.width, hr.height)).bad_input(frame_name(frame))?;
+            self.write_depth(depth, &frame.name, (hr.width, hr.height))
+                .bad_input(frame_name(frame))?;
         }
         Ok(())
     }
@@ -167,38 +197,58 @@ impl<'a> SceneWriter<'a> {
         if !self.plan.images.has_truth {
             return Ok((None, LrImage::Bytes(image)));
         }
-        let (hr, lr) = degrade(&image, &self.plan.images.sizes_of(&frame.intrinsics()), self.plan.images.kernel);
+        let (hr, lr) = degrade(
+            &image,
+            &self.plan.images.sizes_of(&frame.intrinsics()),
+            self.plan.images.kernel,
+        );
         Ok((Some(hr), lr))
     }
 
     fn write_hr(&self, subtree: &str, name: &str, image: &Rgba8) -> anyhow::Result<()> {
-        write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image).map_err(Into::into)
+        write_png(&self.context.output_path(&format!("{subtree}/images/{name}.png"))?, image)
+            .map_err(Into::into)
     }
 
     fn write_mask(&self, subtree: &str, name: &str, mask: &Mask) -> anyhow::Result<()> {
-        write_png(&self.context.output_path(&format!("{subtree}/masks/{name}.png"))?, &mask.to_rgba8()).map_err(Into::into)
+        write_png(
+            &self.context.output_path(&format!("{subtree}/masks/{name}.png"))?,
+            &mask.to_rgba8(),
+        )
+        .map_err(Into::into)
     }
 
-    /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR themselves keep theirs.
+    /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR
+    /// themselves keep theirs.
     fn lr_mask(&self, mask: &Mask, image: &LrImage) -> Mask {
         let size = image.size();
-        let around = if size == (mask.width, mask.height) { 0 } else { degrade::mask_reach(self.plan.images.kernel) };
+        let around = if size == (mask.width, mask.height) {
+            0
+        } else {
+            degrade::mask_reach(self.plan.images.kernel)
+        };
         mask.resized(size, around)
     }
 
     fn write_lr(&self, folder: &str, name: &str, image: &LrImage) -> anyhow::Result<()> {
-        let path = self.context.output_path(&format!("{folder}/{name}.{}", degrade::extension(self.plan.images.kernel)))?;
+        let path = self.context.output_path(&format!(
+            "{folder}/{name}.{}",
+            degrade::extension(self.plan.images.kernel)
+        ))?;
         match image {
             LrImage::Bytes(image) => write_png(&path, image)?,
             LrImage::Floats(image) => {
-                let channels = ["R", "G", "B", "A"].map(|name| Channel { name, sample_type: SampleType::Float });
+                let channels = ["R", "G", "B", "A"]
+                    .map(|name| Channel { name, sample_type: SampleType::Float });
                 write_exr(
                     &path,
                     (image.width, image.height),
                     &channels,
                     "display-encoded sRGB, premultiplied",
                     |first, rows, samples| {
-                        samples.copy_from_slice(&image.data[first * image.width * 4..(first + rows) * image.width * 4]);
+                        samples.copy_from_slice(
+                            &image.data[first * image.width * 4..(first + rows) * image.width * 4],
+                        );
                         Ok::<(), pixels::PixelError>(())
                     },
                 )?;
@@ -207,16 +257,28 @@ impl<'a> SceneWriter<'a> {
         Ok(())
     }
 
-    /// True depth at HR size: that of the nearest native pixel centre, since averaging depths across an edge invents surfaces.
-    fn write_depth(&self, source: &Path, name: &str, (width, height): (usize, usize)) -> anyhow::Result<()> {
+    /// True depth at HR size: that of the nearest native pixel centre, since averaging depths
+    /// across an edge invents surfaces.
+    fn write_depth(
+        &self,
+        source: &Path,
+        name: &str,
+        (width, height): (usize, usize),
+    ) -> anyhow::Result<()> {
         let native = read_exr(source)?;
         let shown = source.display().to_string();
-        let channel = |name: &str| native.channel(name).with_context(|| format!("{}: no channel {name}", printable(&shown)));
+        let channel = |name: &str| {
+            native
+                .channel(name)
+                .with_context(|| format!("{}: no channel {name}", printable(&shown)))
+        };
         let (depth, opacity) = (channel("Z")?, channel("A")?);
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
-        let channels =
-            [Channel { name: "A", sample_type: SampleType::Half }, Channel { name: "Z", sample_type: SampleType::Float }];
+        let channels = [
+            Channel { name: "A", sample_type: SampleType::Half },
+            Channel { name: "Z", sample_type: SampleType::Float },
+        ];
         write_exr(
             &path,
             (width, height),
@@ -224,7 +286,10 @@ impl<'a> SceneWriter<'a> {
             "Z: z-depth of the nearest native pixel centre; A: 0 where nothing is seen",
             |first, _, samples| {
                 for (i, sample) in samples.chunks_exact_mut(2).enumerate() {
-                    let (x, y) = (nearest(i % width, native.width, width), nearest(first + i / width, native.height, height));
+                    let (x, y) = (
+                        nearest(i % width, native.width, width),
+                        nearest(first + i / width, native.height, height),
+                    );
                     let at = y * native.width + x;
                     sample.copy_from_slice(&[opacity[at], depth[at]]);
                 }

@@ -1,13 +1,17 @@
-//! `register`: finds where photographs were taken from, by a field that knows the scene. Each camera moves until what the field renders meets its
-//! photograph ([`poses::refine`]), from coarse to fine.
+//! `register`: finds where photographs were taken from, by a field that knows the scene. Each
+//! camera moves until what the field renders meets its photograph ([`poses::refine`]), from coarse
+//! to fine.
 //!
-//! That is how test views are to be scored where poses aren't exact: the field lies where its own training views say, and a camera that is wrong
-//! by a pixel costs more decibels than anything a field gets wrong. Only LR photographs are looked at where there are any: HR ones are what
-//! views are scored by.
+//! That is how test views are to be scored where poses aren't exact: the field lies where its own
+//! training views say, and a camera that is wrong by a pixel costs more decibels than anything a
+//! field gets wrong. Only LR photographs are looked at where there are any: HR ones are what views
+//! are scored by.
 
 use std::error::Error;
 
-use artifact::{Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings};
+use artifact::{
+    Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings,
+};
 use pixels::{Image, PixelError};
 use poses::{CameraMove, Moved, Options, Pyramid, refine};
 use radiance::RayField;
@@ -46,7 +50,10 @@ impl Stage for Register {
         let photographs = ["scene/truth", "scene/train", "scene/references"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
-            ("photographs", Input::required(&photographs, "photographs with cameras that are about right")),
+            (
+                "photographs",
+                Input::required(&photographs, "photographs with cameras that are about right"),
+            ),
         ]
     }
 
@@ -102,8 +109,8 @@ impl Registered {
         Self { from: camera.clone(), to: camera.clone(), depth: None, errors: None }
     }
 
-    /// By what a field renders, from coarse to fine. The given pose stays where the whole photograph is met no better from the one found: smaller
-    /// sizes may have led astray.
+    /// By what a field renders, from coarse to fine. The given pose stays where the whole
+    /// photograph is met no better from the one found: smaller sizes may have led astray.
     fn by(
         field: &dyn RayField,
         camera: &Camera,
@@ -124,7 +131,12 @@ impl Registered {
         let last = moved(&to, 0, params.renderings)?;
         let best = if last.after < given.before { last } else { given.clone() };
         let from = camera.resized(image.width as u32, image.height as u32);
-        Ok(Self { from, to: best.camera, depth: best.depth, errors: Some([given.before, best.after]) })
+        Ok(Self {
+            from,
+            to: best.camera,
+            depth: best.depth,
+            errors: Some([given.before, best.after]),
+        })
     }
 }
 
@@ -138,13 +150,22 @@ fn read(view: &View, input: &GivenInput) -> Result<Option<Photograph>, PixelErro
 
 /// How far cameras went, and what it was good for; a warning, where they went far.
 fn summary(found: &[Registered]) -> (String, Option<String>) {
-    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| CameraMove { from, to, depth: *depth }));
+    let moved = Moved::between(found.iter().map(|Registered { from, to, depth, .. }| CameraMove {
+        from,
+        to,
+        depth: *depth,
+    }));
     let errors: Vec<[f64; 2]> = found.iter().filter_map(|registered| registered.errors).collect();
-    let mean = |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
-    let (count, all, before, after) = (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));
-    let summary = format!("{count} of {all} registered: {moved}; error (Huber's) {before:.4} before, {after:.4} after");
+    let mean =
+        |i: usize| (errors.iter().map(|e| e[i]).sum::<f64>() / errors.len().max(1) as f64).sqrt();
+    let (count, all, before, after) =
+        (errors.len(), counted(found.len(), "camera"), mean(0), mean(1));
+    let summary = format!(
+        "{count} of {all} registered: {moved}; error (Huber's) {before:.4} before, {after:.4} after"
+    );
     let warning = format!(
-        "cameras have {moved}, which is far: unless the given poses are that far off, the field or the photographs are of something else"
+        "cameras have {moved}, which is far: unless the given poses are that far off, the field \
+        or the photographs are of something else"
     );
     (summary, moved.is_far().then_some(warning))
 }

@@ -4,8 +4,8 @@ use scene::Intrinsics;
 
 use super::*;
 
-/// A painted wall. Images of fewer pixels than `whole` show it shifted; those of more say nothing of depth, so that nothing
-/// moves by them.
+/// A painted wall. Images of fewer pixels than `whole` show it shifted; those of more say nothing
+/// of depth, so that nothing moves by them.
 struct Wall {
     whole: usize,
     shift: f64,
@@ -15,11 +15,14 @@ impl RayField for Wall {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
         let is_whole = rays.len() >= self.whole;
         let pixel = |ray: &Ray| {
-            let (origin, direction) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+            let (origin, direction) =
+                (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
             let distance = -origin.z / direction.z;
-            let at = origin + distance * direction + DVec3::X * if is_whole { 0.0 } else { self.shift };
-            let colour =
-                [0.0, 1.0, 2.0].map(|c| (0.5 + 0.2 * ((2.0 + c) * at.x + c).sin() + 0.2 * (3.0 * at.y - c).cos()) as f32);
+            let at =
+                origin + distance * direction + DVec3::X * if is_whole { 0.0 } else { self.shift };
+            let colour = [0.0, 1.0, 2.0].map(|c| {
+                (0.5 + 0.2 * ((2.0 + c) * at.x + c).sin() + 0.2 * (3.0 * at.y - c).cos()) as f32
+            });
             let depth = if is_whole && self.shift != 0.0 { f32::INFINITY } else { distance as f32 };
             Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
         };
@@ -29,14 +32,22 @@ impl RayField for Wall {
 
 fn camera(x: f64) -> Camera {
     let intrinsics = Intrinsics::from_angle_x(48, 48, 0.7);
-    Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]] }
+    Camera {
+        name: "r_0".into(),
+        intrinsics,
+        camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
+    }
 }
 
 fn photograph() -> Image {
     let k = camera(0.0).intrinsics;
     let rays = (0..k.width * k.height).map(|i| {
         let ray = camera(0.0).ray(f64::from(i % k.width) + 0.5, f64::from(i / k.width) + 0.5);
-        Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+        Ray {
+            origin: ray.origin.as_vec3().to_array(),
+            direction: ray.direction.as_vec3().to_array(),
+            background: [1.0; 3],
+        }
     });
     let pixels = Wall { whole: 0, shift: 0.0 }.render(&rays.collect::<Vec<_>>()).unwrap();
     Image::new(48, 48, 3, pixels.iter().flat_map(|pixel| pixel.colour).collect())
@@ -49,19 +60,35 @@ fn registered(field: &Wall, from: f64) -> Registered {
 #[test]
 fn a_camera_that_is_off_is_found_and_one_far_off_is_warned_of() {
     let near = registered(&Wall { whole: 0, shift: 0.0 }, 0.02);
-    assert!(near.to.centre().x.abs() < 2e-3 && near.errors.unwrap()[1] < 1e-6, "{:?}", near.to.centre());
+    assert!(
+        near.to.centre().x.abs() < 2e-3 && near.errors.unwrap()[1] < 1e-6,
+        "{:?}",
+        near.to.centre()
+    );
     assert!((near.depth.unwrap() - 4.0).abs() < 0.1);
     let far = registered(&Wall { whole: 0, shift: 0.0 }, 0.4);
     assert!(far.to.centre().x.abs() < 2e-3, "{:?}", far.to.centre());
-    // A photograph is 48 pixels across 2.9 units: 0.02 of those are a third of a pixel, 0.4 are 6.6.
+    // A photograph is 48 pixels across 2.9 units: 0.02 of those are a third of a pixel, 0.4 are
+    // 6.6.
     let (text, warning) = summary(&[near]);
-    assert!(text.starts_with("1 of 1 camera registered: ") && warning.is_none(), "{text} {warning:?}");
-    let (text, warning) = summary(&[far, Registered::unknown(&camera(0.0)), registered(&Wall { whole: 0, shift: 0.0 }, 0.4)]);
+    assert!(
+        text.starts_with("1 of 1 camera registered: ") && warning.is_none(),
+        "{text} {warning:?}"
+    );
+    let (text, warning) = summary(&[
+        far,
+        Registered::unknown(&camera(0.0)),
+        registered(&Wall { whole: 0, shift: 0.0 }, 0.4),
+    ]);
     assert!(text.starts_with("2 of 3 cameras registered: "), "{text}");
-    assert!(warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) in the mean, which is far")), "{warning:?}");
+    assert!(
+        warning.as_ref().is_some_and(|w| w.contains("(4.4 LR pixels) in the mean, which is far")),
+        "{warning:?}"
+    );
 }
 
-/// Smaller images say that the wall lies elsewhere; in the whole one it is met best from where it was given.
+/// Smaller images say that the wall lies elsewhere; in the whole one it is met best from where it
+/// was given.
 #[test]
 fn the_given_pose_stays_where_none_is_better() {
     let misled = registered(&Wall { whole: 2000, shift: 0.5 }, 0.0);

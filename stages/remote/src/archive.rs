@@ -1,6 +1,7 @@
-//! The file that `export` writes and `import` reads: a tar of `export.json`, `objects/HASH/…` and `actions/KEY.json`, in this
-//! order. Whatever stands in `export.json` follows, sorted, and nothing else: each object's manifest, then its files in the
-//! manifest's order, then the records. Equal histories make equal bytes.
+//! The file that `export` writes and `import` reads: a tar of `export.json`, `objects/HASH/…` and
+//! `actions/KEY.json`, in this order. Whatever stands in `export.json` follows, sorted, and nothing
+//! else: each object's manifest, then its files in the manifest's order, then the records. Equal
+//! histories make equal bytes.
 
 use serde::{Deserialize, Serialize};
 

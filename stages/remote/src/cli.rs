@@ -17,14 +17,21 @@ use crate::transfer::AT_ONCE;
 
 /// Shares a store of nerf-sr between machines: finished actions and their artifacts.
 ///
-/// REMOTE is a folder, or s3://bucket/prefix with credentials, region and endpoint from the usual AWS_… variables.
+/// REMOTE is a folder, or s3://bucket/prefix with credentials, region and endpoint from the usual
+/// AWS_… variables.
 #[derive(Parser)]
 #[command(name = "nerf-sr-remote", version)]
 struct Cli {
     #[command(subcommand)]
     verb: Verb,
     /// The store
-    #[arg(long, global = true, default_value = ".nerf-sr", value_name = "DIR", env = "NERF_SR_STORE")]
+    #[arg(
+        long,
+        global = true,
+        default_value = ".nerf-sr",
+        value_name = "DIR",
+        env = "NERF_SR_STORE"
+    )]
     store: PathBuf,
 }
 
@@ -61,8 +68,8 @@ enum Verb {
     },
 }
 
-/// The program: exit code 0 when all is copied, 1 when it failed, 2 for a wrong command line, 3 for what was refused, 130 when it
-/// was interrupted.
+/// The program: exit code 0 when all is copied, 1 when it failed, 2 for a wrong command line, 3 for
+/// what was refused, 130 when it was interrupted.
 pub fn main() -> ExitCode {
     artifact::install_panic_hook("nerf-sr-remote");
     match run(Cli::parse()) {
@@ -86,7 +93,9 @@ fn run(cli: Cli) -> anyhow::Result<()> {
             let store = Store::open(&cli.store)?;
             block_on(&stop, pull(&store, &remote, &selection, &stop))
         }
-        Verb::Export { what, file, records_only } => export(&existing(&cli.store)?, &what, &file, records_only, &stop),
+        Verb::Export { what, file, records_only } => {
+            export(&existing(&cli.store)?, &what, &file, records_only, &stop)
+        }
         Verb::Import { file } => import(&Store::open(&cli.store)?, &file, &stop),
     }
 }
@@ -101,8 +110,12 @@ fn existing(folder: &Path) -> anyhow::Result<Store> {
 }
 
 /// Transfers read and write files in their threads; there are as many as transfers at once.
-fn block_on(stop: &Arc<AtomicBool>, work: impl Future<Output = anyhow::Result<()>>) -> anyhow::Result<()> {
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(AT_ONCE).enable_all().build()?;
+fn block_on(
+    stop: &Arc<AtomicBool>,
+    work: impl Future<Output = anyhow::Result<()>>,
+) -> anyhow::Result<()> {
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(AT_ONCE).enable_all().build()?;
     let result = runtime.block_on(async {
         tokio::select! {
             result = work => result,

@@ -6,7 +6,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, MANIFEST_FILE, Manifest, Record, STORE_FORMAT, Store, counted, print_line, report_line, sized};
+use artifact::{
+    Failure, MANIFEST_FILE, Manifest, Record, STORE_FORMAT, Store, counted, print_line,
+    report_line, sized,
+};
 use serde::Serialize;
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
@@ -16,7 +19,13 @@ use crate::selection::{one, with_history};
 use crate::transfer::Checked;
 
 /// Writes one artifact with its history as one file.
-pub(crate) fn export(store: &Store, what: &str, file: &Path, records_only: bool, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+pub(crate) fn export(
+    store: &Store,
+    what: &str,
+    file: &Path,
+    records_only: bool,
+    stop: &Arc<AtomicBool>,
+) -> anyhow::Result<()> {
     let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
     let written = (|| {
@@ -43,29 +52,44 @@ struct History {
 
 impl History {
     fn of(store: &Store, what: &str, records_only: bool) -> anyhow::Result<Self> {
-        let mut records: BTreeMap<String, Record> = store.records()?.into_iter().map(|record| (record.key(), record)).collect();
+        let mut records: BTreeMap<String, Record> =
+            store.records()?.into_iter().map(|record| (record.key(), record)).collect();
         let place = store.root().display().to_string();
         let names = records.keys().chain(records.values().map(|record| &record.output));
         let name = one(what, names, "artifact or action", &place)?;
         let keys: BTreeSet<String> = match records.get(&name) {
             Some(_) => BTreeSet::from([name.clone()]),
-            None => records.iter().filter(|(_, record)| record.output == name).map(|(key, _)| key.clone()).collect(),
+            None => records
+                .iter()
+                .filter(|(_, record)| record.output == name)
+                .map(|(key, _)| key.clone())
+                .collect(),
         };
         let artifact = records.get(&name).map_or(name, |record| record.output.clone());
         if !store.is_whole(&artifact) {
             let object = store.object(&artifact);
-            return Err(
-                Failure::BadInput(format!("{}: the artifact is not whole; run again, or pull it", object.display())).into()
-            );
+            return Err(Failure::BadInput(format!(
+                "{}: the artifact is not whole; run again, or pull it",
+                object.display()
+            ))
+            .into());
         }
         let history = with_history(&records, keys);
         records.retain(|key, _| history.contains(key));
-        let mut objects: BTreeSet<String> = records.values().map(|record| record.output.clone()).collect();
-        objects.retain(|identity| *identity == artifact || !records_only && store.is_whole(identity));
-        let missing: BTreeSet<&String> =
-            records.values().map(|record| &record.output).filter(|o| !objects.contains(*o)).collect();
+        let mut objects: BTreeSet<String> =
+            records.values().map(|record| record.output.clone()).collect();
+        objects
+            .retain(|identity| *identity == artifact || !records_only && store.is_whole(identity));
+        let missing: BTreeSet<&String> = records
+            .values()
+            .map(|record| &record.output)
+            .filter(|o| !objects.contains(*o))
+            .collect();
         if !records_only && !missing.is_empty() {
-            report_line!("{} of the history not whole here: only the records are written", counted(missing.len(), "artifact"));
+            report_line!(
+                "{} of the history not whole here: only the records are written",
+                counted(missing.len(), "artifact")
+            );
         }
         Ok(Self { artifact, records, objects })
     }
@@ -77,7 +101,11 @@ impl History {
         }
         let total = manifests.iter().map(|(_, manifest)| manifest.size()).sum();
         let folder = file.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let temporary = tempfile::Builder::new().prefix(".").suffix(".partial").permissions(mode(0o666)).tempfile_in(folder);
+        let temporary = tempfile::Builder::new()
+            .prefix(".")
+            .suffix(".partial")
+            .permissions(mode(0o666))
+            .tempfile_in(folder);
         let temporary = temporary.with_context(|| folder.display().to_string())?;
         let mut out = Writer {
             tar: tar::Builder::new(BufWriter::with_capacity(1 << 20, temporary)),
@@ -91,13 +119,22 @@ impl History {
         for (key, record) in &self.records {
             out.json(&action_entry(key), record)?;
         }
-        let temporary = out.tar.into_inner().and_then(|buffer| buffer.into_inner().map_err(io::IntoInnerError::into_error));
+        let temporary = out
+            .tar
+            .into_inner()
+            .and_then(|buffer| buffer.into_inner().map_err(io::IntoInnerError::into_error));
         let temporary = temporary.with_context(|| file.display().to_string())?;
         temporary.as_file().sync_all().with_context(|| file.display().to_string())?;
         temporary.persist(file).map_err(|e| e.error).with_context(|| file.display().to_string())?;
         drop(out.progress);
-        let (records, objects) = (counted(self.records.len(), "record"), counted(self.objects.len(), "artifact"));
-        print_line!("{}: {} with {records} and {objects}, {}", file.display(), &self.artifact[..10], sized(total));
+        let (records, objects) =
+            (counted(self.records.len(), "record"), counted(self.objects.len(), "artifact"));
+        print_line!(
+            "{}: {} with {records} and {objects}, {}",
+            file.display(),
+            &self.artifact[..10],
+            sized(total)
+        );
         Ok(())
     }
 
@@ -136,13 +173,26 @@ impl Writer {
             let path = folder.join(&entry.path);
             let name = path.display().to_string();
             let file = File::open(&path).with_context(|| name.clone())?;
-            let mut reading =
-                Reading { file, checked: Checked::new(entry), progress: &self.progress, name: &name, problem: None };
-            let written = append(&mut self.tar, &object_entry(identity, &entry.path), entry.size, &mut reading);
+            let mut reading = Reading {
+                file,
+                checked: Checked::new(entry),
+                progress: &self.progress,
+                name: &name,
+                problem: None,
+            };
+            let written = append(
+                &mut self.tar,
+                &object_entry(identity, &entry.path),
+                entry.size,
+                &mut reading,
+            );
             if let Some(problem) = reading.problem.take() {
                 return Err(problem);
             }
-            reading.checked.finish(&name, "the artifact is damaged: `nerf-sr verify --remove`, then run again")?;
+            reading.checked.finish(
+                &name,
+                "the artifact is damaged: `nerf-sr verify --remove`, then run again",
+            )?;
             written.with_context(|| self.name.clone())?;
         }
         Ok(())
@@ -154,7 +204,12 @@ impl Writer {
 }
 
 /// Nothing of the machine is in an entry: neither owner nor time.
-fn append(tar: &mut tar::Builder<impl Write>, path: &str, size: u64, from: impl Read) -> io::Result<()> {
+fn append(
+    tar: &mut tar::Builder<impl Write>,
+    path: &str,
+    size: u64,
+    from: impl Read,
+) -> io::Result<()> {
     let mut header = tar::Header::new_gnu();
     header.set_size(size);
     header.set_mode(0o644);

@@ -5,7 +5,10 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Arrival, Failure, FileEntry, MANIFEST_FILE, Record, STORE_FORMAT, Store, counted, print_line, sized};
+use artifact::{
+    Arrival, Failure, FileEntry, MANIFEST_FILE, Record, STORE_FORMAT, Store, counted, print_line,
+    sized,
+};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
@@ -26,7 +29,8 @@ pub(crate) fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyh
     let mut archive = tar::Archive::new(BufReader::with_capacity(1 << 20, open));
     let entries = archive.entries().with_context(|| name.clone())?.raw(true);
     let intake = Intake::begin(store, stop)?;
-    let mut reader = Reader { entries, intake: &intake, name, progress: Progress::new("import", total, stop) };
+    let mut reader =
+        Reader { entries, intake: &intake, name, progress: Progress::new("import", total, stop) };
     let index = reader.index()?;
     let mut arrivals = Vec::new();
     for identity in &index.objects {
@@ -42,23 +46,35 @@ pub(crate) fn import(store: &Store, file: &Path, stop: &Arc<AtomicBool>) -> anyh
     drop(reader);
     let new = take_in(&intake, &arrivals, records)?;
     intake.end()?;
-    let (records, objects) = (counted(index.actions.len(), "record"), counted(index.objects.len(), "artifact"));
-    print_line!("{}: {records} and {objects} read ({}), {new} records new", file.display(), sized(total));
+    let (records, objects) =
+        (counted(index.actions.len(), "record"), counted(index.objects.len(), "artifact"));
+    print_line!(
+        "{}: {records} and {objects} read ({}), {new} records new",
+        file.display(),
+        sized(total)
+    );
     Ok(())
 }
 
-/// Objects first, each with its records, and then records that stand alone. How many records are new.
-fn take_in(intake: &Intake, arrivals: &[(&String, Option<Arrival>)], mut records: Vec<Record>) -> anyhow::Result<usize> {
+/// Objects first, each with its records, and then records that stand alone. How many records are
+/// new.
+fn take_in(
+    intake: &Intake,
+    arrivals: &[(&String, Option<Arrival>)],
+    mut records: Vec<Record>,
+) -> anyhow::Result<usize> {
     let mut new = 0;
     for (identity, arrival) in arrivals {
-        let (own, others) = records.into_iter().partition::<Vec<_>, _>(|record| record.output == **identity);
+        let (own, others) =
+            records.into_iter().partition::<Vec<_>, _>(|record| record.output == **identity);
         new += intake.take_in(arrival.as_ref(), &own)?;
         records = others;
     }
     Ok(new + intake.take_in(None, &records)?)
 }
 
-/// Reads entry after entry; any that isn't the next one is refused, so none decides where it is written.
+/// Reads entry after entry; any that isn't the next one is refused, so none decides where it is
+/// written.
 struct Reader<'a, R: Read> {
     entries: tar::Entries<'a, R>,
     intake: &'a Intake,
@@ -81,7 +97,10 @@ impl<'a, R: Read> Reader<'a, R> {
         loop {
             let entry = match self.entries.next() {
                 Some(Ok(entry)) => entry,
-                Some(Err(error)) => return Err(self.refuse(format!("no tar file where {expected:?} should follow: {error}"))),
+                Some(Err(error)) => {
+                    return Err(self
+                        .refuse(format!("no tar file where {expected:?} should follow: {error}")));
+                }
                 None => return Err(self.refuse(format!("it ends before {expected:?}"))),
             };
             let kind = entry.header().entry_type();
@@ -124,14 +143,22 @@ impl<'a, R: Read> Reader<'a, R> {
 
     fn index(&mut self) -> anyhow::Result<Index> {
         let bytes = self.small(INDEX, MANIFEST_LIMIT)?;
-        let value: serde_json::Value = serde_json::from_slice(&bytes).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
+        let value: serde_json::Value =
+            serde_json::from_slice(&bytes).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
         for (field, known) in [("export", EXPORT), ("store", STORE_FORMAT)] {
-            if value.get(field).and_then(serde_json::Value::as_u64).is_none_or(|found| found > u64::from(known)) {
+            if value
+                .get(field)
+                .and_then(serde_json::Value::as_u64)
+                .is_none_or(|found| found > u64::from(known))
+            {
                 let found = value.get(field).cloned().unwrap_or_default();
-                return Err(self.refuse(format!("{field} format {found}, this nerf-sr-remote knows {known}; use the newer one")));
+                return Err(self.refuse(format!(
+                    "{field} format {found}, this nerf-sr-remote knows {known}; use the newer one"
+                )));
             }
         }
-        let index: Index = serde_json::from_value(value).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
+        let index: Index =
+            serde_json::from_value(value).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
         for names in [&index.objects, &index.actions] {
             if !names.iter().all(|name| is_hash(name)) || !names.is_sorted_by(|a, b| a < b) {
                 return Err(self.refuse(format!("{INDEX}: names that are no sorted hashes")));
@@ -153,7 +180,11 @@ impl<'a, R: Read> Reader<'a, R> {
         for file in &manifest.files {
             self.file(identity, file, (!is_here).then(|| folder.join(&file.path)).as_deref())?;
         }
-        if is_here { Ok(None) } else { Ok(Some(self.intake.store.check_arrival(&folder, identity)?)) }
+        if is_here {
+            Ok(None)
+        } else {
+            Ok(Some(self.intake.store.check_arrival(&folder, identity)?))
+        }
     }
 
     /// A file of an object, written where it isn't here yet.
@@ -164,12 +195,14 @@ impl<'a, R: Read> Reader<'a, R> {
             let sizes = format!("{} bytes where the manifest says {}", entry.size(), file.size);
             return Err(self.refuse(format!("{path:?} has {sizes}")));
         }
-        let mut out = to.map(|to| create(to).with_context(|| to.display().to_string())).transpose()?;
+        let mut out =
+            to.map(|to| create(to).with_context(|| to.display().to_string())).transpose()?;
         let name = self.name_of(&path);
         let mut checked = Checked::new(file);
         let mut piece = vec![0; PIECE];
         loop {
-            let count = entry.read(&mut piece).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;
+            let count =
+                entry.read(&mut piece).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;
             if count == 0 {
                 return checked.finish(&name, REMEDY);
             }
@@ -183,10 +216,14 @@ impl<'a, R: Read> Reader<'a, R> {
     /// Nothing may follow, and every object must have a record.
     fn end(&mut self, index: &Index, records: &[Record]) -> anyhow::Result<()> {
         if let Some(entry) = self.entries.next() {
-            let name = entry.map_or_else(|e| e.to_string(), |e| String::from_utf8_lossy(&e.header().path_bytes()).into_owned());
+            let name = entry.map_or_else(
+                |e| e.to_string(),
+                |e| String::from_utf8_lossy(&e.header().path_bytes()).into_owned(),
+            );
             return Err(self.refuse(format!("{name:?} where the end should be")));
         }
-        let has_record = |identity: &String| records.iter().any(|record| record.output == *identity);
+        let has_record =
+            |identity: &String| records.iter().any(|record| record.output == *identity);
         match index.objects.iter().chain([&index.artifact]).find(|identity| !has_record(identity)) {
             Some(identity) => Err(self.refuse(format!("no record says what made {identity:?}"))),
             None => Ok(()),

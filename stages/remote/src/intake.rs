@@ -4,8 +4,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{
-    Arrival, Damage, Entered, Failure, FileEntry, Locked, MANIFEST_FILE, Manifest, Record, RunFile, Store, relative_path,
-    report_line,
+    Arrival, Damage, Entered, Failure, FileEntry, Locked, MANIFEST_FILE, Manifest, Record, RunFile,
+    Store, relative_path, report_line,
 };
 
 use crate::selection::is_hash;
@@ -15,8 +15,8 @@ pub(crate) const RECORD_LIMIT: u64 = 4 << 20;
 /// A manifest has some 150 bytes a file.
 pub(crate) const MANIFEST_LIMIT: u64 = 64 << 20;
 
-/// What is being copied into a store. It is a run: garbage collection leaves alone what a run needs, and clears what a killed one
-/// left behind.
+/// What is being copied into a store. It is a run: garbage collection leaves alone what a run
+/// needs, and clears what a killed one left behind.
 pub(crate) struct Intake {
     pub(crate) store: Store,
     run: Option<RunFile>,
@@ -37,7 +37,11 @@ impl Intake {
     }
 
     /// Takes in an object, if one is given, then its records; how many of these are new.
-    pub(crate) fn take_in(&self, arrival: Option<&Arrival>, records: &[Record]) -> anyhow::Result<usize> {
+    pub(crate) fn take_in(
+        &self,
+        arrival: Option<&Arrival>,
+        records: &[Record],
+    ) -> anyhow::Result<usize> {
         let entered = entered(&self.store, &self.stop)?;
         if let Some(arrival) = arrival {
             self.store.take_in(&entered, arrival)?;
@@ -71,7 +75,9 @@ pub(crate) fn entered(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entere
     loop {
         match store.try_enter()? {
             Locked::Held(entered) => return Ok(entered),
-            Locked::By(_) if stop.load(Ordering::Relaxed) => return Err(Failure::Interrupted.into()),
+            Locked::By(_) if stop.load(Ordering::Relaxed) => {
+                return Err(Failure::Interrupted.into());
+            }
             Locked::By(_) => {}
         }
         if !is_said && since.elapsed() > Duration::from_secs(1) {
@@ -85,9 +91,13 @@ pub(crate) fn entered(store: &Store, stop: &AtomicBool) -> anyhow::Result<Entere
 /// A record from elsewhere: of this key, and with names that paths may be made of.
 pub(crate) fn read_record(bytes: &[u8], key: &str, name: &str) -> anyhow::Result<Record> {
     let refuse = |reason: String| Failure::BadInput(format!("{name}: {reason}"));
-    let record: Record = serde_json::from_slice(bytes).map_err(|e| refuse(format!("not a record: {e}")))?;
+    let record: Record =
+        serde_json::from_slice(bytes).map_err(|e| refuse(format!("not a record: {e}")))?;
     if record.key() != key {
-        return Err(refuse("the content is not what was written (its key is not its name)".to_owned()).into());
+        return Err(refuse(
+            "the content is not what was written (its key is not its name)".to_owned(),
+        )
+        .into());
     }
     match std::iter::once(&record.output).chain(&record.made_of).find(|name| !is_hash(name)) {
         Some(name) => Err(refuse(format!("{name:?} is not a hash")).into()),
@@ -95,7 +105,8 @@ pub(crate) fn read_record(bytes: &[u8], key: &str, name: &str) -> anyhow::Result
     }
 }
 
-/// The manifest from elsewhere in a scratch folder: of this identity, and with paths as nerf-sr writes them.
+/// The manifest from elsewhere in a scratch folder: of this identity, and with paths as nerf-sr
+/// writes them.
 pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow::Result<Manifest> {
     let refuse = |reason: String| Failure::BadInput(format!("{name}: {reason}"));
     let manifest = Manifest::read(folder).map_err(|damage| match damage {
@@ -103,16 +114,23 @@ pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow
         other => refuse(other.to_string()),
     })?;
     if manifest.identity() != identity {
-        return Err(refuse("the content is not what was written (its blake3 is not the artifact's name)".to_owned()).into());
+        return Err(refuse(
+            "the content is not what was written (its blake3 is not the artifact's name)"
+                .to_owned(),
+        )
+        .into());
     }
     let is_plain = |file: &&FileEntry| {
-        file.path != MANIFEST_FILE && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
+        file.path != MANIFEST_FILE
+            && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
     };
     if manifest.files.iter().try_fold(0_u64, |sum, file| sum.checked_add(file.size)).is_none() {
         return Err(refuse("sizes that no disk has".to_owned()).into());
     }
     match manifest.files.iter().find(|file| !is_plain(file)) {
-        Some(file) => Err(refuse(format!("{:?} is not the path of an artifact's file", file.path)).into()),
+        Some(file) => {
+            Err(refuse(format!("{:?} is not the path of an artifact's file", file.path)).into())
+        }
         None => Ok(manifest),
     }
 }

@@ -9,8 +9,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 /// Between two lines where there is no terminal.
 const INTERVAL: Duration = Duration::from_secs(10);
 
-/// Bytes done of bytes in all, with the time left: a bar on a terminal, a line now and then elsewhere. Knows of signals, too:
-/// work looks at both between two pieces.
+/// Bytes done of bytes in all, with the time left: a bar on a terminal, a line now and then
+/// elsewhere. Knows of signals, too: work looks at both between two pieces.
 pub(crate) struct Progress {
     label: &'static str,
     total: u64,
@@ -29,8 +29,8 @@ impl Progress {
     /// With a total of 0 it looks at signals alone.
     pub(crate) fn new(label: &'static str, total: u64, stop: &Arc<AtomicBool>) -> Self {
         let bar = (total > 0 && std::io::stderr().is_terminal()).then(|| {
-            let style =
-                ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
+            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}")
+                .expect("the template is constant");
             ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label)
         });
         let mut pace = Pace::default();
@@ -47,7 +47,8 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         state.done += bytes;
         let done = state.done;
-        let words = |left: String| format!("{} of {} · {left} left", sized(done), sized(self.total));
+        let words =
+            |left: String| format!("{} of {} · {left} left", sized(done), sized(self.total));
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(words(state.pace.left(done, self.total)));

@@ -13,17 +13,25 @@ use crate::selection::Selection;
 use crate::transfer::{Transfer, all};
 
 /// Copies finished actions and their artifacts from a remote to a store that lacks them.
-pub(crate) async fn pull(store: &Store, remote: &Remote, selection: &Selection, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+pub(crate) async fn pull(
+    store: &Store,
+    remote: &Remote,
+    selection: &Selection,
+    stop: &Arc<AtomicBool>,
+) -> anyhow::Result<()> {
     remote.check_format(Access::Read).await?;
     let looking = Arc::new(Progress::new("pull", 0, stop));
     let mut refused = Vec::new();
-    let (missing, known) = missing_records(store, remote, selection, &looking, &mut refused).await?;
+    let (missing, known) =
+        missing_records(store, remote, selection, &looking, &mut refused).await?;
     let intake = Arc::new(Intake::begin(store, stop)?);
     let objects = look(&intake, remote, missing, &looking, &mut refused).await?;
     let total = objects.iter().fold(0, |sum: u64, object| sum.saturating_add(object.bytes));
     drop(looking);
     let transfer = Transfer::new(remote, Progress::new("pull", total, stop));
-    let tasks = objects.into_iter().map(|object| refusable(fetch(Arc::clone(&intake), Arc::clone(&transfer), object)));
+    let tasks = objects
+        .into_iter()
+        .map(|object| refusable(fetch(Arc::clone(&intake), Arc::clone(&transfer), object)));
     let (mut actions, mut bytes) = (0, 0);
     for result in all(tasks).await? {
         match result {
@@ -33,11 +41,19 @@ pub(crate) async fn pull(store: &Store, remote: &Remote, selection: &Selection, 
     }
     refused.sort_unstable();
     refused.iter().for_each(|reason| transfer.progress.say(reason));
-    print_line!("{}: {} pulled ({}), {known} here already", remote.name(""), counted(actions, "action"), sized(bytes));
+    print_line!(
+        "{}: {} pulled ({}), {known} here already",
+        remote.name(""),
+        counted(actions, "action"),
+        sized(bytes)
+    );
     Arc::into_inner(intake).map_or(Ok(()), Intake::end)?;
     match refused.len() {
         0 => Ok(()),
-        count => Err(Failure::BadInput(format!("{} refused; the rest is here", counted(count, "file"))).into()),
+        count => {
+            Err(Failure::BadInput(format!("{} refused; the rest is here", counted(count, "file")))
+                .into())
+        }
     }
 }
 
@@ -58,7 +74,8 @@ async fn missing_records(
         keys.retain(|key| selection.keys.iter().any(|start| key.starts_with(start)));
     }
     let known = count - keys.len();
-    let tasks = keys.into_iter().map(|key| refusable(record(remote.clone(), Arc::clone(progress), key)));
+    let tasks =
+        keys.into_iter().map(|key| refusable(record(remote.clone(), Arc::clone(progress), key)));
     let mut records = BTreeMap::new();
     for result in all(tasks).await? {
         match result {
@@ -69,13 +86,20 @@ async fn missing_records(
         }
     }
     let selected = selection.of(&records, &remote.name(""))?;
-    let missing: Vec<Record> =
-        selected.iter().filter(|key| store.hit(key).is_none()).filter_map(|key| records.remove(key)).collect();
+    let missing: Vec<Record> = selected
+        .iter()
+        .filter(|key| store.hit(key).is_none())
+        .filter_map(|key| records.remove(key))
+        .collect();
     let known = if all_are_meant { known } else { selected.len() - missing.len() };
     Ok((missing, known))
 }
 
-async fn record(remote: Remote, progress: Arc<Progress>, key: String) -> anyhow::Result<Option<(String, Record)>> {
+async fn record(
+    remote: Remote,
+    progress: Arc<Progress>,
+    key: String,
+) -> anyhow::Result<Option<(String, Record)>> {
     progress.add(0)?;
     let file = format!("actions/{key}.json");
     let Some(bytes) = remote.read(&file, RECORD_LIMIT).await? else { return Ok(None) };
@@ -83,7 +107,8 @@ async fn record(remote: Remote, progress: Arc<Progress>, key: String) -> anyhow:
     Ok(Some((key, record)))
 }
 
-/// An artifact that is to come, its manifest in the scratch folder already; `bytes` is 0 where the store has it.
+/// An artifact that is to come, its manifest in the scratch folder already; `bytes` is 0 where the
+/// store has it.
 struct Object {
     identity: String,
     records: Vec<Record>,
@@ -104,7 +129,13 @@ async fn look(
         by_output.entry(record.output.clone()).or_default().push(record);
     }
     let tasks = by_output.into_iter().map(|(identity, records)| {
-        refusable(manifest(Arc::clone(intake), remote.clone(), Arc::clone(progress), identity, records))
+        refusable(manifest(
+            Arc::clone(intake),
+            remote.clone(),
+            Arc::clone(progress),
+            identity,
+            records,
+        ))
     });
     let mut objects = Vec::new();
     for result in all(tasks).await? {
@@ -130,18 +161,26 @@ async fn manifest(
     }
     let file = format!("objects/{identity}/{MANIFEST_FILE}");
     let Some(bytes) = remote.read(&file, MANIFEST_LIMIT).await? else {
-        let message = format!("{}: it is not there; push again from a whole store", remote.name(&file));
+        let message =
+            format!("{}: it is not there; push again from a whole store", remote.name(&file));
         return Err(Failure::BadInput(message).into());
     };
     let folder = intake.scratch(&identity);
     let path = folder.join(MANIFEST_FILE);
-    std::fs::create_dir_all(&folder).and_then(|()| std::fs::write(&path, bytes)).with_context(|| path.display().to_string())?;
+    std::fs::create_dir_all(&folder)
+        .and_then(|()| std::fs::write(&path, bytes))
+        .with_context(|| path.display().to_string())?;
     let manifest = read_manifest(&folder, &identity, &remote.name(&file))?;
     Ok(Object { identity, records, bytes: manifest.size(), is_here: false })
 }
 
-/// Fetches an artifact, looks at it as a whole, and takes it in with its records. How many of these are new, and its bytes.
-async fn fetch(intake: Arc<Intake>, transfer: Arc<Transfer>, object: Object) -> anyhow::Result<(usize, u64)> {
+/// Fetches an artifact, looks at it as a whole, and takes it in with its records. How many of these
+/// are new, and its bytes.
+async fn fetch(
+    intake: Arc<Intake>,
+    transfer: Arc<Transfer>,
+    object: Object,
+) -> anyhow::Result<(usize, u64)> {
     let Object { identity, records, bytes, is_here } = object;
     if is_here {
         return Ok((intake.take_in(None, &records)?, 0));
@@ -149,22 +188,36 @@ async fn fetch(intake: Arc<Intake>, transfer: Arc<Transfer>, object: Object) -> 
     let folder = intake.scratch(&identity);
     let manifest = read_manifest(&folder, &identity, &identity)?;
     let files = manifest.files.into_iter().map(|entry| {
-        download(Arc::clone(&transfer), format!("objects/{identity}/{}", entry.path), folder.join(&entry.path), entry)
+        download(
+            Arc::clone(&transfer),
+            format!("objects/{identity}/{}", entry.path),
+            folder.join(&entry.path),
+            entry,
+        )
     });
     all(files).await?;
     let arrival = intake.store.check_arrival(&folder, &identity)?;
     Ok((intake.take_in(Some(&arrival), &records)?, bytes))
 }
 
-async fn download(transfer: Arc<Transfer>, from: String, to: PathBuf, entry: FileEntry) -> anyhow::Result<()> {
+async fn download(
+    transfer: Arc<Transfer>,
+    from: String,
+    to: PathBuf,
+    entry: FileEntry,
+) -> anyhow::Result<()> {
     transfer.download(&from, &to, &entry).await
 }
 
 /// What is wrong with one artifact stops no other: its reason is a result. Any other error is one.
-async fn refusable<T>(task: impl Future<Output = anyhow::Result<T>>) -> anyhow::Result<Result<T, String>> {
+async fn refusable<T>(
+    task: impl Future<Output = anyhow::Result<T>>,
+) -> anyhow::Result<Result<T, String>> {
     match task.await {
         Ok(value) => Ok(Ok(value)),
-        Err(error) if matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => Ok(Err(artifact::one_line(&error))),
+        Err(error) if matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => {
+            Ok(Err(artifact::one_line(&error)))
+        }
         Err(error) => Err(error),
     }
 }

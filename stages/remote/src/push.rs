@@ -3,7 +3,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{FileEntry, MANIFEST_FILE, Manifest, Record, Store, counted, print_line, report_line, sized};
+use artifact::{
+    FileEntry, MANIFEST_FILE, Manifest, Record, Store, counted, print_line, report_line, sized,
+};
 
 use crate::intake::entered;
 use crate::progress::Progress;
@@ -12,15 +14,22 @@ use crate::selection::Selection;
 use crate::transfer::{Transfer, all};
 
 /// Copies finished actions and their artifacts to a remote that lacks them.
-pub(crate) async fn push(store: &Store, remote: &Remote, selection: &Selection, stop: &Arc<AtomicBool>) -> anyhow::Result<()> {
+pub(crate) async fn push(
+    store: &Store,
+    remote: &Remote,
+    selection: &Selection,
+    stop: &Arc<AtomicBool>,
+) -> anyhow::Result<()> {
     remote.check_format(Access::Write).await?;
     let place = store.root().display().to_string();
-    let records: BTreeMap<String, Record> = store.records()?.into_iter().map(|record| (record.key(), record)).collect();
+    let records: BTreeMap<String, Record> =
+        store.records()?.into_iter().map(|record| (record.key(), record)).collect();
     let selected = selection.of(&records, &place)?;
     let run = store.begin_run(&entered(store, stop)?, std::env::args().collect())?;
     let id = run.id().to_owned();
     let there: BTreeSet<String> = remote.keys().await?.into_iter().collect();
-    let missing: Vec<&Record> = selected.iter().filter(|key| !there.contains(*key)).map(|key| &records[key]).collect();
+    let missing: Vec<&Record> =
+        selected.iter().filter(|key| !there.contains(*key)).map(|key| &records[key]).collect();
     {
         // From here on garbage collection leaves alone what is about to be read.
         let entered = entered(store, stop)?;
@@ -34,7 +43,12 @@ pub(crate) async fn push(store: &Store, remote: &Remote, selection: &Selection, 
     store.remove_run(&id).ok();
     let (actions, bytes) = pushed?;
     let known = selected.len() - missing.len();
-    print_line!("{}: {} pushed ({}), {known} there already", remote.name(""), counted(actions, "action"), sized(bytes));
+    print_line!(
+        "{}: {} pushed ({}), {known} there already",
+        remote.name(""),
+        counted(actions, "action"),
+        sized(bytes)
+    );
     Ok(())
 }
 
@@ -62,13 +76,20 @@ async fn push_records(
     let actions = by_output.values().map(Vec::len).sum();
     let total = sizes.values().sum();
     let transfer = Transfer::new(remote, Progress::new("push", total, stop));
-    all(by_output.into_iter().map(|(output, records)| push_object(store.clone(), Arc::clone(&transfer), output, records)))
-        .await?;
+    all(by_output.into_iter().map(|(output, records)| {
+        push_object(store.clone(), Arc::clone(&transfer), output, records)
+    }))
+    .await?;
     Ok((actions, total))
 }
 
 /// Files first, then the manifest, then the records: whoever starts from a record finds all.
-async fn push_object(store: Store, transfer: Arc<Transfer>, output: String, records: Vec<Record>) -> anyhow::Result<()> {
+async fn push_object(
+    store: Store,
+    transfer: Arc<Transfer>,
+    output: String,
+    records: Vec<Record>,
+) -> anyhow::Result<()> {
     let folder = store.object(&output);
     let manifest = Manifest::read(&folder)?;
     let there = transfer.remote.list(&format!("objects/{output}")).await?;
@@ -81,7 +102,10 @@ async fn push_object(store: Store, transfer: Arc<Transfer>, output: String, reco
             missing.push((folder.join(&entry.path), to, entry));
         }
     }
-    all(missing.into_iter().map(|(from, to, entry)| upload(Arc::clone(&transfer), from, to, entry))).await?;
+    all(missing
+        .into_iter()
+        .map(|(from, to, entry)| upload(Arc::clone(&transfer), from, to, entry)))
+    .await?;
     let path = folder.join(MANIFEST_FILE);
     let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
     transfer.remote.write(&format!("objects/{output}/{MANIFEST_FILE}"), bytes).await?;
@@ -94,6 +118,11 @@ async fn push_object(store: Store, transfer: Arc<Transfer>, output: String, reco
     Ok(())
 }
 
-async fn upload(transfer: Arc<Transfer>, from: std::path::PathBuf, to: String, entry: FileEntry) -> anyhow::Result<()> {
+async fn upload(
+    transfer: Arc<Transfer>,
+    from: std::path::PathBuf,
+    to: String,
+    entry: FileEntry,
+) -> anyhow::Result<()> {
     transfer.upload(&from, &to, &entry).await
 }

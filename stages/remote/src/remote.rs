@@ -9,7 +9,9 @@ use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
 use object_store::path::Path;
-use object_store::{ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig};
+use object_store::{
+    ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig,
+};
 
 /// A server that says nothing for so long is given up.
 const SILENCE: Duration = Duration::from_secs(60);
@@ -37,7 +39,8 @@ const IDENTITIES: [&str; 5] = [
     "AWS_CONTAINER_CREDENTIALS_FULL_URI",
     "AWS_SKIP_SIGNATURE",
 ];
-const NO_IDENTITY: &str = " (AWS_ACCESS_KEY_ID is not set, so the machine's own role was asked for)";
+const NO_IDENTITY: &str =
+    " (AWS_ACCESS_KEY_ID is not set, so the machine's own role was asked for)";
 
 /// Whether a remote is to be written.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -53,7 +56,9 @@ impl Remote {
         match place.split_once("://") {
             Some(("s3", rest)) => Self::open_s3(rest.trim_end_matches('/'), name),
             Some((scheme, _)) => {
-                let message = format!("{place}: {scheme}:// is not known; a remote is a folder or s3://bucket/prefix");
+                let message = format!(
+                    "{place}: {scheme}:// is not known; a remote is a folder or s3://bucket/prefix"
+                );
                 Err(Failure::Usage(message).into())
             }
             None => Self::open_folder(FilePath::new(place), name, access),
@@ -63,7 +68,10 @@ impl Remote {
     fn open_folder(folder: &FilePath, name: String, access: Access) -> anyhow::Result<Self> {
         if access == Access::Write {
             if folder.join("locks").exists() {
-                let message = format!("{name}: a store of nerf-sr's own, which only a run may write; name another folder");
+                let message = format!(
+                    "{name}: a store of nerf-sr's own, which only a run may write; name another \
+                    folder"
+                );
                 return Err(Failure::Usage(message).into());
             }
             std::fs::create_dir_all(folder).with_context(|| name.clone())?;
@@ -79,24 +87,37 @@ impl Remote {
     fn open_s3(rest: &str, name: String) -> anyhow::Result<Self> {
         let (bucket, prefix) = rest.split_once('/').unwrap_or((rest, ""));
         if bucket.is_empty() {
-            return Err(Failure::Usage(format!("{name}: names no bucket; a remote is a folder or s3://bucket/prefix")).into());
+            return Err(Failure::Usage(format!(
+                "{name}: names no bucket; a remote is a folder or s3://bucket/prefix"
+            ))
+            .into());
         }
         // With another provider set already, that one is as good.
         rustls::crypto::ring::default_provider().install_default().ok();
-        let endpoint =
-            ["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"].into_iter().find_map(|v| std::env::var(v).ok());
+        let endpoint = ["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT"]
+            .into_iter()
+            .find_map(|v| std::env::var(v).ok());
         // A limit on a whole request would stop large files on slow lines.
         let client = ClientOptions::new().with_timeout_disabled().with_read_timeout(SILENCE);
         let plain = endpoint.is_some_and(|endpoint| endpoint.starts_with("http://"));
-        let retry = RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
-        let builder = AmazonS3Builder::from_env().with_bucket_name(bucket).with_client_options(client).with_allow_http(plain);
+        let retry =
+            RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
+        let builder = AmazonS3Builder::from_env()
+            .with_bucket_name(bucket)
+            .with_client_options(client)
+            .with_allow_http(plain);
         let files = builder.with_retry(retry).build().with_context(|| name.clone())?;
         let prefix = Path::parse(prefix).with_context(|| name.clone())?;
-        let hint = if IDENTITIES.iter().any(|name| std::env::var_os(name).is_some()) { "" } else { NO_IDENTITY };
+        let hint = if IDENTITIES.iter().any(|name| std::env::var_os(name).is_some()) {
+            ""
+        } else {
+            NO_IDENTITY
+        };
         Ok(Self { files: Arc::new(files), prefix, name, hint })
     }
 
-    /// Where a file of the store is kept. Names with characters that a server or a file system may not take are percent-encoded.
+    /// Where a file of the store is kept. Names with characters that a server or a file system may
+    /// not take are percent-encoded.
     pub(crate) fn path(&self, file: &str) -> Path {
         let is_plain = |c: char| !c.is_control() && !"%#\\?*:<>|\"{}[]^`~".contains(c);
         let path = if file.chars().all(is_plain) { Path::parse(file).ok() } else { None };
@@ -131,7 +152,11 @@ impl Remote {
         while let Some(piece) = stream.next().await {
             bytes.extend_from_slice(&piece.with_context(|| self.failed(file))?);
             if bytes.len() as u64 > limit {
-                return Err(Failure::BadInput(format!("{}: more than {limit} bytes", self.name(file))).into());
+                return Err(Failure::BadInput(format!(
+                    "{}: more than {limit} bytes",
+                    self.name(file)
+                ))
+                .into());
             }
         }
         Ok(Some(bytes))
@@ -139,32 +164,41 @@ impl Remote {
 
     /// Writes a file at once: a reader sees the old or the new one.
     pub(crate) async fn write(&self, file: &str, bytes: Vec<u8>) -> anyhow::Result<()> {
-        self.files.put(&self.path(file), PutPayload::from(bytes)).await.with_context(|| self.failed(file))?;
+        self.files
+            .put(&self.path(file), PutPayload::from(bytes))
+            .await
+            .with_context(|| self.failed(file))?;
         Ok(())
     }
 
     /// Every file below a folder with its size.
     pub(crate) async fn list(&self, folder: &str) -> anyhow::Result<BTreeMap<Path, u64>> {
-        let entries = self.files.list(Some(&self.path(folder))).map_ok(|meta| (meta.location, meta.size));
+        let entries =
+            self.files.list(Some(&self.path(folder))).map_ok(|meta| (meta.location, meta.size));
         entries.try_collect().await.with_context(|| self.failed(folder))
     }
 
     /// Keys that have a record, sorted.
     pub(crate) async fn keys(&self) -> anyhow::Result<Vec<String>> {
         let files = self.list("actions").await?;
-        let keys = files.keys().filter_map(|path| Some(path.filename()?.strip_suffix(".json")?.to_owned()));
+        let keys = files
+            .keys()
+            .filter_map(|path| Some(path.filename()?.strip_suffix(".json")?.to_owned()));
         Ok(keys.filter(|key| crate::selection::is_hash(key)).collect())
     }
 
-    /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for writing, as one of an older form.
+    /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for
+    /// writing, as one of an older form.
     pub(crate) async fn check_format(&self, access: Access) -> anyhow::Result<()> {
         let bytes = match self.read("format", FORMAT_LIMIT).await? {
             Some(bytes) => bytes,
             None if access == Access::Write => return self.mark().await,
             None => {
-                return Err(
-                    Failure::BadInput(format!("{}: nothing was pushed here: there is no file `format`", self.name)).into()
-                );
+                return Err(Failure::BadInput(format!(
+                    "{}: nothing was pushed here: there is no file `format`",
+                    self.name
+                ))
+                .into());
             }
         };
         let text = String::from_utf8_lossy(&bytes);
@@ -172,7 +206,8 @@ impl Remote {
             Ok(found) if found < STORE_FORMAT && access == Access::Write => self.mark().await,
             Ok(found) if found <= STORE_FORMAT => Ok(()),
             _ => Err(Failure::BadInput(format!(
-                "{}: the remote has format {}, this nerf-sr-remote knows format {STORE_FORMAT}; use the newer nerf-sr-remote, or another remote",
+                "{}: the remote has format {}, this nerf-sr-remote knows format {STORE_FORMAT}; \
+                use the newer nerf-sr-remote, or another remote",
                 self.name,
                 text.trim()
             ))

@@ -8,7 +8,8 @@ pub(crate) struct Selection {
     /// Only this action, by its key or how that begins; may be given several times
     #[arg(long = "key", value_name = "KEY")]
     pub(crate) keys: Vec<String>,
-    /// Only the actions that made this artifact, by its hash or how that begins; may be given several times
+    /// Only the actions that made this artifact, by its hash or how that begins; may be given
+    /// several times
     #[arg(long = "artifact", value_name = "HASH")]
     pub(crate) artifacts: Vec<String>,
     /// Also the actions that those were made of
@@ -17,8 +18,13 @@ pub(crate) struct Selection {
 }
 
 impl Selection {
-    /// Keys of the actions that are meant, out of these records. `place` is where they lie, in words.
-    pub(crate) fn of(&self, records: &BTreeMap<String, Record>, place: &str) -> anyhow::Result<BTreeSet<String>> {
+    /// Keys of the actions that are meant, out of these records. `place` is where they lie, in
+    /// words.
+    pub(crate) fn of(
+        &self,
+        records: &BTreeMap<String, Record>,
+        place: &str,
+    ) -> anyhow::Result<BTreeSet<String>> {
         if self.keys.is_empty() && self.artifacts.is_empty() {
             return Ok(records.keys().cloned().collect());
         }
@@ -27,15 +33,24 @@ impl Selection {
             selected.insert(one(start, records.keys(), "action", place)?);
         }
         for start in &self.artifacts {
-            let identity = one(start, records.values().map(|record| &record.output), "artifact", place)?;
-            selected.extend(records.iter().filter(|(_, record)| record.output == identity).map(|(key, _)| key.clone()));
+            let identity =
+                one(start, records.values().map(|record| &record.output), "artifact", place)?;
+            selected.extend(
+                records
+                    .iter()
+                    .filter(|(_, record)| record.output == identity)
+                    .map(|(key, _)| key.clone()),
+            );
         }
         Ok(if self.history { with_history(records, selected) } else { selected })
     }
 }
 
 /// Keys, and those of all actions that they were made of, where there is a record of them.
-pub(crate) fn with_history(records: &BTreeMap<String, Record>, keys: BTreeSet<String>) -> BTreeSet<String> {
+pub(crate) fn with_history(
+    records: &BTreeMap<String, Record>,
+    keys: BTreeSet<String>,
+) -> BTreeSet<String> {
     let mut open: Vec<String> = keys.into_iter().collect();
     let mut found = BTreeSet::new();
     while let Some(key) = open.pop() {
@@ -48,8 +63,14 @@ pub(crate) fn with_history(records: &BTreeMap<String, Record>, keys: BTreeSet<St
 }
 
 /// The one name that begins so.
-pub(crate) fn one<'a>(start: &str, names: impl Iterator<Item = &'a String>, what: &str, place: &str) -> anyhow::Result<String> {
-    let found: BTreeSet<&String> = names.filter(|name| !start.is_empty() && name.starts_with(start)).collect();
+pub(crate) fn one<'a>(
+    start: &str,
+    names: impl Iterator<Item = &'a String>,
+    what: &str,
+    place: &str,
+) -> anyhow::Result<String> {
+    let found: BTreeSet<&String> =
+        names.filter(|name| !start.is_empty() && name.starts_with(start)).collect();
     let problem = match found.len() {
         1 => return Ok(found.into_iter().cloned().collect()),
         0 => format!("{place}: no {what} {start:?}; `nerf-sr status` shows what there is"),
@@ -73,7 +94,11 @@ mod tests {
             made_of: made_of.iter().map(|&key| key.to_owned()).collect(),
             ..Record::default()
         };
-        let all = [("k1", record("h1", &[])), ("k2", record("h1", &["k1", "gone"])), ("k3", record("h3", &["k2"]))];
+        let all = [
+            ("k1", record("h1", &[])),
+            ("k2", record("h1", &["k1", "gone"])),
+            ("k3", record("h3", &["k2"])),
+        ];
         all.into_iter().map(|(key, record)| (key.to_owned(), record)).collect()
     }
 
@@ -93,8 +118,12 @@ mod tests {
         ] {
             let selection = Selection { keys: words(keys), artifacts: words(artifacts), history };
             match (selection.of(&records(), "there"), expected) {
-                (Ok(found), Ok(expected)) => assert_eq!(found.into_iter().collect::<Vec<_>>(), expected),
-                (Err(error), Err(expected)) => assert!(error.to_string().contains(expected), "{error}"),
+                (Ok(found), Ok(expected)) => {
+                    assert_eq!(found.into_iter().collect::<Vec<_>>(), expected)
+                }
+                (Err(error), Err(expected)) => {
+                    assert!(error.to_string().contains(expected), "{error}")
+                }
                 (found, expected) => panic!("{found:?} where {expected:?}"),
             }
         }

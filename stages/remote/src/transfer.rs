@@ -15,7 +15,8 @@ use crate::remote::Remote;
 
 /// Files that are on their way at once, and threads.
 pub(crate) const AT_ONCE: usize = 8;
-/// A larger file goes up in parts of this size. Each file holds three of them at most, which bounds the memory.
+/// A larger file goes up in parts of this size. Each file holds three of them at most, which bounds
+/// the memory.
 const PART: u64 = 6 << 20;
 /// S3 takes 10,000 parts a file.
 const PARTS: u64 = 9_000;
@@ -32,20 +33,33 @@ impl Transfer {
         Arc::new(Self { remote: remote.clone(), progress, places: Semaphore::new(AT_ONCE) })
     }
 
-    /// Uploads a file of an artifact. A file that isn't what the manifest says never appears on the remote.
-    pub(crate) async fn upload(&self, from: &Path, to: &str, entry: &FileEntry) -> anyhow::Result<()> {
+    /// Uploads a file of an artifact. A file that isn't what the manifest says never appears on the
+    /// remote.
+    pub(crate) async fn upload(
+        &self,
+        from: &Path,
+        to: &str,
+        entry: &FileEntry,
+    ) -> anyhow::Result<()> {
         let _place = self.places.acquire().await?;
         let file = File::open(from).with_context(|| from.display().to_string())?;
         let mut checked = Checked::new(entry);
         if entry.size <= PART {
             let mut bytes = Vec::new();
-            file.take(entry.size + 1).read_to_end(&mut bytes).with_context(|| from.display().to_string())?;
+            file.take(entry.size + 1)
+                .read_to_end(&mut bytes)
+                .with_context(|| from.display().to_string())?;
             checked.take(&bytes, &self.progress, &from.display())?;
             checked.finish(&from.display(), LOCAL_REMEDY)?;
             return self.remote.write(to, bytes).await;
         }
         let part = PART.max(entry.size.div_ceil(PARTS));
-        let upload = self.remote.files.put_multipart(&self.remote.path(to)).await.with_context(|| self.remote.failed(to))?;
+        let upload = self
+            .remote
+            .files
+            .put_multipart(&self.remote.path(to))
+            .await
+            .with_context(|| self.remote.failed(to))?;
         let mut upload = WriteMultipart::new_with_chunk_size(upload, part as usize);
         match self.write_parts(&mut upload, file, part, checked, from).await {
             Ok(()) => upload.finish().await.map(|_| ()).with_context(|| self.remote.failed(to)),
@@ -67,7 +81,10 @@ impl Transfer {
     ) -> anyhow::Result<()> {
         loop {
             let mut bytes = Vec::with_capacity(part as usize);
-            (&file).take(part).read_to_end(&mut bytes).with_context(|| from.display().to_string())?;
+            (&file)
+                .take(part)
+                .read_to_end(&mut bytes)
+                .with_context(|| from.display().to_string())?;
             if bytes.is_empty() {
                 return checked.finish(&from.display(), LOCAL_REMEDY);
             }
@@ -77,12 +94,20 @@ impl Transfer {
         }
     }
 
-    /// Fetches a file of an artifact into a scratch folder; one that isn't what the manifest says is refused.
-    pub(crate) async fn download(&self, from: &str, to: &Path, entry: &FileEntry) -> anyhow::Result<()> {
+    /// Fetches a file of an artifact into a scratch folder; one that isn't what the manifest says
+    /// is refused.
+    pub(crate) async fn download(
+        &self,
+        from: &str,
+        to: &Path,
+        entry: &FileEntry,
+    ) -> anyhow::Result<()> {
         let _place = self.places.acquire().await?;
         let name = self.remote.name(from);
         let Some(found) = self.remote.get(from).await? else {
-            return Err(Failure::BadInput(format!("{name}: it is not there; {REMOTE_REMEDY}")).into());
+            return Err(
+                Failure::BadInput(format!("{name}: it is not there; {REMOTE_REMEDY}")).into()
+            );
         };
         if let Some(folder) = to.parent() {
             std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
@@ -100,8 +125,8 @@ impl Transfer {
 }
 
 const LOCAL_REMEDY: &str = "the artifact is damaged: `nerf-sr verify --remove`, then run again";
-const REMOTE_REMEDY: &str =
-    "nothing of its artifact is taken in; delete this file and the action's record there, and push from a whole store";
+const REMOTE_REMEDY: &str = "nothing of its artifact is taken in; delete this file and the \
+    action's record there, and push from a whole store";
 
 /// Compares a stream with what a manifest says of it.
 pub(crate) struct Checked<'a> {
@@ -116,11 +141,19 @@ impl<'a> Checked<'a> {
     }
 
     /// The next piece; an error as soon as there is too much.
-    pub(crate) fn take(&mut self, piece: &[u8], progress: &Progress, name: &dyn std::fmt::Display) -> anyhow::Result<()> {
+    pub(crate) fn take(
+        &mut self,
+        piece: &[u8],
+        progress: &Progress,
+        name: &dyn std::fmt::Display,
+    ) -> anyhow::Result<()> {
         self.size += piece.len() as u64;
         if self.size > self.entry.size {
             let expected = self.entry.size;
-            return Err(Failure::BadInput(format!("{name}: more than the {expected} bytes that the manifest says")).into());
+            return Err(Failure::BadInput(format!(
+                "{name}: more than the {expected} bytes that the manifest says"
+            ))
+            .into());
         }
         self.hasher.update(piece);
         Ok(progress.add(piece.len() as u64)?)
@@ -156,6 +189,8 @@ pub(crate) async fn all<T: Send + 'static>(
     Ok(results)
 }
 
-async fn next<T: 'static>(running: &mut tokio::task::JoinSet<anyhow::Result<T>>) -> anyhow::Result<Option<T>> {
+async fn next<T: 'static>(
+    running: &mut tokio::task::JoinSet<anyhow::Result<T>>,
+) -> anyhow::Result<Option<T>> {
     running.join_next().await.transpose()?.transpose()
 }

@@ -13,7 +13,8 @@ use serde_json::{Value, json};
 fn exported(dir: &Path, store: &Store, what: &str, options: &[&str]) -> PathBuf {
     let file = dir.join("export.tar");
     let name = file.display().to_string();
-    let words: Vec<&str> = ["export", what, &name].into_iter().chain(options.iter().copied()).collect();
+    let words: Vec<&str> =
+        ["export", what, &name].into_iter().chain(options.iter().copied()).collect();
     succeed(&mut command(store.root(), &words));
     file
 }
@@ -29,12 +30,16 @@ fn an_artifact_travels_with_its_history() {
     let eval = &records[3];
     let file = exported(dir.path(), &store, &eval.output[..9], &[]);
     let bytes = fs::read(&file).unwrap();
-    // Equal histories make equal bytes, whatever the file's name and whichever way they were asked for.
+    // Equal histories make equal bytes, whatever the file's name and whichever way they were asked
+    // for.
     let (again, _) = sample(&dir.path().join("again"));
     assert!(bytes == fs::read(exported(dir.path(), &again, &eval.key(), &[])).unwrap());
     let other = dir.path().join("other");
     let (code, out, err) = import(&file, &other);
-    assert!(code == 0 && err.is_empty() && out.contains("3 records and 3 artifacts read"), "{out}{err}");
+    assert!(
+        code == 0 && err.is_empty() && out.contains("3 records and 3 artifacts read"),
+        "{out}{err}"
+    );
     let other = Store::open(&other).unwrap();
     assert_clean(&other);
     assert_tidy(&other);
@@ -60,7 +65,10 @@ fn a_history_may_be_records_alone() {
     assert!(import(&file, &other).1.contains("3 records and 1 artifact read"));
     let other = Store::open(&other).unwrap();
     assert_eq!(other.hit(&records[3].key()).as_ref(), Some(&records[3]));
-    assert_eq!((other.record(&records[2].key()).as_ref(), other.hit(&records[2].key())), (Some(&records[2]), None));
+    assert_eq!(
+        (other.record(&records[2].key()).as_ref(), other.hit(&records[2].key())),
+        (Some(&records[2]), None)
+    );
     // The artifacts may follow.
     let file = exported(dir.path(), &store, &records[3].key(), &[]);
     import(&file, other.root());
@@ -96,7 +104,12 @@ struct Entry {
 }
 
 fn plain(path: &str, bytes: &[u8]) -> Entry {
-    Entry { path: path.to_owned(), kind: tar::EntryType::Regular, size: None, bytes: bytes.to_vec() }
+    Entry {
+        path: path.to_owned(),
+        kind: tar::EntryType::Regular,
+        size: None,
+        bytes: bytes.to_vec(),
+    }
 }
 
 fn entries_of(file: &Path) -> Vec<Entry> {
@@ -155,9 +168,12 @@ impl Sample {
         change(&mut self.manifest);
         let identity = self.manifest.identity();
         let record = Record { output: identity.clone(), ..self.record.clone() };
-        self.index(|index| (index["objects"], index["artifact"]) = (json!([identity]), json!(identity)));
+        self.index(|index| {
+            (index["objects"], index["artifact"]) = (json!([identity]), json!(identity))
+        });
         let path = |file: &str| format!("objects/{identity}/{file}");
-        self.entries[MANIFEST] = plain(&path("artifact.json"), &serde_json::to_vec(&self.manifest).unwrap());
+        self.entries[MANIFEST] =
+            plain(&path("artifact.json"), &serde_json::to_vec(&self.manifest).unwrap());
         self.entries[FILE].path = path(&self.manifest.files[0].path);
         self.entries[RECORD].bytes = serde_json::to_vec(&record).unwrap();
     }
@@ -180,7 +196,11 @@ const HARM: &[(&str, Harm)] = &[
     ("not sorted", |s| s.manifest(|m| m.files.push(m.files[0].clone()))),
     ("sizes that no disk has", |s| {
         s.manifest(|m| {
-            let huge = ["x", "y"].map(|path| FileEntry { path: path.into(), size: u64::MAX, blake3: String::new() });
+            let huge = ["x", "y"].map(|path| FileEntry {
+                path: path.into(),
+                size: u64::MAX,
+                blake3: String::new(),
+            });
             m.files.extend(huge);
         });
     }),
@@ -231,7 +251,8 @@ const HARM: &[(&str, Harm)] = &[
 
 fn small_export(dir: &Path) -> (Vec<Entry>, Record, Manifest) {
     let store = Store::open(&dir.join("store")).unwrap();
-    let record = common::make(&store, "eval", &[], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
+    let record =
+        common::make(&store, "eval", &[], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
     let entries = entries_of(&exported(dir, &store, &record.output, &[]));
     let manifest = store.manifest(&record.output).unwrap();
     (entries, record, manifest)
@@ -242,9 +263,15 @@ fn refused(dir: &Path, bytes: &[u8], reason: &str) {
     let (file, folder) = (dir.join("hostile.tar"), dir.join("inner/other"));
     fs::write(&file, bytes).unwrap();
     let (code, _, err) = import(&file, &folder);
-    assert!(code == 3 && err.contains(reason) && err.lines().count() == 1, "{reason}: {code} {err}");
+    assert!(
+        code == 3 && err.contains(reason) && err.lines().count() == 1,
+        "{reason}: {code} {err}"
+    );
     let other = Store::open(&folder).unwrap();
-    assert!(other.objects().unwrap().is_empty() && other.action_files().unwrap().is_empty(), "{reason}");
+    assert!(
+        other.objects().unwrap().is_empty() && other.action_files().unwrap().is_empty(),
+        "{reason}"
+    );
     assert_tidy(&other);
     fs::remove_dir_all(dir.join("inner")).unwrap();
     let left: Vec<_> = fs::read_dir(dir).unwrap().map(|entry| entry.unwrap().file_name()).collect();
@@ -256,10 +283,15 @@ fn refused(dir: &Path, bytes: &[u8], reason: &str) {
 fn hostile_archives_are_refused_in_one_line() {
     let dir = tempfile::tempdir().unwrap();
     let (entries, record, manifest) = small_export(dir.path());
-    let sample = || Sample { entries: entries.clone(), record: record.clone(), manifest: manifest.clone() };
+    let sample =
+        || Sample { entries: entries.clone(), record: record.clone(), manifest: manifest.clone() };
     let whole = archive(&sample().entries);
     fs::write(dir.path().join("hostile.tar"), &whole).unwrap();
-    assert_eq!(import(&dir.path().join("hostile.tar"), &dir.path().join("fine")).0, 0, "the builder's archives are read");
+    assert_eq!(
+        import(&dir.path().join("hostile.tar"), &dir.path().join("fine")).0,
+        0,
+        "the builder's archives are read"
+    );
     fs::remove_dir_all(dir.path().join("fine")).unwrap();
     for (reason, harm) in HARM {
         let mut sample = sample();
@@ -268,7 +300,8 @@ fn hostile_archives_are_refused_in_one_line() {
     }
 }
 
-/// Wherever an archive is cut, and whichever byte of the small one is flipped, nothing wrong comes in.
+/// Wherever an archive is cut, and whichever byte of the small one is flipped, nothing wrong comes
+/// in.
 #[test]
 fn cut_and_flipped_archives() {
     let dir = tempfile::tempdir().unwrap();
@@ -289,7 +322,8 @@ fn cut_and_flipped_archives() {
         let store = Store::open(&dir.path().join("flipped")).unwrap();
         // A flipped bit may lie in padding, or in words of a record that no hash covers.
         assert!(
-            code == 0 || (code == 3 && err.lines().count() == 1 && store.objects().unwrap().is_empty()),
+            code == 0
+                || (code == 3 && err.lines().count() == 1 && store.objects().unwrap().is_empty()),
             "{place}: {code} {err}"
         );
         store.objects().unwrap().iter().for_each(|object| assert_eq!(*object, record.output));

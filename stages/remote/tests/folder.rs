@@ -24,12 +24,19 @@ fn what_is_pushed_is_pulled() {
     assert_equal(&setup.store, &other);
     assert_tidy(&other);
     let run = other.runs().unwrap().remove(0);
-    assert!(run.ended_unix.is_some() && run.keys.len() == 4, "collection must leave what was pulled");
+    assert!(
+        run.ended_unix.is_some() && run.keys.len() == 4,
+        "collection must leave what was pulled"
+    );
     let out = succeed(&mut command(&setup.path("other"), &["pull", &remote]));
     assert!(out.contains("0 actions pulled (0 bytes), 4 here already"), "{out}");
     // The layout is a store's.
     let train = &setup.records[2];
-    for file in ["format", &format!("actions/{}.json", train.key()), &format!("objects/{}/field.bin", train.output)] {
+    for file in [
+        "format",
+        &format!("actions/{}.json", train.key()),
+        &format!("objects/{}/field.bin", train.output),
+    ] {
         assert!(setup.path("remote").join(file).is_file(), "{file}");
     }
 }
@@ -107,26 +114,52 @@ fn lead_outside(setup: &Setup, path: &str) {
 #[test]
 fn harm_is_refused_by_name() {
     let cases: &[(&str, &str, Harm)] = &[
-        ("metrics.json", "blake3 differs", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1)),
-        ("metrics.json", "more than the 15 bytes", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '))),
-        ("metrics.json", "14 bytes where the manifest says 15", |s| edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14))),
-        ("metrics.json", "it is not there", |s| fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap()),
-        (MANIFEST_FILE, "it is not there", |s| fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap()),
-        (MANIFEST_FILE, "not a manifest", |s| edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20))),
+        ("metrics.json", "blake3 differs", |s| {
+            edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1)
+        }),
+        ("metrics.json", "more than the 15 bytes", |s| {
+            edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '))
+        }),
+        ("metrics.json", "14 bytes where the manifest says 15", |s| {
+            edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14))
+        }),
+        ("metrics.json", "it is not there", |s| {
+            fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap()
+        }),
+        (MANIFEST_FILE, "it is not there", |s| {
+            fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap()
+        }),
+        (MANIFEST_FILE, "not a manifest", |s| {
+            edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20))
+        }),
         (MANIFEST_FILE, "its blake3 is not the artifact's name", |s| {
-            fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE)).map(|_| ()).unwrap();
+            fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE))
+                .map(|_| ())
+                .unwrap();
         }),
         (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "../../../../evil")),
         (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "/tmp/evil")),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, MANIFEST_FILE)),
-        (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, "./metrics.json")),
+        (MANIFEST_FILE, "not the path of an artifact's file", |s| {
+            lead_outside(s, "./metrics.json")
+        }),
         (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
-        (".json", "its key is not its name", |s| fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap()),
+        (".json", "its key is not its name", |s| {
+            fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap()
+        }),
         (".json", "\"../../evil\" is not a hash", |s| {
-            write_json(&record_file(s, 3), &Record { output: "../../evil".into(), ..s.records[3].clone() }).unwrap();
+            write_json(
+                &record_file(s, 3),
+                &Record { output: "../../evil".into(), ..s.records[3].clone() },
+            )
+            .unwrap();
         }),
         (".json", "is not a hash", |s| {
-            write_json(&record_file(s, 3), &Record { made_of: vec!["/etc".into()], ..s.records[3].clone() }).unwrap();
+            write_json(
+                &record_file(s, 3),
+                &Record { made_of: vec!["/etc".into()], ..s.records[3].clone() },
+            )
+            .unwrap();
         }),
     ];
     // One push serves all cases.
@@ -138,9 +171,16 @@ fn harm_is_refused_by_name() {
         harm(&setup);
         let (code, err, store) = setup.pull("other", &[]);
         let lines: Vec<&str> = err.lines().collect();
-        assert!(code == 3 && lines.len() == 2 && lines[0].contains(name) && lines[0].contains(reason), "{reason}: {code} {err}");
+        assert!(
+            code == 3 && lines.len() == 2 && lines[0].contains(name) && lines[0].contains(reason),
+            "{reason}: {code} {err}"
+        );
         assert!(lines[1].contains("1 file refused"), "{err}");
-        assert_eq!((store.records().unwrap().len(), store.objects().unwrap().len()), (3, 2), "{reason}");
+        assert_eq!(
+            (store.records().unwrap().len(), store.objects().unwrap().len()),
+            (3, 2),
+            "{reason}"
+        );
         assert_clean(&store);
         assert_tidy(&store);
         assert!(!setup.path("evil").exists() && !Path::new("/tmp/evil").exists());
@@ -160,7 +200,10 @@ fn other_formats_and_places_are_refused_in_one_line() {
     let setup = Setup::pushed();
     let refused = |words: &[&str], store: &Path, code: i32, reason: &str| {
         let (found, _, err) = said(&mut command(store, words));
-        assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{words:?}: {found} {err}");
+        assert!(
+            found == code && err.contains(reason) && err.lines().count() == 1,
+            "{words:?}: {found} {err}"
+        );
     };
     let (remote, store) = (setup.remote(), setup.store.root());
     for text in ["2\n", "new", ""] {
@@ -168,9 +211,13 @@ fn other_formats_and_places_are_refused_in_one_line() {
         refused(&["pull", &remote], &setup.path("other"), 3, "use the newer nerf-sr-remote");
         refused(&["push", &remote], store, 3, "use the newer nerf-sr-remote");
     }
-    // Whoever writes into one of an older form marks it, so that older programs leave alone what is new there.
+    // Whoever writes into one of an older form marks it, so that older programs leave alone what is
+    // new there.
     fs::write(setup.path("remote/format"), "0\n").unwrap();
-    for (words, store, format) in [(["pull", &remote], setup.path("other").as_path(), "0\n"), (["push", &remote], store, "1\n")] {
+    for (words, store, format) in [
+        (["pull", &remote], setup.path("other").as_path(), "0\n"),
+        (["push", &remote], store, "1\n"),
+    ] {
         succeed(&mut command(store, &words));
         assert_eq!(fs::read_to_string(setup.path("remote/format")).unwrap(), format);
     }
@@ -209,12 +256,21 @@ fn a_damaged_artifact_is_not_pushed() {
 fn several_at_once_pull_into_one_store_and_push_to_one_remote() {
     let setup = Setup::new();
     let remote = setup.remote();
-    for (store, words) in [(setup.store.root().to_path_buf(), ["push", &remote]), (setup.path("other"), ["pull", &remote])] {
-        let start = |_| command(&store, &words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    for (store, words) in [
+        (setup.store.root().to_path_buf(), ["push", &remote]),
+        (setup.path("other"), ["pull", &remote]),
+    ] {
+        let start = |_| {
+            command(&store, &words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+        };
         let children: Vec<_> = (0..4).map(start).collect();
         for child in children {
             let output = child.wait_with_output().unwrap();
-            assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+            assert!(
+                output.status.success(),
+                "{words:?}: {}",
+                String::from_utf8_lossy(&output.stderr)
+            );
         }
     }
     let other = Store::open(&setup.path("other")).unwrap();

@@ -32,7 +32,10 @@ impl Server {
     fn start() -> Option<Self> {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let mut command = Command::new("moto_server");
-        command.args(["-H", "127.0.0.1", "-p", &port.to_string()]).stdout(Stdio::null()).stderr(Stdio::null());
+        command
+            .args(["-H", "127.0.0.1", "-p", &port.to_string()])
+            .stdout(Stdio::null())
+            .stderr(Stdio::null());
         let mut server = Self { child: command.spawn().ok()?, port };
         let since = Instant::now();
         while TcpStream::connect(("127.0.0.1", port)).is_err() {
@@ -41,7 +44,10 @@ impl Server {
             if ended.is_some_and(|status| status.code() == Some(127)) {
                 return None;
             }
-            assert!(ended.is_none() && since.elapsed() < Duration::from_secs(60), "moto_server doesn't answer");
+            assert!(
+                ended.is_none() && since.elapsed() < Duration::from_secs(60),
+                "moto_server doesn't answer"
+            );
             std::thread::sleep(Duration::from_millis(100));
         }
         server.request("PUT", "shared", b"");
@@ -52,20 +58,29 @@ impl Server {
         let mut stream = TcpStream::connect(("127.0.0.1", self.port)).unwrap();
         let length = body.len();
         // moto looks at the name alone.
-        let who = "AWS4-HMAC-SHA256 Credential=test/20260101/us-east-1/s3/aws4_request, SignedHeaders=host, Signature=0";
-        let head = format!("{method} /{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: {who}\r\nConnection: close\r\n");
+        let who = "AWS4-HMAC-SHA256 Credential=test/20260101/us-east-1/s3/aws4_request, \
+            SignedHeaders=host, Signature=0";
+        let head = format!(
+            "{method} /{path} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: {who}\r\nConnection: \
+            close\r\n"
+        );
         let head = format!("{head}Content-Length: {length}\r\n\r\n");
         stream.write_all(&[head.as_bytes(), body].concat()).unwrap();
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer).unwrap();
-        let (end, status) = (answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap(), String::from_utf8_lossy(&answer[9..12]));
+        let (end, status) = (
+            answer.windows(4).position(|w| w == b"\r\n\r\n").unwrap(),
+            String::from_utf8_lossy(&answer[9..12]),
+        );
         assert!(status.starts_with('2'), "{method} {path}: {status}");
         answer.split_off(end + 4)
     }
 
     fn command(&self, store: &Path, words: &[&str]) -> Command {
         let mut command = common::command(store, words);
-        command.env("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{}", self.port)).env("AWS_DEFAULT_REGION", "us-east-1");
+        command
+            .env("AWS_ENDPOINT_URL", format!("http://127.0.0.1:{}", self.port))
+            .env("AWS_DEFAULT_REGION", "us-east-1");
         command.env("AWS_ACCESS_KEY_ID", "test").env("AWS_SECRET_ACCESS_KEY", "test");
         command
     }
@@ -86,15 +101,26 @@ fn two_machines_share_a_store_through_s3() {
     let (store, records) = sample(&place("store"));
     // Nothing is there yet, which is said.
     let (code, _, err) = said(&mut server.command(&place("other"), &["pull", REMOTE]));
-    assert!(code == 3 && err.contains("nothing was pushed here") && err.lines().count() == 1, "{err}");
+    assert!(
+        code == 3 && err.contains("nothing was pushed here") && err.lines().count() == 1,
+        "{err}"
+    );
     let out = server.succeed(store.root(), &["push", REMOTE]);
     assert!(out.contains("4 actions pushed (13.6 MB), 0 there already"), "{out}");
     server.succeed(&place("other"), &["pull", REMOTE]);
     let other = Store::open(&place("other")).unwrap();
     assert_equal(&store, &other);
     assert_tidy(&other);
-    assert!(server.succeed(store.root(), &["push", REMOTE]).contains("0 actions pushed (0 bytes), 4 there already"));
-    assert!(server.succeed(other.root(), &["pull", REMOTE]).contains("0 actions pulled (0 bytes), 4 here already"));
+    assert!(
+        server
+            .succeed(store.root(), &["push", REMOTE])
+            .contains("0 actions pushed (0 bytes), 4 there already")
+    );
+    assert!(
+        server
+            .succeed(other.root(), &["pull", REMOTE])
+            .contains("0 actions pulled (0 bytes), 4 here already")
+    );
     // What another machine makes comes back.
     make(&other, "more", &[&records[3]], &[("x", bytes(1000, 9))]);
     server.succeed(other.root(), &["push", REMOTE]);
@@ -108,7 +134,10 @@ fn two_machines_share_a_store_through_s3() {
     content[3] ^= 1;
     server.request("PUT", &path, &content);
     let (code, _, err) = said(&mut server.command(&place("third"), &["pull", REMOTE]));
-    assert!(code == 3 && err.contains(&format!("{REMOTE}/{file}: the content is not what was written")), "{err}");
+    assert!(
+        code == 3 && err.contains(&format!("{REMOTE}/{file}: the content is not what was written")),
+        "{err}"
+    );
     let third = Store::open(&place("third")).unwrap();
     assert_eq!(third.records().unwrap().len(), 4, "the rest comes in");
     assert_clean(&third);
@@ -122,11 +151,17 @@ fn two_machines_share_a_store_through_s3() {
     // Newer forms, on either side.
     fs::write(third.root().join("format"), "2\n").unwrap();
     let (code, _, err) = said(&mut server.command(third.root(), &["push", REMOTE]));
-    assert!(code == 1 && err.contains("the store has format 2") && err.lines().count() == 1, "{err}");
+    assert!(
+        code == 1 && err.contains("the store has format 2") && err.lines().count() == 1,
+        "{err}"
+    );
     server.request("PUT", "shared/team/store/format", b"2\n");
     for (store, verb) in [(&place("fourth"), "pull"), (&place("store"), "push")] {
         let (code, _, err) = said(&mut server.command(store, &[verb, REMOTE]));
-        assert!(code == 3 && err.contains("the remote has format 2") && err.lines().count() == 1, "{err}");
+        assert!(
+            code == 3 && err.contains("the remote has format 2") && err.lines().count() == 1,
+            "{err}"
+        );
     }
 }
 

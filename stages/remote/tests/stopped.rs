@@ -28,7 +28,13 @@ fn an_interrupt_ends_the_wait_for_a_silent_server() {
 }
 
 fn interrupt(child: &std::process::Child) {
-    assert!(std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap().success());
+    assert!(
+        std::process::Command::new("kill")
+            .args(["-INT", &child.id().to_string()])
+            .status()
+            .unwrap()
+            .success()
+    );
 }
 
 /// How often a push or pull is stopped.
@@ -42,7 +48,8 @@ fn much(setup: &Setup) {
     }
 }
 
-/// Kills, interrupts, begins anew what got to its end in the folder it fills, and at last lets end; how often it was stopped.
+/// Kills, interrupts, begins anew what got to its end in the folder it fills, and at last lets end;
+/// how often it was stopped.
 fn stop_often(store: &Path, words: &[&str], fills: &Path, after: impl Fn()) -> usize {
     let since = Instant::now();
     succeed(&mut command(store, words));
@@ -50,7 +57,8 @@ fn stop_often(store: &Path, words: &[&str], fills: &Path, after: impl Fn()) -> u
     fs::remove_dir_all(fills).unwrap();
     let mut stopped = 0;
     for turn in 0..TURNS {
-        let mut child = command(store, words).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let mut child =
+            command(store, words).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
         std::thread::sleep(whole * (1 + turn * 7 % TURNS) / TURNS);
         if turn % 3 == 0 {
             interrupt(&child);
@@ -78,16 +86,20 @@ fn kills_leave_nothing_half_seen() {
     let stopped = stop_often(setup.store.root(), &["push", &remote], &setup.path("remote"), || {
         // Whatever has a record on the remote is whole there.
         let (code, err, seen) = setup.pull("seen", &[]);
-        assert!(code == 0 || err.contains("nothing was pushed here") || err.contains("no such folder"), "{code} {err}");
+        assert!(
+            code == 0 || err.contains("nothing was pushed here") || err.contains("no such folder"),
+            "{code} {err}"
+        );
         assert_clean(&seen);
         fs::remove_dir_all(setup.path("seen")).unwrap();
     });
     assert!(stopped > 2, "{stopped}");
-    let stopped = stop_often(&setup.path("other"), &["pull", &remote], &setup.path("other"), || {
-        if setup.path("other").exists() {
-            assert_clean(&Store::open(&setup.path("other")).unwrap());
-        }
-    });
+    let stopped =
+        stop_often(&setup.path("other"), &["pull", &remote], &setup.path("other"), || {
+            if setup.path("other").exists() {
+                assert_clean(&Store::open(&setup.path("other")).unwrap());
+            }
+        });
     assert!(stopped > 2, "{stopped}");
     assert_equal(&setup.store, &Store::open(&setup.path("other")).unwrap());
 }

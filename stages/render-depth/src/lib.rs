@@ -1,13 +1,13 @@
 //! `render-depth`: colour, opacity and depth of a field, for any list of cameras at any size.
 //!
-//! A field may have several members, trained apart or one on from another; what they render is averaged: each errs in its own
-//! way where the images leave it open.
+//! A field may have several members, trained apart or one on from another; what they render is
+//! averaged: each errs in its own way where the images leave it open.
 //!
-//! Where a view is smooth, a pixel shows one ray through its centre; elsewhere it shows the mean of several
-//! ([`Params::tolerance`]): adaptive sampling, as in Whitted 1980.
+//! Where a view is smooth, a pixel shows one ray through its centre; elsewhere it shows the mean of
+//! several ([`Params::tolerance`]): adaptive sampling, as in Whitted 1980.
 //!
-//! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at. Rows are rendered and
-//! written sixteen at a time, so memory doesn't grow with the image.
+//! Every view becomes an EXR (R, G, B, A in half precision; `Z` in single) and a PNG to look at.
+//! Rows are rendered and written sixteen at a time, so memory doesn't grow with the image.
 
 use std::ops::Range;
 
@@ -27,14 +27,17 @@ pub struct Params {
     /// Width of the views; heights follow the cameras' aspect. Default: the cameras' own size.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by camera"))]
     pub size: Option<u32>,
-    /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and the depth of one of them.
+    /// Rays along each side of a pixel; 2 casts four. A pixel shows the mean of their colours and
+    /// the depth of one of them.
     #[schemars(range(min = 1, max = 8))]
     pub samples_per_axis: u32,
-    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The estimate is made from the pixel's neighbours
-    /// and bounds the error where the view is quadratic. 0 casts all rays everywhere.
+    /// Error of colour or opacity up to which one ray shows a pixel; others get all rays. The
+    /// estimate is made from the pixel's neighbours and bounds the error where the view is
+    /// quadratic. 0 casts all rays everywhere.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub tolerance: f64,
-    /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the surface and floaters before it.
+    /// Depth that channel `Z` holds. The median lies on a surface; the mean lies between the
+    /// surface and floaters before it.
     pub depth: Depth,
     /// Also writes the distance along the ray, as channel `distance`.
     pub ray_distance: bool,
@@ -42,7 +45,13 @@ pub struct Params {
 
 impl Default for Params {
     fn default() -> Self {
-        Self { size: None, samples_per_axis: 2, tolerance: 0.005, depth: Depth::Median, ray_distance: false }
+        Self {
+            size: None,
+            samples_per_axis: 2,
+            tolerance: 0.005,
+            depth: Depth::Median,
+            ray_distance: false,
+        }
     }
 }
 
@@ -62,11 +71,13 @@ pub struct RenderDepth;
 impl Stage for RenderDepth {
     type Params = Params;
     const NAME: &'static str = "render-depth";
-    const SUMMARY: &'static str = "Renders colour, opacity and depth of a field for a list of cameras.";
+    const SUMMARY: &'static str =
+        "Renders colour, opacity and depth of a field for a list of cameras.";
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        let cameras = ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
+        let cameras =
+            ["scene/cameras", "scene/truth", "scene/train", "scene/references", "cameras", "views"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
             ("cameras", Input::required(&cameras, "folder with views.json: the cameras to render")),
@@ -80,17 +91,30 @@ impl Stage for RenderDepth {
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let Members { file, fields } = Members::read(context.input("field")?, &context.device)?;
         let cameras = Views::read(context.input("cameras")?)?;
-        let resized: Vec<Camera> = cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
+        let resized: Vec<Camera> =
+            cameras.views.iter().map(|v| resize(&v.camera, params.size)).collect();
         let rows = resized.iter().map(|c| u64::from(c.intrinsics.height)).sum();
         let progress = context.progress("rendering", rows);
         let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
-            let [image, preview] = [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
-            let job = RenderJob { params, members: &fields, background: file.background, camera: &camera };
-            context.part(&camera.name, &[&image, &preview], || job.render(context, &image, &preview, &progress))?;
+            let [image, preview] =
+                [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
+            let job = RenderJob {
+                params,
+                members: &fields,
+                background: file.background,
+                camera: &camera,
+            };
+            context.part(&camera.name, &[&image, &preview], || {
+                job.render(context, &image, &preview, &progress)
+            })?;
             done += u64::from(camera.intrinsics.height);
             progress.set(done, "");
-            views.push(View { image: Some(image.clone()), depth: Some(image), ..View::camera_only(camera) });
+            views.push(View {
+                image: Some(image.clone()),
+                depth: Some(image),
+                ..View::camera_only(camera)
+            });
         }
         let count = views.len();
         context.write_json(VIEWS_FILE, &Views::new(file.background, cameras.bounds, views))?;
@@ -103,7 +127,8 @@ fn resize(camera: &Camera, width: Option<u32>) -> Camera {
     let k = camera.intrinsics;
     match width {
         Some(width) => {
-            let height = (f64::from(k.height) * f64::from(width) / f64::from(k.width)).round().max(1.0);
+            let height =
+                (f64::from(k.height) * f64::from(width) / f64::from(k.width)).round().max(1.0);
             camera.resized(width, height as u32)
         }
         None => camera.clone(),
@@ -124,25 +149,40 @@ struct RenderJob<'a> {
 }
 
 impl RenderJob<'_> {
-    fn render(&self, context: &Context, image: &str, preview: &str, progress: &artifact::Progress) -> anyhow::Result<()> {
+    fn render(
+        &self,
+        context: &Context,
+        image: &str,
+        preview: &str,
+        progress: &artifact::Progress,
+    ) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let channels = &VIEW_CHANNELS[..if self.params.ray_distance { 6 } else { 5 }];
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
         let mut centres = Centres::default();
-        write_exr(&exr, (width, height), channels, VIEW_NOTE, |first, rows, samples| -> Result<(), Stopped> {
-            context.check_interrupt().map_err(Stopped::Other)?;
-            let pixels = self.band(&mut centres, first..first + rows).map_err(Stopped::Other)?;
-            for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
-                sample.copy_from_slice(&pixel.channels[..channels.len()]);
-            }
-            png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
-            progress.add(rows as u64);
-            Ok(())
-        })
+        write_exr(
+            &exr,
+            (width, height),
+            channels,
+            VIEW_NOTE,
+            |first, rows, samples| -> Result<(), Stopped> {
+                context.check_interrupt().map_err(Stopped::Other)?;
+                let pixels =
+                    self.band(&mut centres, first..first + rows).map_err(Stopped::Other)?;
+                for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
+                    sample.copy_from_slice(&pixel.channels[..channels.len()]);
+                }
+                png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
+                progress.add(rows as u64);
+                Ok(())
+            },
+        )
         .map_err(|stopped| match stopped {
-            Stopped::Pixels(error @ PixelError::NotFinite { .. }) => Failure::Numerical(error.to_string()).into(),
+            Stopped::Pixels(error @ PixelError::NotFinite { .. }) => {
+                Failure::Numerical(error.to_string()).into()
+            }
             Stopped::Pixels(error) => error.into(),
             Stopped::Other(error) => error,
         })?;
@@ -154,7 +194,9 @@ impl RenderJob<'_> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let n = self.params.samples_per_axis as usize;
-        let all = |rows: Range<usize>| -> Vec<[usize; 2]> { rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect() };
+        let all = |rows: Range<usize>| -> Vec<[usize; 2]> {
+            rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect()
+        };
         if n == 1 || self.params.tolerance == 0.0 {
             return self.cast(&all(rows), n);
         }
@@ -183,10 +225,14 @@ impl RenderJob<'_> {
         let within = |k: usize| (k as f64 + 0.5) / n as f64;
         let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
             .iter()
-            .flat_map(|[x, y]| (0..n * n).map(move |sub| (*x as f64 + within(sub % n), *y as f64 + within(sub / n))))
+            .flat_map(|[x, y]| {
+                (0..n * n)
+                    .map(move |sub| (*x as f64 + within(sub % n), *y as f64 + within(sub / n)))
+            })
             .map(|(u, v)| {
                 let ray = self.camera.ray(u, v);
-                let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
+                let (origin, direction) =
+                    (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
                 (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
@@ -196,7 +242,9 @@ impl RenderJob<'_> {
         let shown = |i: usize| {
             let rays = i * n * n..(i + 1) * n * n;
             subs.clear();
-            subs.extend(rendered.iter().flat_map(|r| r[rays.clone()].iter().zip(&to_z[rays.clone()])));
+            subs.extend(
+                rendered.iter().flat_map(|r| r[rays.clone()].iter().zip(&to_z[rays.clone()])),
+            );
             self.shown(&subs)
         };
         Ok((0..pixels.len()).map(shown).collect())
@@ -205,9 +253,13 @@ impl RenderJob<'_> {
     /// What a pixel shows of its rays, each with its z-depth per distance.
     fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
         let share = 1.0 / subs.len() as f32;
-        let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share;
+        let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| {
+            subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share
+        };
         let [r, g, b] = std::array::from_fn(|c| mean(&|p| p.premultiplied[c]));
-        let (distance, to_z) = middle(&mut subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect::<Vec<_>>());
+        let (distance, to_z) = middle(
+            &mut subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect::<Vec<_>>(),
+        );
         ViewPixel {
             channels: [r, g, b, mean(&|p| p.opacity), distance * to_z, distance],
             colour: std::array::from_fn(|c| mean(&|p| p.colour[c])),
@@ -240,8 +292,9 @@ struct Centres {
 }
 
 impl Centres {
-    /// How far a pixel's mean colour and opacity may be from its centre's: the view's second differences over 24, since the mean of a quadratic
-    /// over a square of side 1 differs from its centre by that part of its second derivatives. Unknown at the view's border.
+    /// How far a pixel's mean colour and opacity may be from its centre's: the view's second
+    /// differences over 24, since the mean of a quadratic over a square of side 1 differs from its
+    /// centre by that part of its second derivatives. Unknown at the view's border.
     fn error(&self, [x, y]: [usize; 2], width: usize) -> f32 {
         let at = (y - self.first) * width + x;
         let inside = x > 0 && x + 1 < width && at >= width && at + width < self.pixels.len();
@@ -256,7 +309,8 @@ impl Centres {
     }
 }
 
-/// The middle one of the sub-pixel rays' distances, and its z-depth per distance: a mean would invent a surface between two.
+/// The middle one of the sub-pixel rays' distances, and its z-depth per distance: a mean would
+/// invent a surface between two.
 fn middle(distances: &mut [(f32, f32)]) -> (f32, f32) {
     distances.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
     distances[(distances.len() - 1) / 2]
@@ -294,12 +348,21 @@ mod tests {
     }
 
     impl RayField for Picture {
-        fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, Box<dyn Error + Send + Sync>> {
+        fn render(
+            &self,
+            rays: &[Ray],
+        ) -> Result<Vec<radiance::Pixel>, Box<dyn Error + Send + Sync>> {
             self.rays.fetch_add(rays.len(), Ordering::Relaxed);
             let pixel = |ray: &Ray| {
                 let [x, y, z] = ray.direction.map(f64::from);
                 let value = (self.colour)(CENTRE - x / z, CENTRE + y / z) as f32;
-                radiance::Pixel { colour: [value; 3], premultiplied: [value; 3], opacity: 1.0, depth: 2.0, median_depth: 2.0 }
+                radiance::Pixel {
+                    colour: [value; 3],
+                    premultiplied: [value; 3],
+                    opacity: 1.0,
+                    depth: 2.0,
+                    median_depth: 2.0,
+                }
             };
             Ok(rays.iter().map(pixel).collect())
         }
@@ -312,12 +375,19 @@ mod tests {
         let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
         let camera = Camera { name: "a".to_owned(), intrinsics, camera_to_world };
         let count = Arc::new(AtomicUsize::new(0));
-        let members: Vec<Box<dyn RayField>> = vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
+        let members: Vec<Box<dyn RayField>> =
+            vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
         let params = Params { tolerance, ..Params::default() };
-        let job = RenderJob { params: &params, members: &members, background: Background::White, camera: &camera };
+        let job = RenderJob {
+            params: &params,
+            members: &members,
+            background: Background::White,
+            camera: &camera,
+        };
         let mut centres = Centres::default();
         let bands = (0..SIZE).step_by(band).map(|first| first..(first + band).min(SIZE));
-        let shown: Vec<ViewPixel> = bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
+        let shown: Vec<ViewPixel> =
+            bands.flat_map(|rows| job.band(&mut centres, rows).unwrap()).collect();
         (shown.iter().map(|pixel| pixel.channels[0]).collect(), count.load(Ordering::Relaxed))
     }
 
@@ -332,12 +402,17 @@ mod tests {
         assert_eq!(most, 4 * SIZE * SIZE);
         for tolerance in [1e-5, 1e-4, 1.5e-4, 2e-4, 1e-3] {
             let (adaptive, rays) = red(bent, tolerance, SIZE);
-            let error = all.iter().zip(&adaptive).map(|(a, b)| f64::from((a - b).abs())).fold(0.0, f64::max);
+            let error = all
+                .iter()
+                .zip(&adaptive)
+                .map(|(a, b)| f64::from((a - b).abs()))
+                .fold(0.0, f64::max);
             println!("tolerance {tolerance}: error {error}, {rays} rays");
             assert!(error <= tolerance + 1e-6, "an error of {error} is above {tolerance}");
             assert!(rays <= most + SIZE * SIZE);
         }
-        let [few, several, many] = [1e-3, 1.5e-4, 1e-5].map(|tolerance| red(bent, tolerance, SIZE).1);
+        let [few, several, many] =
+            [1e-3, 1.5e-4, 1e-5].map(|tolerance| red(bent, tolerance, SIZE).1);
         assert!(few < several && several < many, "{few}, {several}, {many} rays");
         // The border's pixels have all rays.
         assert_eq!(few, SIZE * SIZE + 4 * (4 * SIZE - 4));

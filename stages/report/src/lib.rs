@@ -1,9 +1,13 @@
-//! `report`: the record of a run as one self-contained HTML page: no network, nothing it needs beside it.
+//! `report`: the record of a run as one self-contained HTML page: no network, nothing it needs
+//! beside it.
 //!
-//! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it shows times and hashes.
+//! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it
+//! shows times and hashes.
 //!
-//! * `compare`: where several blocks score, what each made of a crop of one view, beside its error map.
-//! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes and times.
+//! * `compare`: where several blocks score, what each made of a crop of one view, beside its error
+//!   map.
+//! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes
+//!   and times.
 //! * `images`: views and depth as embedded PNG data.
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 
@@ -53,7 +57,8 @@ impl Stage for Report {
             "run",
             Input::required(
                 &["run"],
-                "folder with run.json, the record of a run; in pipeline.yaml: scores, and more under any name",
+                "folder with run.json, the record of a run; in pipeline.yaml: scores, and more \
+                under any name",
             ),
         )]
     }

@@ -14,14 +14,19 @@ use crate::results::{metrics, scored, warnings_by_node};
 const STYLE: &str = "
 body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1240px; padding: 0 1rem; color: #222; background: #fff }
 h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
-table { border-collapse: collapse; margin: .6rem 0 } th, td { padding: .3rem .7rem; text-align: left; border-bottom: 1px solid #ddd }
-td.n { text-align: right; font-variant-numeric: tabular-nums } th { font-weight: 600 } .best { font-weight: 700 }
-.row { display: flex; gap: 6px; flex-wrap: wrap; margin: .4rem 0 1.2rem } figure { margin: 0; flex: 1 1 180px; max-width: 300px }
-figure img { width: 100%; border: 1px solid #ddd; display: block } img.lr, img.px { image-rendering: pixelated }
+table { border-collapse: collapse; margin: .6rem 0 } th, td \
+{ padding: .3rem .7rem; text-align: left; border-bottom: 1px solid #ddd }
+td.n { text-align: right; font-variant-numeric: tabular-nums } th { font-weight: 600 } .best \
+{ font-weight: 700 }
+.row { display: flex; gap: 6px; flex-wrap: wrap; margin: .4rem 0 1.2rem } figure \
+{ margin: 0; flex: 1 1 180px; max-width: 300px }
+figure img { width: 100%; border: 1px solid #ddd; display: block } img.lr, img.px \
+{ image-rendering: pixelated }
 /* One column a method, the same in both rows. */
 .compare figure { flex: 1 1 0; min-width: 110px }
 #warnings { border: 2px solid #b3261e; background: #fdecea; padding: 0 1rem .2rem; margin: 1rem 0 } #warnings h2 { margin: .6rem 0 }
-figcaption { font-size: .82rem; color: #555 } code { font-size: .85em } details { margin: .3rem 0 } small { color: #666 }
+figcaption { font-size: .82rem; color: #555 } code { font-size: .85em } details \
+{ margin: .3rem 0 } small { color: #666 }
 ";
 
 /// What a metrics node was scored on.
@@ -36,7 +41,10 @@ pub(crate) fn page(run: &RunRecord, params: &Params) -> anyhow::Result<Markup> {
     for (index, node) in scored(run) {
         points.push(Point { node, metrics: metrics(node)?, index });
     }
-    let galleries = points.iter().map(|p| gallery(run, p, params.views as usize)).collect::<anyhow::Result<Vec<_>>>()?;
+    let galleries = points
+        .iter()
+        .map(|p| gallery(run, p, params.views as usize))
+        .collect::<anyhow::Result<Vec<_>>>()?;
     let compared = compare(run, &points, params)?;
     Ok(html! {
         (DOCTYPE)
@@ -77,7 +85,9 @@ fn warnings(run: &RunRecord) -> Markup {
 
 /// A table of means, one row a point, the best figure of each column in bold.
 fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
-    let mean = |p: &Point<'_>, path: &str| p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64);
+    let mean = |p: &Point<'_>, path: &str| {
+        p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64)
+    };
     let mut columns: Vec<(&str, &str, usize, bool)> = vec![
         ("PSNR ↑ dB", "psnr", 2, true),
         ("SSIM ↑", "ssim", 4, true),
@@ -93,22 +103,31 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     ];
     // Variants that nothing was scored by only take room.
     let is_variant = |path: &str| ["ssim_valid", "lpips_alex", "lpips_vgg"].contains(&path);
-    columns.retain(|(_, path, ..)| !is_variant(path) || points.iter().any(|point| mean(point, path).is_some()));
+    columns.retain(|(_, path, ..)| {
+        !is_variant(path) || points.iter().any(|point| mean(point, path).is_some())
+    });
     let best = |path: &str, up: bool| {
         let values = points.iter().filter_map(|p| mean(p, path));
-        if up { values.fold(f64::NEG_INFINITY, f64::max) } else { values.fold(f64::INFINITY, f64::min) }
+        if up {
+            values.fold(f64::NEG_INFINITY, f64::max)
+        } else {
+            values.fold(f64::INFINITY, f64::min)
+        }
     };
     html! {
         table id="scores" {
-            thead { tr { th { "point" } @for (name, ..) in &columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
+            thead { tr { th { "point" } @for (name,
+                ..) in &columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
             tbody {
                 @for point in points {
                     tr {
                         td { (label(points, point)) }
                         @for &(_, path, digits, up) in &columns {
                             @match mean(point, path) {
-                                Some(value) => td class=(if points.len() > 1 && value == best(path, up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
-                                None if path == "lpips" && mean(point, "psnr").is_some() => td { "weights not given" },
+                                Some(value) => td class=(if points.len() > 1 && value == best(path,
+                                    up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
+                                None if path == "lpips" && mean(point,
+                                    "psnr").is_some() => td { "weights not given" },
                                 None => td { "–" },
                             }
                         }
@@ -128,7 +147,8 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
     }
 }
 
-/// What tells a point from the others: its values in the sweep and, where several blocks score, whose scores they are (`eval-refined`: refined).
+/// What tells a point from the others: its values in the sweep and, where several blocks score,
+/// whose scores they are (`eval-refined`: refined).
 pub(crate) fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
     let (stage, values) = (point.node.stage.as_str(), point.node.point.as_str());
     let whose = stage.strip_prefix("eval-").unwrap_or(stage);
@@ -140,7 +160,8 @@ pub(crate) fn label(points: &[Point<'_>], point: &Point<'_>) -> String {
     }
 }
 
-/// Seconds of training and of rendering. What was rendered on the way to a refiner belongs to its training.
+/// Seconds of training and of rendering. What was rendered on the way to a refiner belongs to its
+/// training.
 fn times(run: &RunRecord, point: &Point<'_>) -> [f64; 2] {
     let mut rendered = Vec::new();
     let mut next = point.node.inputs.get("views").and_then(|input| input.node);
@@ -149,8 +170,14 @@ fn times(run: &RunRecord, point: &Point<'_>) -> [f64; 2] {
         next = run.nodes[index].inputs.get("views").and_then(|input| input.node);
     }
     let seconds = |i: &usize| run.nodes[*i].seconds;
-    let trains = |i: &usize| ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str()) && !rendered.contains(i);
-    [run.ancestors(point.index).iter().filter(|i| trains(i)).map(seconds).sum(), rendered.iter().map(seconds).sum()]
+    let trains = |i: &usize| {
+        ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str())
+            && !rendered.contains(i)
+    };
+    [
+        run.ancestors(point.index).iter().filter(|i| trains(i)).map(seconds).sum(),
+        rendered.iter().map(seconds).sum(),
+    ]
 }
 
 fn duration(seconds: f64) -> String {
@@ -166,7 +193,8 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
     let (views, truths) = (Views::of_folder(&rendered)?, Views::of_folder(&truth)?);
     let all = point.metrics["views"].as_array().cloned().unwrap_or_default();
     let shown = count.min(all.len());
-    let find = |list: &Views, name: &str| list.views.iter().find(|v| v.camera.name == name).cloned();
+    let find =
+        |list: &Views, name: &str| list.views.iter().find(|v| v.camera.name == name).cloned();
     let chosen = (0..shown).map(|k| &all[k * all.len() / shown]).filter_map(|scores| {
         let name = scores["name"].as_str()?;
         Some((scores, find(&views, name)?, find(&truths, name)?))
@@ -179,7 +207,10 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let figure = |class: &str, uri: Option<String>, caption: String| {
             html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }
         };
-        let embedded = |folder: &Path, file: &Option<String>, background| -> anyhow::Result<Option<(String, usize)>> {
+        let embedded = |folder: &Path,
+                        file: &Option<String>,
+                        background|
+         -> anyhow::Result<Option<(String, usize)>> {
             let image = file.as_ref().map(|f| colour(folder, f, background)).transpose()?;
             Ok(image.map(|i| (shown_in_gallery(&i), i.width)))
         };
@@ -187,7 +218,8 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let found = embedded(&rendered, &view.image, views.background)?;
         let expected = embedded(&truth, &true_view.image, truths.background)?;
         let map = |key: &str| -> anyhow::Result<Option<String>> {
-            let file = scores[key].as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
+            let file =
+                scores[key].as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
             Ok(file.map(|map| shown_in_gallery(&map)))
         };
         let (error, warped) = (map("error_map")?, map("warp")?);
@@ -203,14 +235,19 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
                 .unwrap_or_else(|| "–".to_owned())
         };
         rows.push(html! {
-            h3 { "View " (name) " " small { "PSNR " (number("/psnr", 2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr", 2)) " dB" } }
+            h3 { "View " (name) " " small { "PSNR " (number("/psnr",
+                2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr",
+                    2)) " dB" } }
             div class="row" {
                 (figure("lr", lr.clone().map(|l| l.0), caption("LR", &lr)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
-                (figure("px", error, if expected.is_some() { "error" } else { "error at LR" }.to_owned()))
-                (figure("px", warped, format!("neighbour by depth, {} dB (red: not seen)", number("/warp/psnr", 2))))
-                (figure("px", depth.map(|d| shown_in_gallery(&d)), "depth (warm is near)".to_owned()))
+                (figure("px", error, if expected.is_some() { "error" } else { "error at \
+                    LR" }.to_owned()))
+                (figure("px", warped, format!("neighbour by depth, {} dB (red: not \
+                    seen)", number("/warp/psnr", 2))))
+                (figure("px", depth.map(|d| shown_in_gallery(&d)), "depth (warm is \
+                    near)".to_owned()))
             }
         });
     }

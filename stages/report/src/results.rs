@@ -15,7 +15,8 @@ pub struct ResultRow {
     pub stage: String,
     /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
-    /// Means over the views: `psnr`, `ssim`, `lpips` where weights were given, `depth` where there is truth.
+    /// Means over the views: `psnr`, `ssim`, `lpips` where weights were given, `depth` where there
+    /// is truth.
     pub mean: Value,
     /// Number of views.
     pub views: usize,
@@ -48,17 +49,23 @@ pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
 pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
     let of_node = |node: &RunNode| {
         let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
-        let name = if node.point.is_empty() { node.stage.clone() } else { format!("{} [{}]", node.stage, node.point) };
-        let warnings: Vec<_> = warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect();
+        let name = if node.point.is_empty() {
+            node.stage.clone()
+        } else {
+            format!("{} [{}]", node.stage, node.point)
+        };
+        let warnings: Vec<_> =
+            warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect();
         warnings
     };
     run.nodes.iter().flat_map(of_node).collect()
 }
 
-/// The nodes that scored, each with its place in the list: what came through fewer stages first, so that what is rendered stands before what is
-/// refined.
+/// The nodes that scored, each with its place in the list: what came through fewer stages first, so
+/// that what is rendered stands before what is refined.
 pub(crate) fn scored(run: &RunRecord) -> Vec<(usize, &RunNode)> {
-    let mut scored: Vec<_> = run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").collect();
+    let mut scored: Vec<_> =
+        run.nodes.iter().enumerate().filter(|(_, node)| node.kind == "metrics").collect();
     scored.sort_by_key(|(index, _)| run.ancestors(*index).len());
     scored
 }
@@ -69,7 +76,12 @@ pub(crate) fn results(run: &RunRecord) -> anyhow::Result<Vec<ResultRow>> {
         let stages = run.ancestors(index).into_iter().chain([index]).map(|i| {
             let node = &run.nodes[i];
             let (seconds, threads) = (node.seconds, node.threads);
-            let result = StageResult { parameters: node.parameters.clone(), seconds, threads, folder: node.folder.clone() };
+            let result = StageResult {
+                parameters: node.parameters.clone(),
+                seconds,
+                threads,
+                folder: node.folder.clone(),
+            };
             (node.stage.clone(), result)
         });
         Ok(ResultRow {
@@ -93,21 +105,33 @@ mod tests {
         let node = |stage: &str, point: &str, summary: Option<&str>| {
             let folder = folder.path().join(stage);
             std::fs::create_dir(&folder).unwrap();
-            summary.iter().for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
+            summary
+                .iter()
+                .for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
             let node = serde_json::json!({
-                "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "", "folder": folder, "parameters": {},
+                "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "",
+                "folder": folder, "parameters": {},
                 "inputs": {}, "started_unix": 0, "seconds": 0.0, "threads": 1
             });
             serde_json::from_value(node).unwrap()
         };
         let nodes = vec![
-            node("register", "seed=1", Some("2 of 2 cameras registered\nwarning: cameras have turned far\n")),
+            node(
+                "register",
+                "seed=1",
+                Some("2 of 2 cameras registered\nwarning: cameras have turned far\n"),
+            ),
             node("prep", "", Some("8 training views\n")),
             node("train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
             node("script", "", None),
         ];
-        let found = warnings_by_node(&RunRecord { home: PathBuf::new(), nodes, failed: Vec::new() });
-        let expected = [("register [seed=1]", "cameras have turned far"), ("train-ss", "one"), ("train-ss", "two")];
+        let found =
+            warnings_by_node(&RunRecord { home: PathBuf::new(), nodes, failed: Vec::new() });
+        let expected = [
+            ("register [seed=1]", "cameras have turned far"),
+            ("train-ss", "one"),
+            ("train-ss", "two"),
+        ];
         assert_eq!(found, expected.map(|(node, warning)| (node.to_owned(), warning.to_owned())));
     }
 }

@@ -37,7 +37,8 @@ struct Cli {
     /// Where to compute: cpu or cuda:N
     #[arg(long, global = true, default_value = DEVICE)]
     device: String,
-    /// Who runs the stages: this machine, or a cluster's jobs; there a stage that needs GPUs (`resources`) computes on cuda:0
+    /// Who runs the stages: this machine, or a cluster's jobs; there a stage that needs GPUs
+    /// (`resources`) computes on cuda:0
     #[arg(long, global = true, value_enum, default_value = EXECUTOR, env = "NERF_SR_EXECUTOR")]
     executor: Choose,
 }
@@ -52,10 +53,12 @@ enum Choose {
 
 #[derive(Args, Default)]
 struct What {
-    /// Targets: stages of the pipeline, or files of pipelines/ beside it [default: the pipeline's `default`]
+    /// Targets: stages of the pipeline, or files of pipelines/ beside it [default: the pipeline's
+    /// `default`]
     targets: Vec<String>,
-    /// Sets a parameter; several values run all combinations, sharing what they share. A value is a JSON number, true, false or null, else a word;
-    /// nothing at all is null. The last of several for the same parameter counts
+    /// Sets a parameter; several values run all combinations, sharing what they share. A value is a
+    /// JSON number, true, false or null, else a word; nothing at all is null. The last of several
+    /// for the same parameter counts
     #[arg(short = 'p', long = "param", value_name = "[STAGE.]NAME=VALUE[,VALUE…]")]
     parameters: Vec<String>,
     /// Takes an input from a folder instead, e.g. -i dataset=scenes/lego
@@ -97,10 +100,12 @@ enum Verb {
         /// Stages at once [default: the number of cores, at most 4]
         #[arg(short, long, value_name = "N")]
         jobs: Option<usize>,
-        /// Threads of each stage, and cores of all together; results don't depend on it [default: all cores]
+        /// Threads of each stage, and cores of all together; results don't depend on it [default:
+        /// all cores]
         #[arg(long, value_name = "N")]
         threads: Option<usize>,
-        /// Memory of all stages together, such as 8G, by what each took when it last ran [default: all there is]
+        /// Memory of all stages together, such as 8G, by what each took when it last ran [default:
+        /// all there is]
         #[arg(long, value_name = "AMOUNT")]
         memory: Option<Memory>,
         /// Go on with what doesn't need a failed stage
@@ -109,7 +114,8 @@ enum Verb {
         /// Where pages are written [default: out beside the pipeline]
         #[arg(long, value_name = "DIR")]
         out: Option<PathBuf>,
-        /// What a cluster wants besides: partition, account, set-up lines [default: ~/.config/nerf-sr/slurm.yaml if it is there]
+        /// What a cluster wants besides: partition, account, set-up lines [default:
+        /// ~/.config/nerf-sr/slurm.yaml if it is there]
         #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
         site: Option<PathBuf>,
     },
@@ -162,7 +168,8 @@ enum Verb {
     },
     /// Tell what differs between two results: parameters, defaults in use, metrics, images
     Diff {
-        /// A stage with its arguments as one word ("eval -p kernel=box"), the beginning of an artifact's hash, or a recorded run or pin
+        /// A stage with its arguments as one word ("eval -p kernel=box"), the beginning of an
+        /// artifact's hash, or a recorded run or pin
         before: String,
         /// Likewise
         now: String,
@@ -242,19 +249,20 @@ enum GraphFormat {
     Svg,
 }
 
-/// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or command line, 70 for a panic.
-/// None of them changes where stdout is closed.
+/// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or
+/// command line, 70 for a panic. None of them changes where stdout is closed.
 pub fn main() -> ExitCode {
     artifact::install_panic_hook("nerf-sr");
     match run(Cli::parse()) {
         Ok(code) => code,
         Err(error) => {
             report_line!("nerf-sr: {}", artifact::one_line(&error));
-            let plan_code = error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
-                PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
-                PlanError::Source(_) => 3,
-                PlanError::Interrupted => 130,
-            });
+            let plan_code =
+                error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
+                    PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
+                    PlanError::Source(_) => 3,
+                    PlanError::Interrupted => 130,
+                });
             ExitCode::from(plan_code.unwrap_or_else(|| artifact::exit_code(&error)))
         }
     }
@@ -262,7 +270,8 @@ pub fn main() -> ExitCode {
 
 impl From<What> for Request {
     fn from(what: What) -> Self {
-        let OfExperiment { scenes, protocols, variants, first_variants, show, data } = what.experiment;
+        let OfExperiment { scenes, protocols, variants, first_variants, show, data } =
+            what.experiment;
         let choice = Selection { data, scenes, protocols, variants, first: first_variants, show };
         Self { targets: what.targets, parameters: what.parameters, inputs: what.inputs, choice }
     }
@@ -271,27 +280,37 @@ impl From<What> for Request {
 fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     match &cli.verb {
         Verb::Completions { shell } => return Ok(completions(*shell)),
-        Verb::Describe { stage } => return verbs::describe(&Pipeline::read(&cli.pipeline).map_err(PlanError::from)?, stage),
+        Verb::Describe { stage } => {
+            return verbs::describe(
+                &Pipeline::read(&cli.pipeline).map_err(PlanError::from)?,
+                stage,
+            );
+        }
         Verb::Job { submission, number } => return verbs::job(submission, *number),
         _ => {}
     }
-    let devices = Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
+    let devices =
+        Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
         Verb::Run { what, jobs, threads, memory, keep_going, out, site } => {
             let executor: Box<dyn Executor> = match cli.executor {
                 Choose::Local => {
-                    let remedy = Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
+                    let remedy =
+                        Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
                     Box::new(Local { budget: budget(jobs, threads, memory)?, keep_going, remedy })
                 }
-                Choose::Slurm if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going => {
-                    let problem =
-                        "--jobs, --threads, --memory and --keep-going are for --executor local; say `resources` in the pipeline";
+                Choose::Slurm
+                    if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going =>
+                {
+                    let problem = "--jobs, --threads, --memory and --keep-going are for \
+                        --executor local; say `resources` in the pipeline";
                     return Err(PlanError::Usage(problem.to_owned()).into());
                 }
-                Choose::Slurm => {
-                    Box::new(Cluster { site: Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))? })
-                }
+                Choose::Slurm => Box::new(Cluster {
+                    site: Site::find(site.as_deref())
+                        .map_err(|e| PlanError::Usage(e.to_string()))?,
+                }),
             };
             let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
             verbs::run(&session, &what.into(), &out, executor.as_ref())
@@ -320,7 +339,9 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let choice = Choice { keep_days, drop_unfinished, drop_old };
             verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
         }
-        Verb::Completions { .. } | Verb::Describe { .. } | Verb::Job { .. } => unreachable!("handled before the session"),
+        Verb::Completions { .. } | Verb::Describe { .. } | Verb::Job { .. } => {
+            unreachable!("handled before the session")
+        }
     }
 }
 
@@ -333,7 +354,11 @@ fn completions(shell: clap_complete::Shell) -> ExitCode {
 }
 
 /// What a run may take, as far as the machine can use it.
-fn budget(jobs: Option<usize>, threads: Option<usize>, memory: Option<Memory>) -> Result<Budget, PlanError> {
+fn budget(
+    jobs: Option<usize>,
+    threads: Option<usize>,
+    memory: Option<Memory>,
+) -> Result<Budget, PlanError> {
     if jobs == Some(0) || threads == Some(0) {
         return Err(PlanError::Usage("--jobs and --threads must be at least 1".to_owned()));
     }
@@ -341,7 +366,11 @@ fn budget(jobs: Option<usize>, threads: Option<usize>, memory: Option<Memory>) -
     let (stages, less_jobs) = capped("--jobs", jobs.unwrap_or(cores.min(4)), cores);
     let (threads, less_threads) = capped("--threads", threads.unwrap_or(cores), cores);
     less_jobs.into_iter().chain(less_threads).for_each(|said| report_line!("{said}"));
-    Ok(Budget { stages, threads, memory: memory.map(Memory::bytes).or_else(machine_memory).unwrap_or(u64::MAX) })
+    Ok(Budget {
+        stages,
+        threads,
+        memory: memory.map(Memory::bytes).or_else(machine_memory).unwrap_or(u64::MAX),
+    })
 }
 
 /// The words with which another verb is asked for the same.
@@ -362,7 +391,11 @@ fn given(what: &What, pipeline: &Path, store: Option<&Path>, device: &str) -> Ve
         ("--store", store.map(file)),
         ("--device", (device != DEVICE).then(|| device.to_owned())),
     ];
-    words.extend(options.into_iter().flat_map(|(name, value)| value.into_iter().flat_map(|v| [name.to_owned(), v])));
+    words.extend(
+        options
+            .into_iter()
+            .flat_map(|(name, value)| value.into_iter().flat_map(|v| [name.to_owned(), v])),
+    );
     words
 }
 

@@ -35,6 +35,9 @@ mod tests {
         assert_eq!(ran(1, 1), "1 of 1 stage ran, 0 were cached");
         assert_eq!(all_cached(1), "nothing to run: the stage is cached");
         assert_eq!(all_cached(5), "nothing to run: all 5 stages are cached");
-        assert_eq!([0, 1, 2].map(left_out), [None, Some("1 stage was not run".into()), Some("2 stages were not run".into())]);
+        assert_eq!(
+            [0, 1, 2].map(left_out),
+            [None, Some("1 stage was not run".into()), Some("2 stages were not run".into())]
+        );
     }
 }

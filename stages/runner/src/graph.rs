@@ -50,10 +50,17 @@ impl Drawing {
 /// The nodes in their order, and after them the sinks.
 fn drawn<'a>(plan: &'a Plan, states: &[State]) -> Vec<Drawn<'a>> {
     let nodes = plan.nodes.iter().zip(states).map(|(node, state)| {
-        let mut drawn = Drawn { label: node.label(), state: Drawing::of(state), made_of: Vec::new(), parents: Vec::new() };
+        let mut drawn = Drawn {
+            label: node.label(),
+            state: Drawing::of(state),
+            made_of: Vec::new(),
+            parents: Vec::new(),
+        };
         for input in &node.inputs {
             let source = match &input.from {
-                Origin::Node { index, subtree: Some(folder) } => format!("{}/{folder}", plan.nodes[*index].label()),
+                Origin::Node { index, subtree: Some(folder) } => {
+                    format!("{}/{folder}", plan.nodes[*index].label())
+                }
                 Origin::Node { index, subtree: None } => plan.nodes[*index].label(),
                 Origin::Folder(folder) => folder.display().to_string(),
             };
@@ -108,15 +115,20 @@ pub(crate) fn svg(plan: &Plan, states: &[State]) -> String {
         places.push((20 + depth * (BOX.0 + GAP.0), 20 + rows[depth] * (BOX.1 + GAP.1)));
         rows[depth] += 1;
     }
-    let (width, height) = (rows.len() * (BOX.0 + GAP.0) + 20, rows.iter().max().unwrap_or(&0) * (BOX.1 + GAP.1) + 20);
+    let (width, height) =
+        (rows.len() * (BOX.0 + GAP.0) + 20, rows.iter().max().unwrap_or(&0) * (BOX.1 + GAP.1) + 20);
     let mut text = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\" font-size=\"12\">\n"
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
+        font-family=\"sans-serif\" font-size=\"12\">\n"
     );
     for (drawn, (x2, y2)) in all.iter().zip(&places) {
         for (x1, y1) in drawn.parents.iter().map(|(parent, _)| places[*parent]) {
             let (x1, y1, y2) = (x1 + BOX.0, y1 + BOX.1 / 2, y2 + BOX.1 / 2);
             let middle = usize::midpoint(x1, *x2);
-            text += &format!("<path d=\"M{x1} {y1} C{middle} {y1} {middle} {y2} {x2} {y2}\" fill=\"none\" stroke=\"#888\"/>\n");
+            text += &format!(
+                "<path d=\"M{x1} {y1} C{middle} {y1} {middle} {y2} {x2} {y2}\" fill=\"none\" \
+                stroke=\"#888\"/>\n"
+            );
         }
     }
     for (drawn, (x, y)) in all.iter().zip(&places) {
@@ -124,9 +136,12 @@ pub(crate) fn svg(plan: &Plan, states: &[State]) -> String {
         let label = drawn.label.replace('&', "&amp;").replace('<', "&lt;");
         let (middle, baseline) = (x + width / 2, y + height / 2 + 4);
         text += &format!(
-            "<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" rx=\"6\" fill=\"{fill}\" stroke=\"#555\"/>"
+            "<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" rx=\"6\" \
+            fill=\"{fill}\" stroke=\"#555\"/>"
         );
-        text += &format!("<text x=\"{middle}\" y=\"{baseline}\" text-anchor=\"middle\">{label}</text>\n");
+        text += &format!(
+            "<text x=\"{middle}\" y=\"{baseline}\" text-anchor=\"middle\">{label}</text>\n"
+        );
     }
     text + "</svg>\n"
 }

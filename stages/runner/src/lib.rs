@@ -1,8 +1,10 @@
-//! `nerf-sr`, the runner: pipeline.yaml → plan → run. It knows stages by their `describe` alone and artifacts by their hashes.
+//! `nerf-sr`, the runner: pipeline.yaml → plan → run. It knows stages by their `describe` alone and
+//! artifacts by their hashes.
 //!
 //! Planning has a crate of its own, `planning`. Here is what is done with a plan.
 //!
-//! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all that they were made of.
+//! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all
+//!   that they were made of.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `sink`: hands the run's record to stages that show it (the report).
 

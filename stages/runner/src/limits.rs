@@ -8,7 +8,10 @@ pub(crate) fn capped(option: &str, asked: usize, cores: usize) -> (usize, Option
     let most = cores.saturating_mul(A_CORE);
     let said = || {
         let cores = counted(cores, "core");
-        format!("nerf-sr: {option} {asked} is more than {cores} can use: {most} it is; the results are the same")
+        format!(
+            "nerf-sr: {option} {asked} is more than {cores} can use: {most} it is; the results \
+            are the same"
+        )
     };
     (asked.min(most), (asked > most).then(said))
 }
@@ -22,6 +25,10 @@ mod tests {
         assert_eq!(capped("--jobs", 8, 2), (8, None));
         let (threads, said) = capped("--threads", 1000, 2);
         assert_eq!(threads, 8);
-        assert_eq!(said.unwrap(), "nerf-sr: --threads 1000 is more than 2 cores can use: 8 it is; the results are the same");
+        assert_eq!(
+            said.unwrap(),
+            "nerf-sr: --threads 1000 is more than 2 cores can use: 8 it is; the results are the \
+            same"
+        );
     }
 }

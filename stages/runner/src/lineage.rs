@@ -28,7 +28,8 @@ pub(crate) struct StageDifference {
 impl Lineage {
     /// Of the actions that have these keys. What garbage collection has taken is left out.
     pub(crate) fn of(store: &Store, keys: impl IntoIterator<Item = String>) -> Self {
-        let (mut open, mut seen): (Vec<String>, BTreeSet<String>) = (keys.into_iter().collect(), BTreeSet::new());
+        let (mut open, mut seen): (Vec<String>, BTreeSet<String>) =
+            (keys.into_iter().collect(), BTreeSet::new());
         let mut found: Vec<Record> = Vec::new();
         while let Some(key) = open.pop() {
             if !seen.insert(key.clone()) {
@@ -39,23 +40,31 @@ impl Lineage {
                 found.push(record);
             }
         }
-        // A point is of the run that made the result first: where a stage has one result, its name is enough.
-        let is_single = |stage: &str| found.iter().filter(|record| record.stage == stage).count() == 1;
+        // A point is of the run that made the result first: where a stage has one result, its name
+        // is enough.
+        let is_single =
+            |stage: &str| found.iter().filter(|record| record.stage == stage).count() == 1;
         let name = |record: &Record| {
-            if is_single(&record.stage) { record.stage.clone() } else { label(&record.stage, &record.point) }
+            if is_single(&record.stage) {
+                record.stage.clone()
+            } else {
+                label(&record.stage, &record.point)
+            }
         };
         Self { records: found.iter().map(|record| (name(record), record.clone())).collect() }
     }
 
-    /// What differs from an earlier one, stage by stage. Where what a stage was made of differs, its inputs' hashes aren't told.
+    /// What differs from an earlier one, stage by stage. Where what a stage was made of differs,
+    /// its inputs' hashes aren't told.
     pub(crate) fn differences(&self, before: &Self, store: &Store) -> Vec<StageDifference> {
         let names: BTreeSet<&String> = self.records.keys().chain(before.records.keys()).collect();
         let mut found = Vec::new();
         for name in names {
             let sides = [(before, before.records.get(name)), (self, self.records.get(name))];
             let depth = Depth::of(sides.map(|(_, record)| record), store);
-            let [parts_before, parts_now] =
-                sides.map(|(lineage, record)| record.map(|record| lineage.parts(record, store, depth)).unwrap_or_default());
+            let [parts_before, parts_now] = sides.map(|(lineage, record)| {
+                record.map(|record| lineage.parts(record, store, depth)).unwrap_or_default()
+            });
             let changes = changes(&parts_before, &parts_now);
             if !changes.is_empty() {
                 found.push(StageDifference { stage: name.clone(), changes });
@@ -67,16 +76,29 @@ impl Lineage {
     /// What may differ of a result, by name.
     fn parts(&self, record: &Record, store: &Store, depth: Depth) -> Map<String, Value> {
         if depth == Depth::Name {
-            return record.key_parts.iter().filter(|(name, _)| *name == "stage").map(owned).collect();
+            return record
+                .key_parts
+                .iter()
+                .filter(|(name, _)| *name == "stage")
+                .map(owned)
+                .collect();
         }
         let is_made = |hash: &Value| {
-            let outputs = self.records.values().filter(|other| record.made_of.contains(&other.key()));
+            let outputs =
+                self.records.values().filter(|other| record.made_of.contains(&other.key()));
             outputs.into_iter().any(|other| is_of(store, hash, &other.output))
         };
-        let mut parts: Map<String, Value> =
-            record.key_parts.iter().filter(|(name, value)| !(name.starts_with("input ") && is_made(value))).map(owned).collect();
+        let mut parts: Map<String, Value> = record
+            .key_parts
+            .iter()
+            .filter(|(name, value)| !(name.starts_with("input ") && is_made(value)))
+            .map(owned)
+            .collect();
         let manifest = store.manifest(&record.output).ok();
-        parts.insert("artifact".to_owned(), Value::from(if manifest.is_some() { "kept" } else { "gone" }));
+        parts.insert(
+            "artifact".to_owned(),
+            Value::from(if manifest.is_some() { "kept" } else { "gone" }),
+        );
         if let Some(manifest) = manifest.filter(|_| depth == Depth::Content) {
             add_content(&mut parts, record, &manifest, &store.object(&record.output));
         }
@@ -108,16 +130,28 @@ impl Depth {
 }
 
 /// Adds an artifact's files by their hashes; of JSON files the numbers that count.
-fn add_content(parts: &mut Map<String, Value>, record: &Record, manifest: &Manifest, folder: &Path) {
+fn add_content(
+    parts: &mut Map<String, Value>,
+    record: &Record,
+    manifest: &Manifest,
+    folder: &Path,
+) {
     for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
         parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
     }
-    for file in manifest.files.iter().filter(|file| file.path.ends_with(".json") && !file.path.contains('/')) {
+    for file in manifest
+        .files
+        .iter()
+        .filter(|file| file.path.ends_with(".json") && !file.path.contains('/'))
+    {
         let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
         let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
-        // Which file has the values in use isn't recorded: what names no parameter is something else.
+        // Which file has the values in use isn't recorded: what names no parameter is something
+        // else.
         let resolved = value.get("resolved").and_then(Value::as_object).into_iter().flatten();
-        for (name, value) in resolved.filter(|(name, _)| record.key_parts.contains_key(&format!("parameter {name}"))) {
+        for (name, value) in
+            resolved.filter(|(name, _)| record.key_parts.contains_key(&format!("parameter {name}")))
+        {
             parts.insert(format!("resolved {name}"), value.clone());
         }
         if file.path == METRICS_FILE {
@@ -135,8 +169,12 @@ fn owned((name, value): (&String, &Value)) -> (String, Value) {
 /// Whether an input's hash is of an artifact or of one of its folders.
 fn is_of(store: &Store, hash: &Value, output: &str) -> bool {
     let of_folder = |manifest: Manifest| {
-        let folders: BTreeSet<String> =
-            manifest.files.iter().filter_map(|file| file.path.split_once('/')).map(|(folder, _)| folder.to_owned()).collect();
+        let folders: BTreeSet<String> = manifest
+            .files
+            .iter()
+            .filter_map(|file| file.path.split_once('/'))
+            .map(|(folder, _)| folder.to_owned())
+            .collect();
         folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
     };
     hash == output || store.manifest(output).is_ok_and(of_folder)
@@ -146,7 +184,9 @@ fn is_of(store: &Store, hash: &Value, output: &str) -> bool {
 fn numbers(name: &str, value: &Value, tell: &mut dyn FnMut(&str, &Value)) {
     match value {
         Value::Number(_) => tell(name, value),
-        Value::Object(entries) => entries.iter().for_each(|(key, value)| numbers(&format!("{name}.{key}"), value, tell)),
+        Value::Object(entries) => {
+            entries.iter().for_each(|(key, value)| numbers(&format!("{name}.{key}"), value, tell))
+        }
         _ => {}
     }
 }

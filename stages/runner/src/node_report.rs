@@ -57,7 +57,8 @@ pub(crate) struct NodeReport {
     /// The cluster's job that is to make it, where one is queued or running. `status` alone asks.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) job: Option<Job>,
-    /// What differs from the nearest earlier run of the stage; absent where it never ran, or wasn't asked for.
+    /// What differs from the nearest earlier run of the stage; absent where it never ran, or wasn't
+    /// asked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) changes: Option<Vec<Change>>,
 }
@@ -79,9 +80,18 @@ pub(crate) struct ArtifactReport {
 
 impl PlanReport {
     /// With records, what differs from earlier runs, too.
-    pub(crate) fn new(session: &Session, plan: &Plan, states: &[State], records: &[Record]) -> Self {
-        let nodes = (0..plan.nodes.len()).map(|number| NodeReport::new(session, plan, (number, &states[number]), records));
-        let sinks = plan.sinks.iter().map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.shows.clone() });
+    pub(crate) fn new(
+        session: &Session,
+        plan: &Plan,
+        states: &[State],
+        records: &[Record],
+    ) -> Self {
+        let nodes = (0..plan.nodes.len())
+            .map(|number| NodeReport::new(session, plan, (number, &states[number]), records));
+        let sinks = plan
+            .sinks
+            .iter()
+            .map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.shows.clone() });
         Self { nodes: nodes.collect(), sinks: sinks.collect() }
     }
 
@@ -95,7 +105,12 @@ impl PlanReport {
 }
 
 impl NodeReport {
-    fn new(session: &Session, plan: &Plan, (number, state): (usize, &State), records: &[Record]) -> Self {
+    fn new(
+        session: &Session,
+        plan: &Plan,
+        (number, state): (usize, &State),
+        records: &[Record],
+    ) -> Self {
         let (store, node) = (&session.store, &plan.nodes[number]);
         let mut report = Self {
             number,

@@ -1,5 +1,5 @@
-//! Publishing of what a sink made: written whole beside the old folder, then put in its place at once. A folder is replaced only
-//! where all in it is ours and untouched.
+//! Publishing of what a sink made: written whole beside the old folder, then put in its place at
+//! once. A folder is replaced only where all in it is ours and untouched.
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -16,20 +16,33 @@ pub(crate) const MARK: &str = ".shows";
 
 /// Whether a folder shows this already, with all its files.
 pub(crate) fn shows(target: &Path, identity: &str) -> bool {
-    let is_whole = || Manifest::read(target).is_ok_and(|manifest| manifest.check_sizes(target).is_ok());
+    let is_whole =
+        || Manifest::read(target).is_ok_and(|manifest| manifest.check_sizes(target).is_ok());
     fs::read_to_string(target.join(MARK)).is_ok_and(|shown| shown == identity) && is_whole()
 }
 
-/// Puts a made folder, with its mark, in a target's place. `out` is the target's folder, `kind` what the sink makes.
-pub(crate) fn publish(made: &Path, out: &Path, name: &str, kind: &str, stop: &AtomicBool) -> Result<PathBuf, StageFailure> {
+/// Puts a made folder, with its mark, in a target's place. `out` is the target's folder, `kind`
+/// what the sink makes.
+pub(crate) fn publish(
+    made: &Path,
+    out: &Path,
+    name: &str,
+    kind: &str,
+    stop: &AtomicBool,
+) -> Result<PathBuf, StageFailure> {
     let target = out.join(name);
-    let fail = |place: &Path, e: io::Error| StageFailure { code: 1, message: format!("{}: {e}", place.display()) };
+    let fail = |place: &Path, e: io::Error| StageFailure {
+        code: 1,
+        message: format!("{}: {e}", place.display()),
+    };
     fs::create_dir_all(out).map_err(|e| fail(out, e))?;
     let _lock = lock_folder(out, stop)?;
     // With the lock held, what lies there is a killed run's.
     let fresh = out.join(format!(".{name}.nerf-sr-new"));
     remove(&fresh).map_err(|e| fail(&fresh, e))?;
-    let placed = copy_folder(made, &fresh).map_err(|e| fail(&fresh, e)).and_then(|()| put(&fresh, &target, kind));
+    let placed = copy_folder(made, &fresh)
+        .map_err(|e| fail(&fresh, e))
+        .and_then(|()| put(&fresh, &target, kind));
     // What is left is the old page, or what couldn't be put there.
     remove(&fresh).ok();
     placed.map(|()| target)
@@ -37,15 +50,20 @@ pub(crate) fn publish(made: &Path, out: &Path, name: &str, kind: &str, stop: &At
 
 /// Puts a whole folder in the target's place; what was there takes the fresh one's name.
 fn put(fresh: &Path, target: &Path, kind: &str) -> Result<(), StageFailure> {
-    let fail = |e: io::Error| StageFailure { code: 1, message: format!("{}: {e}", target.display()) };
+    let fail =
+        |e: io::Error| StageFailure { code: 1, message: format!("{}: {e}", target.display()) };
     match target.symlink_metadata() {
-        Err(e) if e.kind() == io::ErrorKind::NotFound => return fs::rename(fresh, target).map_err(fail),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {
+            return fs::rename(fresh, target).map_err(fail);
+        }
         Err(e) => return Err(fail(e)),
         Ok(_) => {}
     }
     owned(target, kind).map_err(|reason| StageFailure {
         code: 1,
-        message: format!("{reason}; nothing was replaced: move it away, or choose another folder with --out"),
+        message: format!(
+            "{reason}; nothing was replaced: move it away, or choose another folder with --out"
+        ),
     })?;
     let flags = rustix::fs::RenameFlags::EXCHANGE;
     match rustix::fs::renameat_with(rustix::fs::CWD, fresh, rustix::fs::CWD, target, flags) {
@@ -62,7 +80,8 @@ fn put(fresh: &Path, target: &Path, kind: &str) -> Result<(), StageFailure> {
     }
 }
 
-/// Whether all in a folder is what a sink of ours put there; else which file isn't. An empty folder may be replaced, too.
+/// Whether all in a folder is what a sink of ours put there; else which file isn't. An empty folder
+/// may be replaced, too.
 fn owned(target: &Path, kind: &str) -> Result<(), String> {
     let place = |file: &Path| target.join(file).display().to_string();
     let is_link = target.symlink_metadata().is_ok_and(|meta| meta.file_type().is_symlink());
@@ -78,7 +97,11 @@ fn owned(target: &Path, kind: &str) -> Result<(), String> {
     let manifest = match Manifest::read(target) {
         Ok(manifest) if kind == manifest.kind => manifest,
         _ => {
-            let first = files.iter().map(|(file, _)| file.as_path()).find(|file| !own(file)).unwrap_or(Path::new(""));
+            let first = files
+                .iter()
+                .map(|(file, _)| file.as_path())
+                .find(|file| !own(file))
+                .unwrap_or(Path::new(""));
             return Err(format!("{} is not nerf-sr's", place(first)));
         }
     };
@@ -90,7 +113,9 @@ fn owned(target: &Path, kind: &str) -> Result<(), String> {
         // A page whose file somebody took away is still ours.
         if target.join(&entry.path).exists() {
             let single = Manifest { files: vec![entry.clone()], ..manifest.clone() };
-            single.check_contents(target).map_err(|_| format!("{} was changed by somebody", place(Path::new(&entry.path))))?;
+            single.check_contents(target).map_err(|_| {
+                format!("{} was changed by somebody", place(Path::new(&entry.path)))
+            })?;
         }
     }
     Ok(())
@@ -142,7 +167,8 @@ mod tests {
         fs::create_dir_all(folder.join("views")).unwrap();
         fs::write(folder.join("index.html"), text).unwrap();
         fs::write(folder.join("views/a.png"), "png").unwrap();
-        write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap()).unwrap();
+        write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap())
+            .unwrap();
         fs::write(folder.join(MARK), text).unwrap();
         folder
     }
@@ -162,7 +188,11 @@ mod tests {
         fs::remove_file(target.join("views/a.png")).unwrap();
         published(dir.path(), "two").unwrap();
         assert!(target.join("views/a.png").exists());
-        assert_eq!(fs::read_dir(dir.path().join("out")).unwrap().count(), 1, "nothing is left beside");
+        assert_eq!(
+            fs::read_dir(dir.path().join("out")).unwrap().count(),
+            1,
+            "nothing is left beside"
+        );
         let empty = dir.path().join("out/report");
         remove(&empty).unwrap();
         fs::create_dir(&empty).unwrap();
@@ -174,9 +204,15 @@ mod tests {
     fn what_is_not_ours_is_not_replaced() {
         type Damage = fn(&Path);
         let cases: [(&str, Damage); 8] = [
-            ("report/notes.txt is not nerf-sr's", |t| fs::write(t.join("notes.txt"), "precious").unwrap()),
-            ("report/views/mine.png is not nerf-sr's", |t| fs::write(t.join("views/mine.png"), "precious").unwrap()),
-            ("report/index.html was changed", |t| fs::write(t.join("index.html"), "my own words").unwrap()),
+            ("report/notes.txt is not nerf-sr's", |t| {
+                fs::write(t.join("notes.txt"), "precious").unwrap()
+            }),
+            ("report/views/mine.png is not nerf-sr's", |t| {
+                fs::write(t.join("views/mine.png"), "precious").unwrap()
+            }),
+            ("report/index.html was changed", |t| {
+                fs::write(t.join("index.html"), "my own words").unwrap()
+            }),
             ("index.html is not nerf-sr's", |t| fs::remove_file(t.join(MANIFEST_FILE)).unwrap()),
             ("index.html is not nerf-sr's", |t| fs::write(t.join(MANIFEST_FILE), "{}").unwrap()),
             ("index.html is not nerf-sr's", |t| {

@@ -11,13 +11,17 @@ pub(crate) struct Remedy {
 impl Remedy {
     /// `arguments` are targets, values and files as given.
     pub(crate) fn new(arguments: Vec<String>) -> Self {
-        let program = std::env::args_os().next().map_or_else(|| "nerf-sr".to_owned(), |p| p.to_string_lossy().into_owned());
+        let program = std::env::args_os()
+            .next()
+            .map_or_else(|| "nerf-sr".to_owned(), |p| p.to_string_lossy().into_owned());
         Self { program, arguments }
     }
 
     /// The command that prints the log of a stage of this run.
     pub(crate) fn log(&self, stage: &str) -> String {
-        let words = [self.program.as_str(), "log", stage].into_iter().chain(self.arguments.iter().map(String::as_str));
+        let words = [self.program.as_str(), "log", stage]
+            .into_iter()
+            .chain(self.arguments.iter().map(String::as_str));
         words.map(quoted).collect::<Vec<_>>().join(" ")
     }
 
@@ -57,9 +61,19 @@ mod tests {
 
     #[test]
     fn the_command_is_whole() {
-        let remedy = Remedy { program: "nerf-sr".to_owned(), arguments: vec!["-p".to_owned(), "x=a b".to_owned()] };
+        let remedy = Remedy {
+            program: "nerf-sr".to_owned(),
+            arguments: vec!["-p".to_owned(), "x=a b".to_owned()],
+        };
         let said = [0, 1].map(|skipped| remedy.after_failure("prep [x=a b]", "prep", skipped));
-        assert_eq!(said[0], "nerf-sr: prep [x=a b] failed; `nerf-sr log prep -p 'x=a b'` has all it said");
-        assert_eq!(said[1], "nerf-sr: prep [x=a b] failed; 1 stage was not run; `nerf-sr log prep -p 'x=a b'` has all it said");
+        assert_eq!(
+            said[0],
+            "nerf-sr: prep [x=a b] failed; `nerf-sr log prep -p 'x=a b'` has all it said"
+        );
+        assert_eq!(
+            said[1],
+            "nerf-sr: prep [x=a b] failed; 1 stage was not run; `nerf-sr log prep -p 'x=a b'` has \
+            all it said"
+        );
     }
 }

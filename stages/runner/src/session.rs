@@ -17,15 +17,21 @@ pub(crate) struct Session {
 }
 
 impl Session {
-    pub(crate) fn open(pipeline: &Path, store: Option<&Path>, devices: Devices) -> anyhow::Result<Self> {
+    pub(crate) fn open(
+        pipeline: &Path,
+        store: Option<&Path>,
+        devices: Devices,
+    ) -> anyhow::Result<Self> {
         check_device(&devices.given).map_err(PlanError::Usage)?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
         let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
-        std::fs::create_dir_all(&root)
-            .with_context(|| format!("cannot open the store {}; name another with --store", root.display()))?;
+        std::fs::create_dir_all(&root).with_context(|| {
+            format!("cannot open the store {}; name another with --store", root.display())
+        })?;
         // Stages get absolute paths, whatever folder they run in.
         let root = root.canonicalize().with_context(|| root.display().to_string())?;
-        let store = Store::open(&root).context("cannot open the store; name another with --store")?;
+        let store =
+            Store::open(&root).context("cannot open the store; name another with --store")?;
         Ok(Self { pipeline, store, devices })
     }
 
@@ -47,7 +53,8 @@ impl Session {
         Ok(plan)
     }
 
-    /// The queued or running job of each node, where there is one, and how many there are besides. Slurm is asked once, and only where this store has had jobs.
+    /// The queued or running job of each node, where there is one, and how many there are besides.
+    /// Slurm is asked once, and only where this store has had jobs.
     pub(crate) fn jobs(&self, plan: &Plan) -> (Vec<Option<Job>>, usize) {
         let queue = Queue::look(&Slurm::default(), self.store.root()).unwrap_or_else(|error| {
             report_text(&format!("nerf-sr: whether jobs are queued isn't known: {error}"));
@@ -57,7 +64,8 @@ impl Session {
             return (Vec::new(), 0);
         }
         let identities = identities(plan, &self.store).unwrap_or_default();
-        let jobs: Vec<Option<Job>> = identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
+        let jobs: Vec<Option<Job>> =
+            identities.iter().map(|identity| queue.job_of(identity).cloned()).collect();
         let besides = queue.jobs.len().saturating_sub(jobs.iter().flatten().count());
         (jobs, besides)
     }
@@ -74,13 +82,19 @@ pub(crate) fn command_line() -> Vec<String> {
 
 /// The nodes of a stage, by the stage's name.
 pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError> {
-    let found: Vec<usize> = (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
+    let found: Vec<usize> =
+        (0..plan.nodes.len()).filter(|&i| plan.nodes[i].stage == stage).collect();
     if found.is_empty() {
         if plan.sinks.iter().any(|sink| sink.stage == stage) {
-            return Err(PlanError::Usage(format!("{stage} is a sink: each run shows by it what it made; nothing of it is kept")));
+            return Err(PlanError::Usage(format!(
+                "{stage} is a sink: each run shows by it what it made; nothing of it is kept"
+            )));
         }
         let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
-        return Err(PlanError::Usage(format!("no stage {stage:?} in this plan; {}", known_blocks(stage, known))));
+        return Err(PlanError::Usage(format!(
+            "no stage {stage:?} in this plan; {}",
+            known_blocks(stage, known)
+        )));
     }
     Ok(found)
 }

@@ -1,25 +1,36 @@
-//! Sinks show a run: they get its record and write a folder beside pipeline.yaml. They are never cached, but a sink that has
-//! shown this very record already isn't called again.
+//! Sinks show a run: they get its record and write a folder beside pipeline.yaml. They are never
+//! cached, but a sink that has shown this very record already isn't called again.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json, write_json};
+use artifact::{
+    FailedPoint, MANIFEST_FILE, Manifest, Record, RunFile, RunNode, RunRecord, Store, hash_json,
+    write_json,
+};
 use planning::{Plan, Sink};
 use serde_json::{Map, json};
 use stage_call::{Call, Display, StageFailure};
 
 use crate::publish;
 
-/// The record of the nodes that a sink shows and all they were made of; none where some of that isn't there, unless the sink shows what there
-/// is. Nothing of an artifact is read for it, so the values that scenes decide are missing ([`resolve`]).
-fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> Option<RunRecord> {
+/// The record of the nodes that a sink shows and all they were made of; none where some of that
+/// isn't there, unless the sink shows what there is. Nothing of an artifact is read for it, so the
+/// values that scenes decide are missing ([`resolve`]).
+fn record(
+    plan: &Plan,
+    sink: &Sink,
+    records: &[Option<Record>],
+    store: &Store,
+    out: &Path,
+) -> Option<RunRecord> {
     let mut is_whole: Vec<bool> = Vec::with_capacity(plan.nodes.len());
     for (node, record) in plan.nodes.iter().zip(records) {
         is_whole.push(record.is_some() && node.parents().all(|parent| is_whole[parent]));
     }
-    let (shown, missing): (Vec<usize>, Vec<usize>) = sink.shows.iter().partition(|&&index| is_whole[index]);
+    let (shown, missing): (Vec<usize>, Vec<usize>) =
+        sink.shows.iter().partition(|&&index| is_whole[index]);
     if !missing.is_empty() && !sink.program.description.partial {
         return None;
     }
@@ -65,26 +76,40 @@ fn record(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, o
     let left_out = sink.left_out.iter().filter(|_| sink.program.description.partial).cloned();
     let failed = failed.chain(left_out).collect();
     // A name that isn't UTF-8 has no place in JSON; without it a table has no commit.
-    let home = std::path::absolute(out).ok().filter(|home| home.to_str().is_some()).unwrap_or_default();
+    let home =
+        std::path::absolute(out).ok().filter(|home| home.to_str().is_some()).unwrap_or_default();
     Some(RunRecord { home, nodes, failed })
 }
 
 /// Adds the values that scenes decide, from the artifacts.
 fn resolve(record: RunRecord, plan: &Plan) -> RunRecord {
     let of_node = |node: RunNode| {
-        let planned = plan.nodes.iter().find(|planned| planned.stage == node.stage && planned.point == node.point);
-        RunNode { resolved: planned.map(|planned| planned.by_scene(&node.folder)).unwrap_or_default(), ..node }
+        let planned = plan
+            .nodes
+            .iter()
+            .find(|planned| planned.stage == node.stage && planned.point == node.point);
+        RunNode {
+            resolved: planned.map(|planned| planned.by_scene(&node.folder)).unwrap_or_default(),
+            ..node
+        }
     };
     RunRecord { nodes: record.nodes.into_iter().map(of_node).collect(), ..record }
 }
 
 /// By what a page is known to show a record: what scenes decide follows from the rest.
 fn identity(sink: &Sink, record: &RunRecord) -> String {
-    hash_json(&json!({"record": record, "code": sink.program.description.code, "parameters": sink.parameters}))
+    hash_json(&json!({"record": record, "code": sink.program.description.code,
+            "parameters": sink.parameters}))
 }
 
 /// Whether a sink's page shows these records already.
-pub(crate) fn is_shown(plan: &Plan, sink: &Sink, records: &[Option<Record>], store: &Store, out: &Path) -> bool {
+pub(crate) fn is_shown(
+    plan: &Plan,
+    sink: &Sink,
+    records: &[Option<Record>],
+    store: &Store,
+    out: &Path,
+) -> bool {
     let record = record(plan, sink, records, store, out);
     record.is_some_and(|record| publish::shows(&out.join(&sink.stage), &identity(sink, &record)))
 }
@@ -111,9 +136,16 @@ pub(crate) struct Showing<'a> {
 }
 
 /// Calls a sink; it writes `out/STAGE`.
-pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>]) -> Result<Shown, StageFailure> {
+pub(crate) fn show(
+    showing: &Showing<'_>,
+    sink: &Sink,
+    records: &[Option<Record>],
+) -> Result<Shown, StageFailure> {
     let Showing { plan, store, run, out, threads, stop } = *showing;
-    let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure { code: 1, message: format!("{}: {e}", path.display()) };
+    let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure {
+        code: 1,
+        message: format!("{}: {e}", path.display()),
+    };
     let Some(record) = record(plan, sink, records, store, out) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
     let identity = identity(sink, &record);
@@ -122,7 +154,8 @@ pub(crate) fn show(showing: &Showing<'_>, sink: &Sink, records: &[Option<Record>
     }
     let record = resolve(record, plan);
     let scratch = store.scratch(run.id()).join(&sink.stage);
-    let (folder, params, output) = (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
+    let (folder, params, output) =
+        (scratch.join("run"), scratch.join("params.json"), scratch.join("output"));
     std::fs::create_dir_all(&folder)
         .and_then(|()| write_json(&folder.join("run.json"), &record))
         .and_then(|()| write_json(&params, &sink.parameters))

@@ -8,7 +8,8 @@ use stage_call::{StageFailure, seconds};
 
 /// Between two attempts.
 const PAUSE: Duration = Duration::from_millis(20);
-/// So long nothing is said: most waits are over by then. Each later word comes after twice the time.
+/// So long nothing is said: most waits are over by then. Each later word comes after twice the
+/// time.
 const PATIENCE: Duration = Duration::from_secs(1);
 
 /// Attempts until it is held. `say` is told by whom it is held, and since when it is waited for.
@@ -23,7 +24,10 @@ pub(crate) fn until_held<T>(
             Locked::Held(held) => return Ok(held),
             Locked::By(holder) => {
                 if stop.load(Ordering::Relaxed) {
-                    return Err(StageFailure { code: 130, message: "interrupted while it waited".to_owned() });
+                    return Err(StageFailure {
+                        code: 130,
+                        message: "interrupted while it waited".to_owned(),
+                    });
                 }
                 if since.elapsed() >= next {
                     say(holder.as_ref(), since.elapsed());
@@ -36,9 +40,17 @@ pub(crate) fn until_held<T>(
 }
 
 /// Enters the store; waits while garbage is collected.
-pub(crate) fn enter(store: &Store, stop: &AtomicBool, say: &dyn Fn(&str)) -> Result<Entered, StageFailure> {
+pub(crate) fn enter(
+    store: &Store,
+    stop: &AtomicBool,
+    say: &dyn Fn(&str),
+) -> Result<Entered, StageFailure> {
     let words = |holder: Option<&Holder>, waited: Duration| {
-        say(&format!("waits for garbage collection{}, for {} now", by(holder), seconds(waited.as_secs_f64())));
+        say(&format!(
+            "waits for garbage collection{}, for {} now",
+            by(holder),
+            seconds(waited.as_secs_f64())
+        ));
     };
     until_held(stop, &words, || store.try_enter())
 }
@@ -47,7 +59,9 @@ pub(crate) fn enter(store: &Store, stop: &AtomicBool, say: &dyn Fn(&str)) -> Res
 pub(crate) fn enter_at_once(store: &Store) -> anyhow::Result<Entered> {
     match store.try_enter()? {
         Locked::Held(entered) => Ok(entered),
-        Locked::By(_) => Err(anyhow::anyhow!("garbage is being collected just now; try again when that is done")),
+        Locked::By(_) => {
+            Err(anyhow::anyhow!("garbage is being collected just now; try again when that is done"))
+        }
     }
 }
 
@@ -58,7 +72,8 @@ pub(crate) fn by(holder: Option<&Holder>) -> String {
         return format!(" by process {} on {}", holder.pid, holder.host);
     }
     let pid = i32::try_from(holder.pid).ok().and_then(rustix::process::Pid::from_raw);
-    let lives = pid.is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH));
+    let lives = pid
+        .is_some_and(|pid| rustix::process::test_kill_process(pid) != Err(rustix::io::Errno::SRCH));
     if lives {
         format!(" by process {}", holder.pid)
     } else {
@@ -91,7 +106,10 @@ mod tests {
     #[test]
     fn holders_are_told_by_machine_and_life() {
         let holder = Holder::this_process();
-        assert_eq!(by(Some(&Holder { host: "far".into(), ..holder.clone() })), format!(" by process {} on far", holder.pid));
+        assert_eq!(
+            by(Some(&Holder { host: "far".into(), ..holder.clone() })),
+            format!(" by process {} on far", holder.pid)
+        );
         let gone = by(Some(&Holder { pid: 0x7fff_fff0, ..holder }));
         assert!(gone.ends_with("which has ended"), "{gone}");
         assert_eq!(by(None), "");

@@ -23,10 +23,15 @@ impl Shape<'_> {
     pub(crate) fn table(&self, rows: &[Row], is_part: bool) -> String {
         let params = self.params;
         let columns = distinct(rows, &params.columns);
-        let further = params.further.iter().filter(|row| !is_part || row.contains_key(&params.each));
+        let further =
+            params.further.iter().filter(|row| !is_part || row.contains_key(&params.each));
         let further: Vec<Row> = further.filter(|row| self.belongs(row, rows)).cloned().collect();
         let all = [rows, &further[..]].concat();
-        let values: Vec<&String> = params.values.iter().filter(|name| all.iter().any(|row| row.contains_key(*name))).collect();
+        let values: Vec<&String> = params
+            .values
+            .iter()
+            .filter(|name| all.iter().any(|row| row.contains_key(*name)))
+            .collect();
         let mut lines = vec![self.head(&columns, &values)];
         for line in distinct(rows, &self.keys) {
             lines.push(self.line(rows, rows, &line, (&columns, &values)));
@@ -41,7 +46,11 @@ impl Shape<'_> {
     fn head(&self, columns: &[Vec<String>], values: &[&String]) -> Vec<String> {
         let mut head = self.keys.clone();
         match self.params.columns.is_empty() {
-            false => head.extend(columns.iter().map(|column| format!("{} ({})", column.join(", "), titles(values).join(" / ")))),
+            false => {
+                head.extend(columns.iter().map(|column| {
+                    format!("{} ({})", column.join(", "), titles(values).join(" / "))
+                }))
+            }
             true => head.extend(titles(values)),
         }
         head.extend(self.first.is_some().then(|| "against the first".to_owned()));
@@ -62,13 +71,19 @@ impl Shape<'_> {
         let mut line = keys.to_vec();
         for column in columns {
             let here = of(&mine, &self.params.columns, column);
-            let cells: Vec<String> =
-                values.iter().map(|name| marked(name, mean(&here, name), self.best(&rivals, column, name))).collect();
+            let cells: Vec<String> = values
+                .iter()
+                .map(|name| marked(name, mean(&here, name), self.best(&rivals, column, name)))
+                .collect();
             match (self.params.columns.is_empty(), reason(&here)) {
                 (false, Some(reason)) => line.push(reason),
-                (false, None) if cells.iter().all(|cell| cell == NOTHING) => line.push(NOTHING.to_owned()),
+                (false, None) if cells.iter().all(|cell| cell == NOTHING) => {
+                    line.push(NOTHING.to_owned())
+                }
                 (false, None) => line.push(cells.join(" / ")),
-                (true, Some(reason)) => line.extend(std::iter::once(reason).chain(cells.into_iter().skip(1))),
+                (true, Some(reason)) => {
+                    line.extend(std::iter::once(reason).chain(cells.into_iter().skip(1)))
+                }
                 (true, None) => line.extend(cells),
             }
         }
@@ -76,7 +91,11 @@ impl Shape<'_> {
             let gain = mean(&mine, self.params.compared()).map(|value| value - first);
             line.push(gain.map_or(NOTHING.to_owned(), |gain| format!("{gain:+.2}")));
         }
-        line.extend(PLACES.map(|name| Some(together(&mine, name)).filter(|text| !text.is_empty()).unwrap_or(NOTHING.to_owned())));
+        line.extend(PLACES.map(|name| {
+            Some(together(&mine, name))
+                .filter(|text| !text.is_empty())
+                .unwrap_or(NOTHING.to_owned())
+        }));
         line
     }
 
@@ -84,19 +103,29 @@ impl Shape<'_> {
     fn rivals(&self, rows: &[Row], mine: &[Row]) -> Vec<Row> {
         let by = &self.params.grouped_by;
         let group = mine.first().and_then(|row| row.get(by));
-        rows.iter().filter(|row| row.get(by) == group && !row.contains_key(MISSING)).cloned().collect()
+        rows.iter()
+            .filter(|row| row.get(by) == group && !row.contains_key(MISSING))
+            .cloned()
+            .collect()
     }
 
     /// The best mean of a value in a column, where there are several.
     fn best(&self, rivals: &[Row], column: &[String], name: &str) -> Option<f64> {
         let lines = distinct(rivals, &self.keys);
-        let means = lines.iter().filter_map(|keys| mean(&of(&of(rivals, &self.keys, keys), &self.params.columns, column), name));
-        means.reduce(if is_less_better(name) { f64::min } else { f64::max }).filter(|_| lines.len() > 1)
+        let means = lines.iter().filter_map(|keys| {
+            mean(&of(&of(rivals, &self.keys, keys), &self.params.columns, column), name)
+        });
+        means
+            .reduce(if is_less_better(name) { f64::min } else { f64::max })
+            .filter(|_| lines.len() > 1)
     }
 
-    /// Whether results have the keys of a row from elsewhere: one of their columns, and in all else what all of them have.
+    /// Whether results have the keys of a row from elsewhere: one of their columns, and in all else
+    /// what all of them have.
     fn belongs(&self, further: &Row, rows: &[Row]) -> bool {
-        let is_key = |name: &String, value: &Value| value.is_string() && name != "method" && *name != self.params.grouped_by;
+        let is_key = |name: &String, value: &Value| {
+            value.is_string() && name != "method" && *name != self.params.grouped_by
+        };
         further.iter().filter(|(name, value)| is_key(name, value)).all(|(name, value)| {
             let theirs = distinct(rows, std::slice::from_ref(name)).concat();
             let is_column = self.params.columns.contains(name) || self.params.rows.contains(name);
@@ -124,8 +153,12 @@ fn marked(name: &str, value: Option<f64>, best: Option<f64>) -> String {
 
 /// Lines as a Markdown table; the first is its head.
 pub(crate) fn grid(lines: &[Vec<String>]) -> String {
-    let line =
-        |cells: &[String]| format!("| {} |\n", cells.iter().map(|cell| cell.replace('|', "\\|")).collect::<Vec<_>>().join(" | "));
+    let line = |cells: &[String]| {
+        format!(
+            "| {} |\n",
+            cells.iter().map(|cell| cell.replace('|', "\\|")).collect::<Vec<_>>().join(" | ")
+        )
+    };
     let rule = vec!["---".to_owned(); lines[0].len()];
     [&lines[0], &rule].into_iter().chain(&lines[1..]).map(|cells| line(cells)).collect()
 }

@@ -6,7 +6,8 @@
 //! * `grid`: one of them, means where several results fall into one cell, the best marked.
 //! * `values`: values by their names, and how they are shown.
 //!
-//! A sink: it gets the run's record and is never cached. What a failed point would have shown is named; what was left out says why.
+//! A sink: it gets the run's record and is never cached. What a failed point would have shown is
+//! named; what was left out says why.
 
 mod grid;
 mod markdown;
@@ -29,16 +30,19 @@ pub use rows::Row;
 pub struct Params {
     /// Heading of the table.
     pub title: String,
-    /// Keys that make a row: axes of the run (`scene`, `protocol`, `variant`, a swept parameter), or `method` for the block that was scored. Results that
-    /// differ in other keys alone are averaged. Default: all keys that differ, except `scene`.
+    /// Keys that make a row: axes of the run (`scene`, `protocol`, `variant`, a swept parameter),
+    /// or `method` for the block that was scored. Results that differ in other keys alone are
+    /// averaged. Default: all keys that differ, except `scene`.
     #[schemars(extend("x-default" = "all keys that differ, except `scene`"))]
     pub rows: Vec<String>,
     /// Keys that make a column each, with all values in one cell.
     #[schemars(extend("x-default" = "a column for each value"))]
     pub columns: Vec<String>,
-    /// Values to show, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, and all others that `rows.json` has.
+    /// Values to show, in this order: `psnr`, `ssim`, `lpips`, `train_s`, `render_s`, and all
+    /// others that `rows.json` has.
     pub values: Vec<String>,
-    /// The row that others are compared with, by its keys. A further column has the first of `values` minus that row's.
+    /// The row that others are compared with, by its keys. A further column has the first of
+    /// `values` minus that row's.
     #[schemars(extend("x-default" = "no comparison"))]
     pub relative_to: BTreeMap<String, String>,
     /// Values whose mean, standard deviation, least and greatest are stated over all results.
@@ -47,25 +51,27 @@ pub struct Params {
     /// Names of methods, by the block that was scored: `{eval: rendered, eval-refined: refined}`.
     #[schemars(extend("x-default" = "the blocks' names"))]
     pub methods: BTreeMap<String, String>,
-    /// Further entries of rows for programs, by the block that was scored: `{eval: {refined: false}}`. `"{variant}"` is the
-    /// value of that key.
+    /// Further entries of rows for programs, by the block that was scored: `{eval: {refined:
+    /// false}}`. `"{variant}"` is the value of that key.
     #[schemars(extend("x-default" = "none"))]
     pub fields: BTreeMap<String, Map<String, Value>>,
-    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images, methods: [eval]}]`, the
-    /// methods by the block that was scored. A column names the group, and the best is marked in each.
+    /// Groups of methods that may be compared, in the order of the table: `[{name: LR images,
+    /// methods: [eval]}]`, the methods by the block that was scored. A column names the group, and
+    /// the best is marked in each.
     #[schemars(extend("x-default" = "one group of all"))]
     pub groups: Vec<Group>,
     /// Heading of the groups' column, and their key.
     pub grouped_by: String,
-    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr: 29.77}]`. Such a row
-    /// stands where the results have its keys, and is never the best.
+    /// Rows from elsewhere, for comparison: `[{method: "paper: SS", protocol: 100x2, psnr:
+    /// 29.77}]`. Such a row stands where the results have its keys, and is never the best.
     #[schemars(extend("x-default" = "none"))]
     pub further: Vec<Row>,
-    /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over: eval-nerf}]`. Methods are
-    /// blocks, or those of `further`.
+    /// Differences in PSNR between methods: `[{name: at equal rays, of: eval-ss, over:
+    /// eval-nerf}]`. Methods are blocks, or those of `further`.
     #[schemars(extend("x-default" = "none"))]
     pub gains: Vec<Gain>,
-    /// A key; each of its values has a table of its own, too, where there are several. Of `further`, it has the rows with this key.
+    /// A key; each of its values has a table of its own, too, where there are several. Of
+    /// `further`, it has the rows with this key.
     #[schemars(extend("x-default" = "one table of all"))]
     pub each: String,
     /// Remarks below the table.
@@ -135,7 +141,10 @@ impl Stage for Table {
     const PARTIAL: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("run", Input::required(&["run"], "folder with run.json: the record of what was scored"))]
+        vec![(
+            "run",
+            Input::required(&["run"], "folder with run.json: the record of what was scored"),
+        )]
     }
 
     fn output() -> Output {

@@ -8,12 +8,20 @@ use crate::values::{distinct, mean, of, shown, titles};
 use crate::{Params, Row};
 
 /// The tables, and the points that failed.
-pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) -> Result<String, String> {
+pub(crate) fn markdown(
+    params: &Params,
+    rows: &[Row],
+    failed: &[FailedPoint],
+) -> Result<String, String> {
     let shape = Shape { params, keys: row_keys(params, rows)?, first: reference(params, rows)? };
     let each = std::slice::from_ref(&params.each);
     let parts = if params.each.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
     let parts = if parts.len() > 1 { parts } else { Vec::new() };
-    let mean = if parts.is_empty() { String::new() } else { format!("Means over {}:\n\n", parts.join(", ")) };
+    let mean = if parts.is_empty() {
+        String::new()
+    } else {
+        format!("Means over {}:\n\n", parts.join(", "))
+    };
     let mut text = format!("# {}\n\n{mean}{}", params.title, shape.table(rows, false));
     for part in parts {
         let mine = of(rows, each, std::slice::from_ref(&part));
@@ -24,7 +32,9 @@ pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) ->
     let failed: Vec<&FailedPoint> = failed.iter().filter(|point| point.reason.is_none()).collect();
     if !failed.is_empty() {
         text += "\nFailed, or waiting for what failed:\n\n";
-        failed.iter().for_each(|point| text += &format!("* {}\n", label(&point.stage, &point.point)));
+        failed
+            .iter()
+            .for_each(|point| text += &format!("* {}\n", label(&point.stage, &point.point)));
     }
     if !params.notes.is_empty() {
         text += "\n";
@@ -37,23 +47,36 @@ pub(crate) fn markdown(params: &Params, rows: &[Row], failed: &[FailedPoint]) ->
 fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
     let mut known: Vec<&String> = Vec::new();
     let is_key = |name: &str| ![&PLACES[..], &[MISSING]].concat().contains(&name);
-    for (name, _) in rows.iter().flatten().filter(|(name, value)| value.is_string() && is_key(name)) {
+    for (name, _) in rows.iter().flatten().filter(|(name, value)| value.is_string() && is_key(name))
+    {
         if !known.contains(&name) {
             known.push(name);
         }
     }
     let each = Some(&params.each).filter(|key| !key.is_empty());
     let asked = [("rows", &params.rows), ("columns", &params.columns)];
-    let asked = asked.into_iter().flat_map(|(parameter, names)| names.iter().map(move |name| (parameter, name)));
+    let asked = asked
+        .into_iter()
+        .flat_map(|(parameter, names)| names.iter().map(move |name| (parameter, name)));
     let mut asked = asked.chain(each.map(|name| ("each", name)));
-    if let Some((parameter, name)) = asked.find(|(_, name)| !rows.is_empty() && !rows.iter().any(|row| row.contains_key(*name))) {
+    if let Some((parameter, name)) =
+        asked.find(|(_, name)| !rows.is_empty() && !rows.iter().any(|row| row.contains_key(*name)))
+    {
         let known = artifact::known_names(name, known.into_iter().map(String::as_str));
         return Err(format!("parameter {parameter}: no result has a key {name:?}; {known}"));
     }
     let differs = |name: &String| distinct(rows, std::slice::from_ref(name)).len() > 1;
-    let is_row = |name: &&String| *name != "scene" && !params.columns.contains(name) && differs(name);
-    let mut keys = if params.rows.is_empty() { known.into_iter().filter(is_row).cloned().collect() } else { params.rows.clone() };
-    if !params.groups.is_empty() && !keys.contains(&params.grouped_by) && !params.columns.contains(&params.grouped_by) {
+    let is_row =
+        |name: &&String| *name != "scene" && !params.columns.contains(name) && differs(name);
+    let mut keys = if params.rows.is_empty() {
+        known.into_iter().filter(is_row).cloned().collect()
+    } else {
+        params.rows.clone()
+    };
+    if !params.groups.is_empty()
+        && !keys.contains(&params.grouped_by)
+        && !params.columns.contains(&params.grouped_by)
+    {
         keys.push(params.grouped_by.clone());
     }
     Ok(keys)
@@ -76,23 +99,32 @@ fn gains(params: &Params, rows: &[Row]) -> String {
     let columns = distinct(rows, &params.columns);
     let all = [rows, &params.further[..]].concat();
     let psnr = |method: &String, column: &Vec<String>| {
-        let mine = of(&all, &["method".to_owned()], &[params.methods.get(method).unwrap_or(method).clone()]);
+        let mine = of(
+            &all,
+            &["method".to_owned()],
+            &[params.methods.get(method).unwrap_or(method).clone()],
+        );
         mean(&of(&mine, &params.columns, column), "psnr")
     };
     let lines = params.gains.iter().map(|gain| {
-        let cells = columns.iter().map(|column| Some(psnr(&gain.of, column)? - psnr(&gain.over, column)?));
+        let cells =
+            columns.iter().map(|column| Some(psnr(&gain.of, column)? - psnr(&gain.over, column)?));
         (&gain.name, cells.collect::<Vec<Option<f64>>>())
     });
     let lines: Vec<_> = lines.filter(|(_, cells)| cells.iter().any(Option::is_some)).collect();
     if lines.is_empty() {
         return String::new();
     }
-    let titles = columns.iter().map(|column| if column.is_empty() { "all".to_owned() } else { column.join(", ") });
+    let titles = columns
+        .iter()
+        .map(|column| if column.is_empty() { "all".to_owned() } else { column.join(", ") });
     let head: Vec<String> = std::iter::once("gain".to_owned()).chain(titles).collect();
     let cell = |gain: Option<f64>| gain.map_or(NOTHING.to_owned(), |gain| format!("{gain:+.2}"));
-    let line =
-        |(name, cells): (&String, Vec<Option<f64>>)| std::iter::once(name.clone()).chain(cells.into_iter().map(cell)).collect();
-    let lines: Vec<Vec<String>> = std::iter::once(head).chain(lines.into_iter().map(line)).collect();
+    let line = |(name, cells): (&String, Vec<Option<f64>>)| {
+        std::iter::once(name.clone()).chain(cells.into_iter().map(cell)).collect()
+    };
+    let lines: Vec<Vec<String>> =
+        std::iter::once(head).chain(lines.into_iter().map(line)).collect();
     format!("\n## Gain, PSNR in dB\n\n{}", grid(&lines))
 }
 
@@ -102,10 +134,14 @@ fn spread(rows: &[Row], name: &str) -> Option<String> {
     let mean = mean(rows, name)?;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     let deviation = (squares / values.len().saturating_sub(1).max(1) as f64).sqrt();
-    let [least, most] = [f64::min, f64::max].map(|pick| values.iter().copied().reduce(pick).unwrap_or(mean));
+    let [least, most] =
+        [f64::min, f64::max].map(|pick| values.iter().copied().reduce(pick).unwrap_or(mean));
     let title = titles(&[&name.to_owned()]).concat();
     let [mean, least, most] = [mean, least, most].map(|value| shown(name, value));
-    Some(format!("\n{title} over {} results: {mean} ± {deviation:.2}, from {least} to {most}\n", values.len()))
+    Some(format!(
+        "\n{title} over {} results: {mean} ± {deviation:.2}, from {least} to {most}\n",
+        values.len()
+    ))
 }
 
 #[cfg(test)]

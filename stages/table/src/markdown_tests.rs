@@ -6,8 +6,14 @@ use serde_json::json;
 use std::collections::BTreeMap;
 
 fn rows() -> Vec<Row> {
-    let row = |scene: &str, variant: &str, protocol: &str, psnr: f64, lpips: Option<f64>, train_s: f64| {
-        let mut row = json!({"scene": scene, "variant": variant, "protocol": protocol, "method": "eval", "psnr": psnr, "train_s": train_s,
+    let row = |scene: &str,
+               variant: &str,
+               protocol: &str,
+               psnr: f64,
+               lpips: Option<f64>,
+               train_s: f64| {
+        let mut row = json!({"scene": scene, "variant": variant, "protocol": protocol,
+            "method": "eval", "psnr": psnr, "train_s": train_s,
             "commit": "abc1234", "machine": "2 cores"});
         lpips.iter().for_each(|value| row["lpips"] = json!(value));
         row.as_object().cloned().unwrap()
@@ -43,7 +49,11 @@ fn columns_hold_all_values_of_a_key() {
         values: vec!["psnr".to_owned(), "lpips".to_owned()],
         ..Params::default()
     };
-    let failed = [FailedPoint { stage: "eval".to_owned(), point: "scene=ship".to_owned(), ..FailedPoint::default() }];
+    let failed = [FailedPoint {
+        stage: "eval".to_owned(),
+        point: "scene=ship".to_owned(),
+        ..FailedPoint::default()
+    }];
     let expected = "\
 # Results
 
@@ -65,13 +75,21 @@ fn keys_that_no_result_has_are_refused() {
         (
             vec!["varant"],
             vec![],
-            "parameter rows: no result has a key \"varant\"; did you mean variant? known: method, protocol, scene, variant",
+            "parameter rows: no result has a key \"varant\"; did you mean variant? known: method, \
+            protocol, scene, variant",
         ),
-        (vec![], vec![("variant", "nothing")], "parameter relative_to: no result has {\"variant\": \"nothing\"}"),
+        (
+            vec![],
+            vec![("variant", "nothing")],
+            "parameter relative_to: no result has {\"variant\": \"nothing\"}",
+        ),
     ] {
         let params = Params {
             rows: rows_by.into_iter().map(str::to_owned).collect(),
-            relative_to: relative_to.into_iter().map(|(k, v)| (k.to_owned(), v.to_owned())).collect(),
+            relative_to: relative_to
+                .into_iter()
+                .map(|(k, v)| (k.to_owned(), v.to_owned()))
+                .collect(),
             ..Params::default()
         };
         assert_eq!(markdown(&params, &rows(), &[]).unwrap_err(), words);
@@ -79,8 +97,12 @@ fn keys_that_no_result_has_are_refused() {
     let spread = Params { spread: vec!["psnr".to_owned()], ..Params::default() };
     let text = markdown(&spread, &rows(), &[]).unwrap();
     assert!(text.ends_with("\nPSNR over 4 results: 30.94 ± 1.39, from 29.50 to 32.25\n"), "{text}");
-    let nothing =
-        markdown(&Params::default(), &[], &[FailedPoint { stage: "eval".to_owned(), ..FailedPoint::default() }]).unwrap();
+    let nothing = markdown(
+        &Params::default(),
+        &[],
+        &[FailedPoint { stage: "eval".to_owned(), ..FailedPoint::default() }],
+    )
+    .unwrap();
     assert!(nothing.contains("* eval\n"), "{nothing}");
 }
 
@@ -92,11 +114,13 @@ fn params(text: serde_json::Value) -> Params {
 fn methods() -> Vec<Row> {
     let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| {
         let places = json!({"commit": "abc1234", "machine": "vm"});
-        let mut row = json!({"method": method, "has seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr});
+        let mut row = json!({"method": method, "has \
+            seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr});
         row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
         row
     };
-    let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
+    let missing = json!({"method": "liif", "has \
+        seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
     let rows = [
         row("nerf", "LR", "lego", "100x2", 30.0),
         row("nerf", "LR", "chair", "100x2", 32.0),
@@ -110,24 +134,34 @@ fn methods() -> Vec<Row> {
     rows.map(|row| row.as_object().cloned().unwrap()).into()
 }
 
-/// The best is marked among those that have seen the same; what is known from elsewhere competes with none.
+/// The best is marked among those that have seen the same; what is known from elsewhere competes
+/// with none.
 #[test]
 fn groups_further_rows_and_gains() {
     let params = Params {
-        groups: vec![Group { name: "LR".to_owned(), methods: vec!["nerf".to_owned(), "ss".to_owned()] }],
+        groups: vec![Group {
+            name: "LR".to_owned(),
+            methods: vec!["nerf".to_owned(), "ss".to_owned()],
+        }],
         gains: vec![
             Gain { name: "ours".to_owned(), of: "ss".to_owned(), over: "nerf".to_owned() },
-            Gain { name: "theirs".to_owned(), of: "paper: SS".to_owned(), over: "paper: NeRF".to_owned() },
+            Gain {
+                name: "theirs".to_owned(),
+                of: "paper: SS".to_owned(),
+                over: "paper: NeRF".to_owned(),
+            },
             Gain { name: "unknown".to_owned(), of: "ss".to_owned(), over: "liif".to_owned() },
         ],
         ..params(json!({
-            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has seen", "each": "scene",
+            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has \
+            seen", "each": "scene",
             "notes": ["One."],
             "further": [
                 {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},
                 {"method": "paper: SS", "protocol": "100x2", "psnr": 29.75},
                 {"method": "paper: SS", "protocol": "200x2", "psnr": 40},
-                {"method": "paper: SS, this scene", "scene": "chair", "protocol": "100x2", "psnr": 40},
+                {"method": "paper: SS, this \
+                    scene", "scene": "chair", "protocol": "100x2", "psnr": 40},
             ],
         }))
     };
@@ -174,26 +208,44 @@ Means over lego, chair:
     assert_eq!(markdown(&params, &methods(), &[]).unwrap(), expected);
     let unknown = Params { each: "scena".to_owned(), ..Params::default() };
     let problem = markdown(&unknown, &methods(), &[]).unwrap_err();
-    assert!(problem.starts_with("parameter each: no result has a key \"scena\"; did you mean scene?"), "{problem}");
+    assert!(
+        problem.starts_with("parameter each: no result has a key \"scena\"; did you mean scene?"),
+        "{problem}"
+    );
 }
 
 /// Methods stand in the order of their groups, and what was left out in its place.
 #[test]
 fn rows_follow_the_groups() {
     let node = |stage: &str| {
-        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true, "kind": "other", "key": "",
-            "output": "", "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 1.0, "threads": 1, "host": "vm"})
+        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true,
+            "kind": "other", "key": "",
+            "output": "", "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0,
+            "seconds": 1.0, "threads": 1, "host": "vm"})
     };
-    let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"}, "reason": "no liif"});
+    let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"},
+        "reason": "no liif"});
     let failed = json!({"stage": "eval-nerf", "point": ""});
     let nodes = ["eval", "eval-hr", "eval-ss"].map(node);
     let run = json!({"nodes": nodes, "failed": [failed, left_out]});
     let params = params(json!({"methods": {"eval-ss": "ours"}, "grouped_by": "seen",
-        "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]}, {"name": "HR", "methods": ["eval-hr"]}]}));
+        "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]},
+        {"name": "HR", "methods": ["eval-hr"]}]}));
     let rows = crate::rows::rows(&serde_json::from_value(run).unwrap(), &params).unwrap();
     let told: Vec<[&str; 3]> = rows
         .iter()
-        .map(|row| ["method", "seen", "missing"].map(|key| row.get(key).map_or("", |v| v.as_str().unwrap())))
+        .map(|row| {
+            ["method", "seen", "missing"]
+                .map(|key| row.get(key).map_or("", |v| v.as_str().unwrap()))
+        })
         .collect();
-    assert_eq!(told, [["ours", "LR", ""], ["eval-liif", "LR", "no liif"], ["eval-hr", "HR", ""], ["eval", "", ""]]);
+    assert_eq!(
+        told,
+        [
+            ["ours", "LR", ""],
+            ["eval-liif", "LR", "no liif"],
+            ["eval-hr", "HR", ""],
+            ["eval", "", ""]
+        ]
+    );
 }

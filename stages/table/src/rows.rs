@@ -14,10 +14,12 @@ pub(crate) const MISSING: &str = "missing";
 /// A result: its keys (axes of the run, `method`), then its values, by name.
 pub type Row = Map<String, Value>;
 
-/// A row for every result of a run, and for what was left out of it: in the order of the groups, and otherwise of the run.
+/// A row for every result of a run, and for what was left out of it: in the order of the groups,
+/// and otherwise of the run.
 pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>> {
     let commit = commit(&run.home);
-    let mut scored: Vec<(usize, &RunNode)> = run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
+    let mut scored: Vec<(usize, &RunNode)> =
+        run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
     // Blocks that come through fewer stages stand first: rendered views before refined ones.
     let depth_of = |stage: &str| {
         let of_stage = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
@@ -74,17 +76,25 @@ fn place(params: &Params, stage: &String) -> usize {
 
 /// What a view took to render, or where it was refined, to refine.
 fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
-    let [views, rendering, refining] = ["views", "render_s", "refine_s"].map(|name| row.get(name).and_then(Value::as_f64));
+    let [views, rendering, refining] =
+        ["views", "render_s", "refine_s"].map(|name| row.get(name).and_then(Value::as_f64));
     let seconds = refining.filter(|seconds| *seconds > 0.0).or(rendering)?;
     Some(("seconds_per_view".to_owned(), json!(seconds / views.filter(|views| *views > 0.0)?)))
 }
 
-/// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where it isn't under git.
+/// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where it
+/// isn't under git.
 fn commit(home: &Path) -> String {
-    let Some(folder) = home.ancestors().find(|folder| folder.is_dir()) else { return String::new() };
+    let Some(folder) = home.ancestors().find(|folder| folder.is_dir()) else {
+        return String::new();
+    };
     let describe = ["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"];
     let git = Command::new("git").arg("-C").arg(folder).args(describe).output();
-    let said = git.ok().filter(|output| output.status.success()).map(|output| output.stdout).unwrap_or_default();
+    let said = git
+        .ok()
+        .filter(|output| output.status.success())
+        .map(|output| output.stdout)
+        .unwrap_or_default();
     String::from_utf8_lossy(&said).trim().to_owned()
 }
 
@@ -94,7 +104,10 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
     if node.kind == "refiner" {
         let file = read(&node.folder.join("refiner.json"))?;
         numbers("", &file, &mut found);
-        let gain = file["refined_psnr"].as_f64().zip(file["rendered_psnr"].as_f64()).map(|(after, before)| after - before);
+        let gain = file["refined_psnr"]
+            .as_f64()
+            .zip(file["rendered_psnr"].as_f64())
+            .map(|(after, before)| after - before);
         found.extend(gain.map(|gain| ("gain".to_owned(), json!(gain))));
         return Ok(found);
     }
@@ -104,7 +117,11 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
     let file = read(&node.folder.join("metrics.json"))?;
     numbers("", &file["mean"], &mut found);
     let near = &file["near_references"];
-    for (name, value) in [("least_gain", &file["least_gain"]), ("near_psnr", &near["psnr"]), ("near_views", &near["views"])] {
+    for (name, value) in [
+        ("least_gain", &file["least_gain"]),
+        ("near_psnr", &near["psnr"]),
+        ("near_views", &near["views"]),
+    ] {
         numbers(name, value, &mut found);
     }
     found.insert("views".to_owned(), json!(file["views"].as_array().map_or(0, Vec::len)));
@@ -130,17 +147,22 @@ fn read(path: &Path) -> anyhow::Result<Value> {
     serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
 }
 
-/// Seconds of what a result came through. What fields and refiners were made of counts as training; other views count as rendering, and
-/// those of them that no field made directly as refining.
+/// Seconds of what a result came through. What fields and refiners were made of counts as training;
+/// other views count as rendering, and those of them that no field made directly as refining.
 fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let ancestors = run.ancestors(index);
     let is_trained = |node: &RunNode| ["field", "refiner"].contains(&node.kind.as_str());
-    let trained: Vec<usize> = ancestors.iter().copied().filter(|&i| is_trained(&run.nodes[i])).collect();
+    let trained: Vec<usize> =
+        ancestors.iter().copied().filter(|&i| is_trained(&run.nodes[i])).collect();
     let in_training: Vec<usize> = trained.iter().flat_map(|&i| run.ancestors(i)).collect();
     let is_views = |i: &usize| run.nodes[*i].kind == "views";
-    let training: Vec<usize> =
-        ancestors.iter().copied().filter(|i| in_training.contains(i) && (is_views(i) || trained.contains(i))).collect();
-    let rendering: Vec<usize> = ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
+    let training: Vec<usize> = ancestors
+        .iter()
+        .copied()
+        .filter(|i| in_training.contains(i) && (is_views(i) || trained.contains(i)))
+        .collect();
+    let rendering: Vec<usize> =
+        ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
     let by_field = |i: &usize| {
         let mut parents = run.nodes[*i].inputs.values().filter_map(|input| input.node);
         parents.any(|parent| run.nodes[parent].kind == "field")
@@ -148,7 +170,8 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
     let refining: Vec<usize> = rendering.iter().copied().filter(|i| !by_field(i)).collect();
     let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0; // of nothing it is -0
     let mut row = Row::new();
-    for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)] {
+    for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)]
+    {
         row.insert(name.to_owned(), json!(seconds(nodes)));
     }
     // Of the field that the views show: the first one of the run that isn't there for a refiner.
@@ -158,7 +181,10 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         if path.exists() {
             let log = read(&path)?;
             row.insert("samples_per_ray".to_owned(), log["samples_per_ray"].clone());
-            row.insert("rays_per_s".to_owned(), json!(log["rays"].as_f64().unwrap_or(0.0) / field.seconds.max(1e-9)));
+            row.insert(
+                "rays_per_s".to_owned(),
+                json!(log["rays"].as_f64().unwrap_or(0.0) / field.seconds.max(1e-9)),
+            );
         }
     }
     Ok(row)

@@ -4,7 +4,8 @@ use serde_json::Value;
 
 use crate::Row;
 
-/// Combinations of values that keys have, in the order of the rows; a single empty one without keys.
+/// Combinations of values that keys have, in the order of the rows; a single empty one without
+/// keys.
 pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
     let mut found: Vec<Vec<String>> = Vec::new();
     for row in rows {
@@ -18,7 +19,11 @@ pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
 
 /// The rows whose keys have these values.
 pub(crate) fn of(rows: &[Row], keys: &[String], values: &[String]) -> Vec<Row> {
-    let fits = |row: &&Row| keys.iter().zip(values).all(|(key, value)| row.get(key).map(plain).unwrap_or_default() == *value);
+    let fits = |row: &&Row| {
+        keys.iter()
+            .zip(values)
+            .all(|(key, value)| row.get(key).map(plain).unwrap_or_default() == *value)
+    };
     rows.iter().filter(fits).cloned().collect()
 }
 

@@ -1,18 +1,21 @@
 //! `train-refine`: trains the network that refines rendered views, from views whose truth is known.
 //!
-//! This is internal learning; in the pipeline the views are of the downscaled field: a field trained from LR images that were
-//! shrunk once more, rendered at LR size, beside the LR images themselves. So it sees LR images alone, and the scene it is for.
+//! This is internal learning; in the pipeline the views are of the downscaled field: a field
+//! trained from LR images that were shrunk once more, rendered at LR size, beside the LR images
+//! themselves. So it sees LR images alone, and the scene it is for.
 //!
-//! For views that will be refined by references, it sees references in training, too: other views of the downscaled field, of
-//! which every one has its true image.
+//! For views that will be refined by references, it sees references in training, too: other views
+//! of the downscaled field, of which every one has its true image.
 //!
-//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the paper's split, they are made
-//! consistent with those before the network sees them; so do the views that it learns from.
+//! Where all views to be refined (input `cameras`) have LR photographs of their own, as in the
+//! paper's split, they are made consistent with those before the network sees them; so do the views
+//! that it learns from.
 //!
-//! Every eighth view is left out of training; what the network brings there is measured and kept with it.
+//! Every eighth view is left out of training; what the network brings there is measured and kept
+//! with it.
 //!
-//! `net: paper` trains the published network instead, on the rendered views of references beside the references (block `train-paper`): that is
-//! for comparison, and takes weeks on a CPU.
+//! `net: paper` trains the published network instead, on the rendered views of references beside
+//! the references (block `train-paper`): that is for comparison, and takes weeks on a CPU.
 
 mod paper;
 
@@ -23,8 +26,9 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Stage};
 use pixels::{psnr_of, read_exr};
 use refinement::{
-    Guidance, KnownView, LrObservations, Network, REFINER_FILE, RefinementError, Refiner, RefinerArchitecture, RefinerFile,
-    RefinerTrainer, RefinerTraining, Rendered, Training, WEIGHTS_FILE,
+    Guidance, KnownView, LrObservations, Network, REFINER_FILE, RefinementError, Refiner,
+    RefinerArchitecture, RefinerFile, RefinerTrainer, RefinerTraining, Rendered, Training,
+    WEIGHTS_FILE,
 };
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -80,10 +84,12 @@ pub struct CompactParams {
     /// Residual blocks, of two layers each.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "network"))]
     pub blocks: u32,
-    /// References that each view gets while the network learns: as many as it will have when views are refined. 0 trains a network without references.
+    /// References that each view gets while the network learns: as many as it will have when views
+    /// are refined. 0 trains a network without references.
     #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
     pub references_per_view: u32,
-    /// A reference shows only points that it sees by its own depth. Without this, it also shows points that something hides; for comparisons.
+    /// A reference shows only points that it sees by its own depth. Without this, it also shows
+    /// points that something hides; for comparisons.
     #[schemars(extend("x-group" = "data"))]
     pub occlusion: bool,
     /// Moves warped references by up to two pixels to fit the render; for comparisons.
@@ -150,30 +156,43 @@ pub struct TrainRefine;
 impl Stage for TrainRefine {
     type Params = Params;
     const NAME: &'static str = "train-refine";
-    const SUMMARY: &'static str = "Trains the network that refines rendered views, from views whose truth is known.";
+    const SUMMARY: &'static str =
+        "Trains the network that refines rendered views, from views whose truth is known.";
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        let cameras = ["scene/cameras", "scene/train", "scene/truth", "scene/references", "cameras", "views"];
+        let cameras =
+            ["scene/cameras", "scene/train", "scene/truth", "scene/references", "cameras", "views"];
         vec![
             ("views", Input::required(&["views"], "rendered views")),
-            ("truth", Input::required(&["scene/train", "scene/truth", "scene/references"], "what they should look like")),
+            (
+                "truth",
+                Input::required(
+                    &["scene/train", "scene/truth", "scene/references"],
+                    "what they should look like",
+                ),
+            ),
             (
                 "photographs",
                 Input::optional(
                     &["scene/train"],
-                    "net: compact: LR photographs that the field which rendered them was trained on",
+                    "net: compact: LR photographs that the field which rendered them was trained \
+                    on",
                 ),
             ),
             (
                 "cameras",
                 Input::optional(
                     &cameras,
-                    "net: compact: cameras of the views to be refined; where all have LR photographs, so have examples",
+                    "net: compact: cameras of the views to be refined; where all have LR \
+                    photographs, so have examples",
                 ),
             ),
             (
                 "weights",
-                Input::optional(&["weights"], "net: paper: folder with VGG-19, for the perceptual loss; without it L1 alone"),
+                Input::optional(
+                    &["weights"],
+                    "net: paper: folder with VGG-19, for the perceptual loss; without it L1 alone",
+                ),
             ),
         ]
     }
@@ -189,19 +208,26 @@ impl Stage for TrainRefine {
             Net::Paper(paper) => return paper::run(context, paper, params.seed),
         };
         if net.patch_size % 2 == 1 {
-            return Err(
-                Failure::Usage(format!("parameter patch_size: {} is odd; an even number is expected", net.patch_size)).into()
-            );
+            return Err(Failure::Usage(format!(
+                "parameter patch_size: {} is odd; an even number is expected",
+                net.patch_size
+            ))
+            .into());
         }
         let own = lr_observations(context)?;
-        let (training, left_out) = examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
+        let (training, left_out) =
+            examples(context.input("views")?, context.input("truth")?, own.as_ref())?;
         if net.references_per_view > 0 && training.len() < 2 {
-            return Err(Failure::BadInput("input views: one view has no others for references".to_owned()).into());
+            return Err(Failure::BadInput(
+                "input views: one view has no others for references".to_owned(),
+            )
+            .into());
         }
         let architecture = RefinerArchitecture {
             channels: net.features,
             blocks: net.blocks,
-            guidance: (net.references_per_view > 0).then_some(Guidance { occlusion: net.occlusion, alignment: net.alignment }),
+            guidance: (net.references_per_view > 0)
+                .then_some(Guidance { occlusion: net.occlusion, alignment: net.alignment }),
         };
         let options = RefinerTraining {
             steps: net.steps,
@@ -212,7 +238,9 @@ impl Stage for TrainRefine {
             seed: params.seed,
         };
         let mut trainer = RefinerTrainer::new(Refiner::new(architecture, params.seed)?, options)?;
-        train(context, options.steps, &mut trainer, &training, |error| format!("{:.2} dB", psnr_of(error)))?;
+        train(context, options.steps, &mut trainer, &training, |error| {
+            format!("{:.2} dB", psnr_of(error))
+        })?;
         let scores = trainer.score(&left_out, &training)?;
         trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
         let file = RefinerFile {
@@ -228,10 +256,12 @@ impl Stage for TrainRefine {
     }
 }
 
-/// LR photographs of the downscaled field's views, where those of the views to be refined will be known, too: the task is to be
-/// the same.
+/// LR photographs of the downscaled field's views, where those of the views to be refined will be
+/// known, too: the task is to be the same.
 fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_>>> {
-    let Some((photographs, cameras)) = context.optional_input("photographs").zip(context.optional_input("cameras")) else {
+    let Some((photographs, cameras)) =
+        context.optional_input("photographs").zip(context.optional_input("cameras"))
+    else {
         return Ok(None);
     };
     let own = LrObservations::read(photographs)?;
@@ -239,7 +269,8 @@ fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_
         return Ok(None);
     }
     context.say(
-        "all views to be refined have LR photographs of their own: the network learns on views that are consistent with theirs",
+        "all views to be refined have LR photographs of their own: the network learns on views \
+        that are consistent with theirs",
     );
     Ok(Some(own))
 }
@@ -247,8 +278,10 @@ fn lr_observations(context: &Context) -> anyhow::Result<Option<LrObservations<'_
 /// What training brought to some views.
 fn say(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
     let RefinerFile { rendered_psnr, refined_psnr, strength, .. } = file;
-    let summary =
-        format!("{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight {strength:.2})");
+    let summary = format!(
+        "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
+        {strength:.2})"
+    );
     context.say(&summary);
     context.write_summary(&summary)
 }
@@ -273,7 +306,9 @@ fn train(
     let (mut sum, mut since, mut noted) = (0.0, 0u64, Instant::now());
     loop {
         // A checkpoint costs at most a fiftieth of the time.
-        if let Some(path) = checkpoint.as_deref().filter(|_| context.interrupted() || written.elapsed() > 50 * took) {
+        if let Some(path) =
+            checkpoint.as_deref().filter(|_| context.interrupted() || written.elapsed() > 50 * took)
+        {
             let started = Instant::now();
             write_checkpoint(trainer, path).context("cannot write the checkpoint")?;
             (written, took) = (Instant::now(), started.elapsed());
@@ -298,7 +333,8 @@ fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> 
     Ok(std::fs::rename(partial, path)?)
 }
 
-/// Views beside their truth: those to train on, and those left out; where there are fewer than two, the same ones.
+/// Views beside their truth: those to train on, and those left out; where there are fewer than two,
+/// the same ones.
 fn examples(
     views: &GivenInput,
     truth: &GivenInput,
@@ -308,27 +344,38 @@ fn examples(
     let background = known.background.shown();
     let example = |view: &View| -> anyhow::Result<Option<KnownView>> {
         let name = &view.camera.name;
-        let (Some(file), Some(true_view)) = (&view.image, known.taken_by(&view.camera)) else { return Ok(None) };
+        let (Some(file), Some(true_view)) = (&view.image, known.taken_by(&view.camera)) else {
+            return Ok(None);
+        };
         let place = || format!("view {name}");
-        let Some(photograph) = true_view.read_photograph(truth).bad_input(place())? else { return Ok(None) };
+        let Some(photograph) = true_view.read_photograph(truth).bad_input(place())? else {
+            return Ok(None);
+        };
         let image = read_exr(&views.path(file)).bad_input(place())?;
-        let mut rendered = Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
+        let mut rendered =
+            Rendered::new(view.camera.clone(), &image, background).bad_input("input views")?;
         if let Some(own) = own {
             rendered = own.make_consistent(rendered)?;
         }
         Ok(Some(KnownView::new(rendered, photograph.over(background)).bad_input("input views")?))
     };
-    let all = rendered.views.iter().filter_map(|v| example(v).transpose()).collect::<anyhow::Result<Vec<_>>>()?;
+    let all = rendered
+        .views
+        .iter()
+        .filter_map(|v| example(v).transpose())
+        .collect::<anyhow::Result<Vec<_>>>()?;
     if all.is_empty() {
-        return Err(
-            Failure::BadInput("input views: none of them has an image, by name and pose, in input truth".to_owned()).into()
-        );
+        return Err(Failure::BadInput(
+            "input views: none of them has an image, by name and pose, in input truth".to_owned(),
+        )
+        .into());
     }
     if all.len() == 1 {
         return Ok((all.clone(), all));
     }
     let middle = (LEFT_OUT / 2).min(all.len() - 1);
-    let (left_out, training): (Vec<_>, Vec<_>) = all.into_iter().enumerate().partition(|(i, _)| i % LEFT_OUT == middle);
+    let (left_out, training): (Vec<_>, Vec<_>) =
+        all.into_iter().enumerate().partition(|(i, _)| i % LEFT_OUT == middle);
     let bare = |list: Vec<(usize, KnownView)>| list.into_iter().map(|(_, e)| e).collect();
     Ok((bare(training), bare(left_out)))
 }

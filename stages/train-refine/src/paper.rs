@@ -5,7 +5,8 @@ use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 
 use crate::{PaperParams, examples, say, train};
 
-/// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in Caffe's scaling.
+/// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in
+/// Caffe's scaling.
 const VGG: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
 
 /// Trains the published network. It learns from all views there are, as published: from one.
@@ -25,7 +26,9 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     options.check(&known).bad_input("input truth")?;
     let perceptual = context.optional_input("weights").map(perceptual).transpose()?;
     context.say(match &perceptual {
-        Some(loss) => format!("L1 and the perceptual loss of {} of VGG-19's 5 blocks", loss.blocks()),
+        Some(loss) => {
+            format!("L1 and the perceptual loss of {} of VGG-19's 5 blocks", loss.blocks())
+        }
         None => "L1 alone: give input weights for the perceptual loss".to_owned(),
     });
     let width = params.features;
@@ -38,14 +41,23 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
         psnr_of(errors.map(|e| f64::from(e).powi(2)).sum::<f64>() / count as f64)
     };
     for view in &known {
-        let drawn = trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
-        let (truth, own) = (&view.truth.data, view.rendered.view.data.chunks_exact(4).flat_map(|p| &p[..3]));
+        let drawn =
+            trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
+        let (truth, own) =
+            (&view.truth.data, view.rendered.view.data.chunks_exact(4).flat_map(|p| &p[..3]));
         rendered += mean(&mut own.zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
-        refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
+        refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len())
+            / known.len() as f64;
     }
     let network = Network::Paper { width, patches: params.patches };
-    let file =
-        RefinerFile { network, strength: 1.0, rendered_psnr: rendered, refined_psnr: refined, trusted: None, agreeing: false };
+    let file = RefinerFile {
+        network,
+        strength: 1.0,
+        rendered_psnr: rendered,
+        refined_psnr: refined,
+        trusted: None,
+        agreeing: false,
+    };
     context.write_json(REFINER_FILE, &file)?;
     say(context, "the references that it learnt from", &file)
 }

@@ -1,8 +1,10 @@
-//! `make bench`: what the engine costs, and that cost over what the machine can do, measured side by side in one run.
+//! `make bench`: what the engine costs, and that cost over what the machine can do, measured side
+//! by side in one run.
 //!
-//! `SCENE=DIR` is a scene that `prep` made (×2, 100 px in the Makefile), `OUT=FILE` gets rows of JSON `{name, value, unit}`,
-//! `RAYS=N` sets the length of the measured training (default 3 million), `SIMD=avx512|avx2|portable` the SIMD family.
-//! `AGAINST=FILE` is what an earlier run wrote: each of its values is compared with this run's.
+//! `SCENE=DIR` is a scene that `prep` made (×2, 100 px in the Makefile), `OUT=FILE` gets rows of
+//! JSON `{name, value, unit}`, `RAYS=N` sets the length of the measured training (default 3
+//! million), `SIMD=avx512|avx2|portable` the SIMD family. `AGAINST=FILE` is what an earlier run
+//! wrote: each of its values is compared with this run's.
 
 use std::hint::black_box;
 use std::path::{Path, PathBuf};
@@ -38,14 +40,20 @@ impl Rows {
         self.0.iter().find(|r| r.name == name).map_or(f64::NAN, |r| r.value)
     }
 
-    /// Measures sgemm once more. Other work slows a machine down by half at times, and never speeds it up: the best of all is what it can do.
+    /// Measures sgemm once more. Other work slows a machine down by half at times, and never speeds
+    /// it up: the best of all is what it can do.
     fn sgemm(&mut self, when: &str) {
         self.add(format!("sgemm_gflops_{when}"), sgemm(), "GFLOP/s");
     }
 
     /// What speeds come to over the best sgemm of all.
     fn relate(&mut self) {
-        let best = self.0.iter().filter(|r| r.name.starts_with("sgemm_gflops_")).map(|r| r.value).fold(f64::NAN, f64::max);
+        let best = self
+            .0
+            .iter()
+            .filter(|r| r.name.starts_with("sgemm_gflops_"))
+            .map(|r| r.value)
+            .fold(f64::NAN, f64::max);
         self.add("sgemm_gflops", best, "GFLOP/s");
         let speeds: Vec<(String, f64)> = self
             .0
@@ -79,7 +87,9 @@ fn choose_family(name: &str) -> anyhow::Result<()> {
 /// Reads the rows that an earlier run wrote.
 fn read_rows(file: &Path) -> anyhow::Result<Rows> {
     let bytes = std::fs::read(file).with_context(|| format!("AGAINST = {}", file.display()))?;
-    Ok(Rows(serde_json::from_slice(&bytes).with_context(|| format!("AGAINST = {}", file.display()))?))
+    Ok(Rows(
+        serde_json::from_slice(&bytes).with_context(|| format!("AGAINST = {}", file.display()))?,
+    ))
 }
 
 /// Prints this run's values over those of an earlier one.
@@ -88,7 +98,13 @@ fn compare(rows: &Rows, earlier: &Rows) {
     for row in &earlier.0 {
         let now = rows.value(&row.name);
         if now.is_finite() {
-            println!("{:<52} {:>14.1} {now:>14.1} {:>7.2} {}", row.name, row.value, now / row.value, row.unit);
+            println!(
+                "{:<52} {:>14.1} {now:>14.1} {:>7.2} {}",
+                row.name,
+                row.value,
+                now / row.value,
+                row.unit
+            );
         }
     }
 }
@@ -139,14 +155,19 @@ fn best(runs: usize, mut run: impl FnMut()) -> f64 {
 }
 
 fn one_core<T: Send>(run: impl FnOnce() -> T + Send) -> T {
-    rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a pool of one thread").install(run)
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .expect("a pool of one thread")
+        .install(run)
 }
 
 /// f32 matrix products, one on each core at once.
 fn sgemm() -> f64 {
     const N: usize = 768;
     let threads = rayon::current_num_threads();
-    let mut work: Vec<[Vec<f32>; 3]> = (0..threads).map(|_| [0.5, 0.25, 0.0].map(|v| vec![v; N * N])).collect();
+    let mut work: Vec<[Vec<f32>; 3]> =
+        (0..threads).map(|_| [0.5, 0.25, 0.0].map(|v| vec![v; N * N])).collect();
     let seconds = best(8, || {
         rayon::scope(|scope| {
             for [a, b, c] in &mut work {
@@ -183,7 +204,9 @@ fn bandwidth() -> f64 {
     let (mut a, b, c) = (vec![0.0f32; N], vec![1.0f32; N], vec![2.0f32; N]);
     let seconds = best(5, || {
         let parts = a.par_chunks_mut(1 << 16).zip(b.par_chunks(1 << 16)).zip(c.par_chunks(1 << 16));
-        parts.for_each(|((a, b), c)| a.iter_mut().zip(b).zip(c).for_each(|((a, b), c)| *a = b + 3.0 * c));
+        parts.for_each(|((a, b), c)| {
+            a.iter_mut().zip(b).zip(c).for_each(|((a, b), c)| *a = b + 3.0 * c)
+        });
     });
     black_box(&a);
     (3 * 4 * N) as f64 / seconds / 1e9
@@ -195,20 +218,28 @@ fn rays(count: usize) -> Vec<Ray> {
     let at = |i: usize| {
         let (x, y) = ((i % side) as f32 / side as f32 - 0.5, (i / side) as f32 / side as f32 - 0.5);
         let length = (x * x + y * y + 4.0).sqrt();
-        Ray { origin: [0.1, -0.2, 4.0], direction: [x / length, y / length, -2.0 / length], background: [1.0; 3] }
+        Ray {
+            origin: [0.1, -0.2, 4.0],
+            direction: [x / length, y / length, -2.0 / length],
+            background: [1.0; 3],
+        }
     };
     (0..side * side).map(at).collect()
 }
 
 /// One core through a field of faint density: every sample gets a colour.
 fn passes(rows: &mut Rows) {
-    let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
+    let bounds =
+        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, ..Default::default() };
     let default = Architecture::default();
     let variants = [
         ("", Architecture { levels: 8, log2_entries: 17, hidden: 32, ..default }),
         ("_64_wide", Architecture { levels: 8, log2_entries: 17, hidden: 64, ..default }),
         ("_2_19_entries", Architecture { levels: 8, log2_entries: 19, hidden: 32, ..default }),
-        ("_256_steps", Architecture { levels: 8, log2_entries: 17, hidden: 32, steps: 256, ..default }),
+        (
+            "_256_steps",
+            Architecture { levels: 8, log2_entries: 17, hidden: 32, steps: 256, ..default },
+        ),
     ];
     for (name, architecture) in variants {
         let field = Field::new(architecture, bounds, 1);
@@ -231,7 +262,11 @@ fn passes(rows: &mut Rows) {
             rows.add("coloured_share", 100.0 * coloured as f64 / marched as f64, "%");
             let flops = (3 * 2 * field.network_multiplications()) as f64;
             rows.add("networks_gflops_of_forward_backward", flops / both, "GFLOP/s");
-            rows.add("networks_share_of_sgemm_one_core", 100.0 * flops / both / rows.value("one_core_sgemm_gflops"), "%");
+            rows.add(
+                "networks_share_of_sgemm_one_core",
+                100.0 * flops / both / rows.value("one_core_sgemm_gflops"),
+                "%",
+            );
             // Eight corners of four floats a level: read forward, read and written backward.
             let bytes = (architecture.levels * 8 * 16 * 3) as f64;
             rows.add("grid_traffic_of_forward_backward", bytes / both, "GB/s");
@@ -245,12 +280,15 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let views = Views::read(&input)?;
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let params = params.resolve(&SceneFacts::of(&views, true));
-        let mut supervision = train_ss::supervision(&input, &params, None, &std::env::temp_dir(), &|_| ())?;
-        let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field else {
+        let mut supervision =
+            train_ss::supervision(&input, &params, None, &std::env::temp_dir(), &|_| ())?;
+        let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field
+        else {
             anyhow::bail!("a grid is measured here");
         };
         let training = params.grid_training(given, *distortion, *floater_loss);
-        let mut trainer = Trainer::new(Field::new(*architecture, views.bounds, params.seed), training);
+        let mut trainer =
+            Trainer::new(Field::new(*architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);
         while let Some(report) = trainer.step(&mut supervision)? {
             samples += report.samples;
@@ -261,9 +299,11 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");
         Ok(trainer.finish())
     };
-    // Rays drawn evenly over all pixels, so that the figure compares with others'; then as trainings really go.
+    // Rays drawn evenly over all pixels, so that the figure compares with others'; then as
+    // trainings really go.
     let grid = |rays, pixel_importance| {
-        let field = FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
+        let field =
+            FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
         Params { field, ..Params::default() }
     };
     let field = run(&grid(rays, Some(1.0)), rows, "")?;
@@ -283,8 +323,10 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let cameras: Vec<Camera> = truth.views.iter().take(10).map(|v| v.camera.clone()).collect();
     let own = cameras[0].intrinsics.width;
     let mut render = |name: String, width: u32, one: bool| {
-        let all: Vec<Vec<Ray>> =
-            cameras.iter().map(|c| camera_rays(&c.resized(width, c.intrinsics.height * width / own))).collect();
+        let all: Vec<Vec<Ray>> = cameras
+            .iter()
+            .map(|c| camera_rays(&c.resized(width, c.intrinsics.height * width / own)))
+            .collect();
         let count: usize = all.iter().map(Vec::len).sum();
         let go = || {
             let start = Instant::now();
@@ -302,21 +344,29 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Some steps of the paper's field as published: 2,048 rays, 64 + 64 samples, two networks of eight 256-wide layers.
+/// Some steps of the paper's field as published: 2,048 rays, 64 + 64 samples, two networks of eight
+/// 256-wide layers.
 #[cfg(feature = "torch")]
 fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()> {
     const STEPS: u64 = 3;
-    let mlp = MlpParams { rays: Some((STEPS + 1) * 2048), precrop_steps: Some(0), ..MlpParams::default() };
+    let mlp = MlpParams {
+        rays: Some((STEPS + 1) * 2048),
+        precrop_steps: Some(0),
+        ..MlpParams::default()
+    };
     let params = Params { field: FieldParams::Mlp(mlp), ..Params::default() };
     let params = params.resolve(&SceneFacts::of(views, true));
     let ResolvedField::Mlp { architecture, density_noise_std, given } = &params.field else {
         anyhow::bail!("MLPs are measured here");
     };
     nets::deterministic();
-    let mut supervision = train_ss::supervision(input, &params, None, &std::env::temp_dir(), &|_| ())?;
-    let field = torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
+    let mut supervision =
+        train_ss::supervision(input, &params, None, &std::env::temp_dir(), &|_| ())?;
+    let field =
+        torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;
-    let mut trainer = torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?;
+    let mut trainer =
+        torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?;
     trainer.step(&mut supervision)?;
     let (start, mut samples) = (Instant::now(), 0);
     while let Some(report) = trainer.step(&mut supervision)? {
@@ -335,7 +385,11 @@ fn camera_rays(camera: &Camera) -> Vec<Ray> {
     let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
     let ray = |i: usize| {
         let ray = camera.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
-        Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+        Ray {
+            origin: ray.origin.as_vec3().to_array(),
+            direction: ray.direction.as_vec3().to_array(),
+            background: [1.0; 3],
+        }
     };
     (0..width * height).map(ray).collect()
 }
@@ -343,5 +397,6 @@ fn camera_rays(camera: &Camera) -> Vec<Ray> {
 fn peak_memory() -> f64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
-    line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok()).unwrap_or(f64::NAN) / 1024.0
+    line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok()).unwrap_or(f64::NAN)
+        / 1024.0
 }

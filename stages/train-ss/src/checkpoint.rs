@@ -9,7 +9,8 @@ use crate::field_trainer::FieldTrainer;
 use crate::supervision::Supersampling;
 use crate::training_log::{CurvePoint, TrainingLog};
 
-/// The training curve while it grows. Everything in it is saved, so that a resumed training writes the same one.
+/// The training curve while it grows. Everything in it is saved, so that a resumed training writes
+/// the same one.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub(crate) struct Curve {
     points: Vec<CurvePoint>,
@@ -50,8 +51,8 @@ impl Curve {
     }
 }
 
-/// Checkpoints in the work folder: `curve-STEP.json` and `kept-STEP.bin`, what the supervision has come to know; then
-/// `checkpoint.safetensors`, which says which STEP they belong to.
+/// Checkpoints in the work folder: `curve-STEP.json` and `kept-STEP.bin`, what the supervision has
+/// come to know; then `checkpoint.safetensors`, which says which STEP they belong to.
 pub(crate) struct Checkpoints {
     folder: Option<PathBuf>,
     last: Instant,
@@ -60,11 +61,21 @@ pub(crate) struct Checkpoints {
 
 impl Checkpoints {
     pub(crate) fn new(folder: Option<&Path>) -> Self {
-        Self { folder: folder.map(Path::to_path_buf), last: Instant::now(), took: Duration::from_millis(20) }
+        Self {
+            folder: folder.map(Path::to_path_buf),
+            last: Instant::now(),
+            took: Duration::from_millis(20),
+        }
     }
 
-    /// Loads what an earlier run left. What can't be read is said and left out: the training starts over.
-    pub(crate) fn resume(&self, trainer: &mut dyn FieldTrainer, supervision: &mut Supersampling, say: impl Fn(&str)) -> Curve {
+    /// Loads what an earlier run left. What can't be read is said and left out: the training starts
+    /// over.
+    pub(crate) fn resume(
+        &self,
+        trainer: &mut dyn FieldTrainer,
+        supervision: &mut Supersampling,
+        say: impl Fn(&str),
+    ) -> Curve {
         let Some(folder) = &self.folder else { return Curve::default() };
         let path = folder.join(CHECKPOINT);
         if !path.exists() {
@@ -95,7 +106,12 @@ impl Checkpoints {
         Ok(())
     }
 
-    pub(crate) fn write(&mut self, trainer: &dyn FieldTrainer, supervision: &Supersampling, curve: &Curve) -> anyhow::Result<()> {
+    pub(crate) fn write(
+        &mut self,
+        trainer: &dyn FieldTrainer,
+        supervision: &Supersampling,
+        curve: &Curve,
+    ) -> anyhow::Result<()> {
         let Some(folder) = &self.folder else { return Ok(()) };
         let started = Instant::now();
         let (name, temporary) = (folder.join(CHECKPOINT), folder.join("checkpoint.partial"));
@@ -128,12 +144,19 @@ fn kept_name(step: u64) -> String {
     format!("kept-{step}.bin")
 }
 
-/// The curve of a checkpoint's step, with trainer and supervision as they were then, where all of it is there.
-fn restored(folder: &Path, checkpoint: &Path, trainer: &mut dyn FieldTrainer, supervision: &mut Supersampling) -> Option<Curve> {
+/// The curve of a checkpoint's step, with trainer and supervision as they were then, where all of
+/// it is there.
+fn restored(
+    folder: &Path,
+    checkpoint: &Path,
+    trainer: &mut dyn FieldTrainer,
+    supervision: &mut Supersampling,
+) -> Option<Curve> {
     let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
     let mut kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
     let is_whole = kept.metadata().ok()?.len() == supervision.written_len() as u64;
     // A trainer that can't resume is as it was.
-    (is_whole && trainer.resume(checkpoint) && supervision.restore(&mut kept).is_ok()).then_some(curve)
+    (is_whole && trainer.resume(checkpoint) && supervision.restore(&mut kept).is_ok())
+        .then_some(curve)
 }

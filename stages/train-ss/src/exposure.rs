@@ -1,10 +1,13 @@
-/// How bright each photograph is against what the field renders for it: a factor a channel, by least squares over the pixels drawn, what is
-/// old fading. A factor that all photographs share belongs to the field: the factors' geometric mean is 1.
+/// How bright each photograph is against what the field renders for it: a factor a channel, by
+/// least squares over the pixels drawn, what is old fading. A factor that all photographs share
+/// belongs to the field: the factors' geometric mean is 1.
 ///
-/// Factors of display-encoded colours: a change of exposure multiplies linear light, and sRGB's encoding is nearly a power.
+/// Factors of display-encoded colours: a change of exposure multiplies linear light, and sRGB's
+/// encoding is nearly a power.
 #[derive(Clone, Debug)]
 pub(crate) struct Exposures {
-    /// For every view and channel, sums of photographed times rendered and of rendered times rendered.
+    /// For every view and channel, sums of photographed times rendered and of rendered times
+    /// rendered.
     sums: Vec<[[f64; 2]; 3]>,
     factors: Vec<[f32; 3]>,
 }
@@ -13,8 +16,9 @@ pub(crate) struct Exposures {
 const KEEP: f64 = 0.998;
 /// Photographs are as bright as rendered, says so many white pixels.
 const PRIOR: f64 = 1.0;
-/// Share of the training before which the field knows too little to say anything of exposures. Much later it has made up
-/// floaters before the cameras that explain them: with 0.1, 0.3 factors are found half, not at all.
+/// Share of the training before which the field knows too little to say anything of exposures. Much
+/// later it has made up floaters before the cameras that explain them: with 0.1, 0.3 factors are
+/// found half, not at all.
 const BEGIN: f64 = 0.02;
 /// Bytes of a view's sums.
 const BYTES: usize = 6 * 8;
@@ -50,7 +54,8 @@ impl Exposures {
             return;
         }
         for c in 0..3 {
-            let logarithm = |sums: &[[f64; 2]; 3]| ((sums[c][0] + PRIOR) / (sums[c][1] + PRIOR)).ln();
+            let logarithm =
+                |sums: &[[f64; 2]; 3]| ((sums[c][0] + PRIOR) / (sums[c][1] + PRIOR)).ln();
             let mean = self.sums.iter().map(logarithm).sum::<f64>() / self.sums.len().max(1) as f64;
             for (factor, sums) in self.factors.iter_mut().zip(&self.sums) {
                 factor[c] = (logarithm(sums) - mean).exp() as f32;
@@ -95,7 +100,10 @@ mod tests {
         assert_eq!(exposures.factors(), [[1.0; 3]; 3]);
         exposures.settle(0.5);
         for (found, expected) in exposures.factors().iter().zip(true_factors) {
-            assert!(found.iter().zip(expected).all(|(f, e)| (f / e - 1.0).abs() < 0.06), "{found:?} {expected:?}");
+            assert!(
+                found.iter().zip(expected).all(|(f, e)| (f / e - 1.0).abs() < 0.06),
+                "{found:?} {expected:?}"
+            );
         }
         let mut other = Exposures::new(3);
         assert_eq!(exposures.bytes().len(), other.len());

@@ -40,7 +40,8 @@ impl std::fmt::Display for Collapsed {
 
 impl std::error::Error for Collapsed {}
 
-/// A training that hasn't begun, from semi-transparent space or from weights that another training wrote (`from`).
+/// A training that hasn't begun, from semi-transparent space or from weights that another training
+/// wrote (`from`).
 pub(crate) fn start(
     params: &Resolved,
     from: Option<&Path>,
@@ -51,7 +52,8 @@ pub(crate) fn start(
         ResolvedField::Grid { architecture, distortion, floater_loss, given } => {
             let field = match from {
                 Some(weights) => {
-                    let mut field = Field::read(weights, *architecture, bounds).bad_input("input init")?;
+                    let mut field =
+                        Field::read(weights, *architecture, bounds).bad_input("input init")?;
                     field.limit_to_occupied();
                     field
                 }
@@ -68,21 +70,31 @@ pub(crate) fn start(
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
             let field = match from {
-                Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device).bad_input("input init")?,
+                Some(weights) => torch_field::Mlp::read(weights, *architecture, bounds, device)
+                    .bad_input("input init")?,
                 None => torch_field::Mlp::new(*architecture, bounds, params.seed, device)?,
             };
-            Ok(Box::new(torch_field::MlpTrainer::new(field, params.mlp_training(given, *density_noise_std))?))
+            Ok(Box::new(torch_field::MlpTrainer::new(
+                field,
+                params.mlp_training(given, *density_noise_std),
+            )?))
         }
         #[cfg(not(feature = "torch"))]
         ResolvedField::Mlp { .. } => {
-            let message = "parameter field: mlp needs libtorch, and train-ss was built without it; build with --features torch";
+            let message = "parameter field: mlp needs libtorch, and train-ss was built without \
+                it; build with --features torch";
             Err(Failure::Usage(message.to_owned()).into())
         }
     }
 }
 
 /// A field from weights that a training wrote.
-pub(crate) fn read(model: FieldModel, bounds: Bounds, weights: &Path, device: &str) -> anyhow::Result<Box<dyn RayField>> {
+pub(crate) fn read(
+    model: FieldModel,
+    bounds: Bounds,
+    weights: &Path,
+    device: &str,
+) -> anyhow::Result<Box<dyn RayField>> {
     match model {
         FieldModel::Grid(architecture) => Ok(Box::new(Field::read(weights, architecture, bounds)?)),
         #[cfg(feature = "torch")]
@@ -91,13 +103,21 @@ pub(crate) fn read(model: FieldModel, bounds: Bounds, weights: &Path, device: &s
             Ok(Box::new(torch_field::Mlp::read(weights, architecture, bounds, device)?))
         }
         #[cfg(not(feature = "torch"))]
-        FieldModel::Mlp(_) => anyhow::bail!("a field of networks can't be read for {device}: there is no libtorch"),
+        FieldModel::Mlp(_) => {
+            anyhow::bail!("a field of networks can't be read for {device}: there is no libtorch")
+        }
     }
 }
 
-/// Makes trained weights the mean of those and of the ones that the training went on from: what either makes up evens out, as if both fields were rendered,
-/// and little is lost of what was known before.
-pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &Path) -> anyhow::Result<()> {
+/// Makes trained weights the mean of those and of the ones that the training went on from: what
+/// either makes up evens out, as if both fields were rendered, and little is lost of what was known
+/// before.
+pub(crate) fn average(
+    model: FieldModel,
+    bounds: Bounds,
+    from: &Path,
+    trained: &Path,
+) -> anyhow::Result<()> {
     match model {
         FieldModel::Grid(architecture) => {
             let mut field = Field::read(trained, architecture, bounds)?;
@@ -106,7 +126,14 @@ pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &
         }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let read = |path| anyhow::Ok(torch_field::Mlp::read(path, architecture, bounds, nets::device("cpu")?)?);
+            let read = |path| {
+                anyhow::Ok(torch_field::Mlp::read(
+                    path,
+                    architecture,
+                    bounds,
+                    nets::device("cpu")?,
+                )?)
+            };
             let field = read(trained)?;
             field.average_with(&read(from)?)?;
             field.write(trained)?;
@@ -119,15 +146,26 @@ pub(crate) fn average(model: FieldModel, bounds: Bounds, from: &Path, trained: &
 
 /// The same grid and the same training through libtorch.
 #[cfg(feature = "torch")]
-fn start_grid_on(device: &str, field: &Field, options: TrainingOptions) -> anyhow::Result<Box<dyn FieldTrainer>> {
+fn start_grid_on(
+    device: &str,
+    field: &Field,
+    options: TrainingOptions,
+) -> anyhow::Result<Box<dyn FieldTrainer>> {
     let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
     nets::deterministic();
     Ok(Box::new(torch_field::GridTrainer::new(field, options, device)?))
 }
 
 #[cfg(not(feature = "torch"))]
-fn start_grid_on(device: &str, _: &Field, _: TrainingOptions) -> anyhow::Result<Box<dyn FieldTrainer>> {
-    let message = format!("--device {device}: it needs libtorch, and train-ss was built without it; build with --features torch");
+fn start_grid_on(
+    device: &str,
+    _: &Field,
+    _: TrainingOptions,
+) -> anyhow::Result<Box<dyn FieldTrainer>> {
+    let message = format!(
+        "--device {device}: it needs libtorch, and train-ss was built without it; build with \
+        --features torch"
+    );
     Err(Failure::Usage(message).into())
 }
 
@@ -177,7 +215,10 @@ impl FieldTrainer for Trainer {
 
 fn write_grid(field: &Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
     if !field.is_finite() {
-        return Err(Failure::Numerical(format!("step {steps}: a parameter is not finite; lower the rate")).into());
+        return Err(Failure::Numerical(format!(
+            "step {steps}: a parameter is not finite; lower the rate"
+        ))
+        .into());
     }
     field.write(weights).context("cannot write the field")
 }
@@ -203,7 +244,9 @@ impl FieldTrainer for torch_field::GridTrainer {
 #[cfg(feature = "torch")]
 fn numerical(error: torch_field::TorchFieldError) -> anyhow::Error {
     match error {
-        torch_field::TorchFieldError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
+        torch_field::TorchFieldError::NotFinite { .. } => {
+            Failure::Numerical(error.to_string()).into()
+        }
         torch_field::TorchFieldError::Collapsed { .. } => Collapsed(error.to_string()).into(),
         _ => error.into(),
     }

@@ -7,11 +7,13 @@ use pixels::{AxisTaps, Filter, Image, Resampling, to_u8};
 
 use crate::packed::{Bytes, PackedPhotograph, PixelMemory};
 
-/// The field's HR pixels of every training view as they were last rendered, in 8 bits, and the operators that make LR pixels
-/// of them. Before a pixel is first rendered it is the enlarged LR image's.
+/// The field's HR pixels of every training view as they were last rendered, in 8 bits, and the
+/// operators that make LR pixels of them. Before a pixel is first rendered it is the enlarged LR
+/// image's.
 #[derive(Debug)]
 pub(crate) struct HrCache {
-    /// HR pixels rendered together for an LR pixel, along x and y; no more than the smallest view has.
+    /// HR pixels rendered together for an LR pixel, along x and y; no more than the smallest view
+    /// has.
     side: [usize; 2],
     views: Vec<CachedView>,
 }
@@ -66,15 +68,20 @@ impl HrCache {
         Self { side, views: Vec::new() }
     }
 
-    /// Whether a filter's footprint is the block of an LR pixel alone: then residuals need no other HR pixels than the fresh ones, and
-    /// are those of the mean.
+    /// Whether a filter's footprint is the block of an LR pixel alone: then residuals need no other
+    /// HR pixels than the fresh ones, and are those of the mean.
     pub(crate) fn is_needed(filter: Filter, hr: (usize, usize), lr: (usize, usize)) -> bool {
         let is_whole = hr.0.is_multiple_of(lr.0) && hr.1.is_multiple_of(lr.1);
         !(filter == Filter::Box && is_whole)
     }
 
     /// Adds the next view: an RGB image at HR size to begin with, and what makes it an LR image.
-    pub(crate) fn add(&mut self, image: &Image, kernel: Arc<KernelOperator>, memory: &mut PixelMemory) -> io::Result<()> {
+    pub(crate) fn add(
+        &mut self,
+        image: &Image,
+        kernel: Arc<KernelOperator>,
+        memory: &mut PixelMemory,
+    ) -> io::Result<()> {
         let rendered = memory.keep(image.data.iter().map(|&v| to_u8(v)).collect())?;
         self.views.push(CachedView { width: image.width, height: image.height, rendered, kernel });
         Ok(())
@@ -85,10 +92,15 @@ impl HrCache {
         let view = &self.views[view];
         let first = |i: usize, at: usize, hr: usize, lr: usize| {
             let scale = hr as f64 / lr as f64;
-            let start = (at as f64 + 0.5).mul_add(scale, -0.5 * self.side[i] as f64).round().max(0.0) as usize;
+            let start =
+                (at as f64 + 0.5).mul_add(scale, -0.5 * self.side[i] as f64).round().max(0.0)
+                    as usize;
             start.min(hr.saturating_sub(self.side[i]))
         };
-        [first(0, x, view.width, view.kernel.operator.x.outputs()), first(1, y, view.height, view.kernel.operator.y.outputs())]
+        [
+            first(0, x, view.width, view.kernel.operator.x.outputs()),
+            first(1, y, view.height, view.kernel.operator.y.outputs()),
+        ]
     }
 
     /// Where that block begins and how large an HR pixel is, in LR pixels.
@@ -102,10 +114,10 @@ impl HrCache {
         ([i as f64 * apart[0], j as f64 * apart[1]], apart)
     }
 
-    /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else as cached, and what they
-    /// ask of the block: writes P·residual for each colour, where P = Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse but for the factor s², and
-    /// returns the residual of the pixel itself. `judge` gets a channel, a prediction and its target, and
-    /// gives the residual.
+    /// The kernel's residuals around an LR pixel, with its block as freshly rendered and all else
+    /// as cached, and what they ask of the block: writes P·residual for each colour, where P =
+    /// Kᵀ·(s²·K·Kᵀ)⁻¹ is the pseudo-inverse but for the factor s², and returns the residual of the
+    /// pixel itself. `judge` gets a channel, a prediction and its target, and gives the residual.
     pub(crate) fn back_project(
         &self,
         view: usize,
@@ -123,7 +135,10 @@ impl HrCache {
         let mut residuals = view.projected(&block, xs.clone(), ys.clone());
         for (qy, row) in ys.clone().zip(&mut residuals) {
             let mut target = [[0.0; 4]; NEAR];
-            targets.row(qy * targets.width() + xs.start..qy * targets.width() + xs.end, &mut target[..xs.len()]);
+            targets.row(
+                qy * targets.width() + xs.start..qy * targets.width() + xs.end,
+                &mut target[..xs.len()],
+            );
             for (residual, target) in row.iter_mut().zip(&target) {
                 *residual = std::array::from_fn(|c| judge(c, residual[c], target[c]));
             }
@@ -133,7 +148,11 @@ impl HrCache {
             let mut narrow = [[0.0f32; 3]; NEAR];
             for (qy, row) in ys.clone().zip(&residuals) {
                 let w = inverse.y.weight(qy, top + b);
-                narrow.as_flattened_mut().iter_mut().zip(row.as_flattened()).for_each(|(sum, r)| *sum += w * r);
+                narrow
+                    .as_flattened_mut()
+                    .iter_mut()
+                    .zip(row.as_flattened())
+                    .for_each(|(sum, r)| *sum += w * r);
             }
             for (a, projection) in back_projected.iter_mut().enumerate() {
                 *projection = [0.0; 3];
@@ -162,7 +181,9 @@ impl HrCache {
     /// Gives the cached bytes of all views, one view after the other.
     pub(crate) fn write(&self, to: &mut impl io::Write) -> io::Result<()> {
         let mut buffer = Vec::new();
-        self.views.iter().try_for_each(|view| to.write_all(view.rendered.read(0..view.rendered.len(), &mut buffer)))
+        self.views.iter().try_for_each(|view| {
+            to.write_all(view.rendered.read(0..view.rendered.len(), &mut buffer))
+        })
     }
 
     /// Bytes cached.
@@ -190,8 +211,14 @@ struct Block<'a> {
 }
 
 impl CachedView {
-    /// What the kernel makes of it at some LR columns and rows, at most [`NEAR`] of each, with a block as freshly rendered.
-    fn projected(&self, block: &Block<'_>, xs: Range<usize>, ys: Range<usize>) -> [[[f32; 3]; NEAR]; NEAR] {
+    /// What the kernel makes of it at some LR columns and rows, at most [`NEAR`] of each, with a
+    /// block as freshly rendered.
+    fn projected(
+        &self,
+        block: &Block<'_>,
+        xs: Range<usize>,
+        ys: Range<usize>,
+    ) -> [[[f32; 3]; NEAR]; NEAR] {
         let (across, down) = (&self.kernel.operator.x, &self.kernel.operator.y);
         let (columns, lines) = (footprint(across, xs.clone()), footprint(down, ys.clone()));
         let [left, top] = block.at;
@@ -199,10 +226,17 @@ impl CachedView {
         ROWS.with_borrow_mut(|rows| {
             for line in lines {
                 let start = line * self.width;
-                let read = self.rendered.read(3 * (start + columns.start)..3 * (start + columns.end), &mut rows.read);
+                let read = self
+                    .rendered
+                    .read(3 * (start + columns.start)..3 * (start + columns.end), &mut rows.read);
                 rows.levels.clear();
-                rows.levels.extend(read.as_chunks::<3>().0.iter().map(|pixel| pixel.map(|v| f32::from(v) / 255.0)));
-                if let Some(fresh) = line.checked_sub(top).and_then(|b| block.colours.chunks_exact(block.columns).nth(b)) {
+                rows.levels.extend(
+                    read.as_chunks::<3>().0.iter().map(|pixel| pixel.map(|v| f32::from(v) / 255.0)),
+                );
+                if let Some(fresh) = line
+                    .checked_sub(top)
+                    .and_then(|b| block.colours.chunks_exact(block.columns).nth(b))
+                {
                     rows.levels[left - columns.start..][..fresh.len()].copy_from_slice(fresh);
                 }
                 let mut narrow = [[0.0f32; 3]; NEAR];
@@ -214,7 +248,10 @@ impl CachedView {
                 }
                 for (qy, sums) in ys.clone().zip(&mut projected) {
                     let w = down.weight(qy, line);
-                    sums.as_flattened_mut().iter_mut().zip(narrow.as_flattened()).for_each(|(sum, v)| *sum += w * v);
+                    sums.as_flattened_mut()
+                        .iter_mut()
+                        .zip(narrow.as_flattened())
+                        .for_each(|(sum, v)| *sum += w * v);
                 }
             }
         });
@@ -250,56 +287,90 @@ mod tests {
         cache
     }
 
-    /// Where a filter's footprint is the pixel's own block, the residual asks of every HR pixel what the mean's does.
+    /// Where a filter's footprint is the pixel's own block, the residual asks of every HR pixel
+    /// what the mean's does.
     #[test]
     fn a_whole_box_is_the_mean() {
         let (hr, lr) = ((12, 8), (6, 4));
-        assert!(!HrCache::is_needed(Filter::Box, hr, lr) && HrCache::is_needed(Filter::Lanczos, hr, lr));
+        assert!(
+            !HrCache::is_needed(Filter::Box, hr, lr) && HrCache::is_needed(Filter::Lanczos, hr, lr)
+        );
         assert!(HrCache::is_needed(Filter::Box, (11, 8), lr));
-        let cache = cache([2, 2], &pattern(12, 8), Arc::new(KernelOperator::new(Filter::Box, hr, lr)));
-        let targets = PackedPhotograph::new(&pattern(6, 4).into(), &mut PixelMemory::unlimited()).unwrap();
+        let cache =
+            cache([2, 2], &pattern(12, 8), Arc::new(KernelOperator::new(Filter::Box, hr, lr)));
+        let targets =
+            PackedPhotograph::new(&pattern(6, 4).into(), &mut PixelMemory::unlimited()).unwrap();
         let colours = [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9], [0.2, 0.1, 0.0]];
         let mut back_projected = [[9.0; 3]; 4];
-        let own = cache.back_project(0, [2, 1], &colours, &targets, |_, p, t| p - t, &mut back_projected);
+        let own =
+            cache.back_project(0, [2, 1], &colours, &targets, |_, p, t| p - t, &mut back_projected);
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() / 4.0;
             assert!((own[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
             assert!(
-                back_projected.iter().all(|p| (p[c] - own[c] / 4.0).abs() < 0.02 * own[c].abs() + 1e-6),
+                back_projected
+                    .iter()
+                    .all(|p| (p[c] - own[c] / 4.0).abs() < 0.02 * own[c].abs() + 1e-6),
                 "{back_projected:?}"
             );
         }
     }
 
-    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any scale, also where the block
-    /// is news.
+    /// Residuals and their back-projections are K·c - y and P·(K·c - y) of the whole images, at any
+    /// scale, also where the block is news.
     #[test]
     fn back_projections_are_the_operators_own() {
-        for (lr, hr) in [((9, 8), (18, 16)), ((10, 6), (27, 15)), ((7, 7), (11, 10)), ((5, 4), (20, 16)), ((1, 1), (2, 2))] {
-            let side = [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
+        for (lr, hr) in [
+            ((9, 8), (18, 16)),
+            ((10, 6), (27, 15)),
+            ((7, 7), (11, 10)),
+            ((5, 4), (20, 16)),
+            ((1, 1), (2, 2)),
+        ] {
+            let side =
+                [hr.0 as f64 / lr.0 as f64, hr.1 as f64 / lr.1 as f64].map(|s| s.ceil() as usize);
             let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, hr, lr));
             let KernelOperator { operator, inverse } = &*kernel;
             let image = pattern(hr.0, hr.1);
             let targets = pattern(lr.0, lr.1);
-            let packed = PackedPhotograph::new(&targets.clone().into(), &mut PixelMemory::unlimited()).unwrap();
+            let packed =
+                PackedPhotograph::new(&targets.clone().into(), &mut PixelMemory::unlimited())
+                    .unwrap();
             let cache = cache(side, &image, kernel.clone());
             for y in 0..lr.1 {
                 for x in 0..lr.0 {
                     let [i, j] = cache.block(0, x, y);
                     let mut hybrid = image.clone();
-                    let fresh: Vec<[f32; 3]> =
-                        (0..side[0] * side[1]).map(|k| [0.2 + 0.1 * k as f32 / side[0] as f32, 0.5, 0.7]).collect();
+                    let fresh: Vec<[f32; 3]> = (0..side[0] * side[1])
+                        .map(|k| [0.2 + 0.1 * k as f32 / side[0] as f32, 0.5, 0.7])
+                        .collect();
                     let at = |k: usize| 3 * ((j + k / side[0]) * hr.0 + i + k % side[0]);
-                    fresh.iter().enumerate().for_each(|(k, f)| hybrid.data[at(k)..at(k) + 3].copy_from_slice(f));
+                    fresh
+                        .iter()
+                        .enumerate()
+                        .for_each(|(k, f)| hybrid.data[at(k)..at(k) + 3].copy_from_slice(f));
                     let mut residual = operator.apply(&hybrid);
                     residual.data.iter_mut().zip(&targets.data).for_each(|(r, t)| *r -= t);
                     let expected = inverse.adjoint(&residual);
                     let mut back_projected = vec![[9.0; 3]; fresh.len()];
-                    let own = cache.back_project(0, [x, y], &fresh, &packed, |_, p, t| p - t, &mut back_projected);
+                    let own = cache.back_project(
+                        0,
+                        [x, y],
+                        &fresh,
+                        &packed,
+                        |_, p, t| p - t,
+                        &mut back_projected,
+                    );
                     for c in 0..3 {
-                        assert!((own[c] - residual.data[3 * (y * lr.0 + x) + c]).abs() < 1e-5, "{lr:?} {hr:?} ({x}, {y})");
+                        assert!(
+                            (own[c] - residual.data[3 * (y * lr.0 + x) + c]).abs() < 1e-5,
+                            "{lr:?} {hr:?} ({x}, {y})"
+                        );
                         for (k, projection) in back_projected.iter().enumerate() {
-                            assert!((projection[c] - expected.data[at(k) + c]).abs() < 1e-5, "{lr:?} {hr:?} ({x}, {y}) {k}");
+                            assert!(
+                                (projection[c] - expected.data[at(k) + c]).abs() < 1e-5,
+                                "{lr:?} {hr:?} ({x}, {y}) {k}"
+                            );
                         }
                     }
                 }
@@ -329,7 +400,9 @@ mod tests {
     /// Every HR pixel belongs to some block, so none is left unseen.
     #[test]
     fn blocks_cover_the_image() {
-        for (lr, hr) in [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)] {
+        for (lr, hr) in
+            [(10, 15), (10, 27), (100, 270), (7, 21), (3, 4), (10, 11), (1, 1), (40, 41)]
+        {
             let side = (hr as f64 / lr as f64).ceil() as usize;
             let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (hr, hr), (lr, lr)));
             let cache = cache([side, side], &pattern(hr, hr), kernel);

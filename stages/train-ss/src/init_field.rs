@@ -14,11 +14,20 @@ impl<'a> InitField<'a> {
     /// Reads what it says of itself, which must be what is to be trained.
     pub(crate) fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
         let file: FieldFile = input.read_json(FIELD_FILE)?;
-        file.check().map_err(|reason| Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display())))?;
+        file.check().map_err(|reason| {
+            Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
+        })?;
         let differs = [
             ("lies elsewhere; train both from one prep", file.bounds != wanted.bounds),
-            ("has another background; train both from one prep", file.background != wanted.background),
-            ("is made of something else than the parameters ask for; give those it was trained with", file.field != wanted.field),
+            (
+                "has another background; train both from one prep",
+                file.background != wanted.background,
+            ),
+            (
+                "is made of something else than the parameters ask for; give those it was trained \
+                with",
+                file.field != wanted.field,
+            ),
         ];
         match differs.iter().find(|(_, differs)| *differs) {
             Some((what, _)) => Err(Failure::BadInput(format!("input init: it {what}")).into()),
@@ -32,11 +41,17 @@ impl<'a> InitField<'a> {
     }
 
     /// Writes all of its members before those of `file`, and returns how many they are.
-    pub(crate) fn keep_beside(&self, context: &Context, file: &mut FieldFile) -> anyhow::Result<u32> {
+    pub(crate) fn keep_beside(
+        &self,
+        context: &Context,
+        file: &mut FieldFile,
+    ) -> anyhow::Result<u32> {
         file.members += self.members;
         file.check().map_err(|reason| {
-            let message =
-                format!("parameter ensemble: {reason} with those of input init; lower it, or set combine to average_weights");
+            let message = format!(
+                "parameter ensemble: {reason} with those of input init; lower it, or set \
+                    combine to average_weights"
+            );
             Failure::Usage(message)
         })?;
         for index in 0..self.members {

@@ -1,16 +1,22 @@
-//! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section "Supersampling").
+//! `train-ss`: supersampled training of a radiance field from LR images (NeRF-SR, section
+//! "Supersampling").
 //!
 //! * [`Params`]: the stage's parameters; `supersample: 1` is plain NeRF on the same images.
 //! * [`Resolved`]: the parameters with every default that the scene decides ([`Params::resolve`]).
-//! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's average (its eq. 4), or the
-//!   kernel that made the LR images.
-//! * [`supervision`]: reads and checks all that a training is supervised by; `memory`: what that needs.
-//! * `photographs`: LR images and references, packed (`packed`) into memory and, beyond a budget, a file.
-//! * `pixel_sampler`: which pixel a bundle trains on; `pixel_rays`: its rays; `residual`: how their colours are judged.
-//! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without casting its whole footprint.
+//! * [`Supersampling`]: what rays are cast and what their colours are compared with: the paper's
+//!   average (its eq. 4), or the kernel that made the LR images.
+//! * [`supervision`]: reads and checks all that a training is supervised by; `memory`: what that
+//!   needs.
+//! * `photographs`: LR images and references, packed (`packed`) into memory and, beyond a budget, a
+//!   file.
+//! * `pixel_sampler`: which pixel a bundle trains on; `pixel_rays`: its rays; `residual`: how their
+//!   colours are judged.
+//! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without
+//!   casting its whole footprint.
 //! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
 //! * `exposure`: how bright each photograph is, where that is asked for.
-//! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`: whether it was better to ask.
+//! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`:
+//!   whether it was better to ask.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
 mod checkpoint;
@@ -65,12 +71,19 @@ impl Stage for TrainSs {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![
             ("scene", Input::required(&["scene/train"], "LR images with cameras and bounds")),
-            ("references", Input::optional(&["scene/references"], "HR images of some views, to train on beside the LR images")),
+            (
+                "references",
+                Input::optional(
+                    &["scene/references"],
+                    "HR images of some views, to train on beside the LR images",
+                ),
+            ),
             (
                 "init",
                 Input::optional(
                     &["field"],
-                    "a field to fine-tune, trained on the same scene with the same parameters; see combine",
+                    "a field to fine-tune, trained on the same scene with the same parameters; \
+                    see combine",
                 ),
             ),
         ]
@@ -81,14 +94,19 @@ impl Stage for TrainSs {
     }
 
     fn rules() -> Vec<Rule> {
-        let closed = [("supervision", json!("kernel")), ("pose_refinement", json!(true)), ("exposure", json!(true))];
+        let closed = [
+            ("supervision", json!("kernel")),
+            ("pose_refinement", json!(true)),
+            ("exposure", json!(true)),
+        ];
         let rule = |(parameter, value)| {
             let message = open_background(parameter);
             Rule::new(&message)
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))
         };
-        let importance = "parameter pixel_importance: an epoch goes through all pixels evenly; choose order random";
+        let importance = "parameter pixel_importance: an epoch goes through all pixels evenly; \
+            choose order random";
         let evenly = Rule::new(importance)
             .when("order", json!({"const": "epochs"}))
             .must("pixel_importance", json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}));
@@ -102,7 +120,10 @@ impl Stage for TrainSs {
         let views = Views::read(input)?;
         let init = context.optional_input("init");
         let has_kernel = input.path(DEGRADATION_FILE).exists();
-        let params = params.resolve(&SceneFacts { is_fine_tuning: init.is_some(), ..SceneFacts::of(&views, has_kernel) });
+        let params = params.resolve(&SceneFacts {
+            is_fine_tuning: init.is_some(),
+            ..SceneFacts::of(&views, has_kernel)
+        });
         let (model, combine) = (params.model(), params.combine);
         let mut file = FieldFile {
             format: FIELD_FORMAT,
@@ -116,7 +137,8 @@ impl Stage for TrainSs {
             (Some(init), Combine::Ensemble) => init.keep_beside(context, &mut file)?,
             _ => 0,
         };
-        let members: Vec<Resolved> = (0..params.ensemble).map(|index| params.member(index)).collect();
+        let members: Vec<Resolved> =
+            (0..params.ensemble).map(|index| params.member(index)).collect();
         let compared = if params.pose_refinement { members[0].rays } else { 0 };
         let progress = context.progress("training", compared + params.rays);
         let data = TrainingData { input, references, views: &views, progress: &progress };
@@ -124,11 +146,15 @@ impl Stage for TrainSs {
         let mut done = compared;
         for (index, own) in members.into_iter().enumerate() {
             // What the first member finds of poses holds for all.
-            let own = Resolved { pose_refinement: own.pose_refinement && (index == 0 || log.moves_cameras(&views)), ..own };
+            let own = Resolved {
+                pose_refinement: own.pose_refinement && (index == 0 || log.moves_cameras(&views)),
+                ..own
+            };
             let from = init.as_ref().map(|init| (init.member(index as u32), combine));
             let before = if index == 0 { 0 } else { done };
             let member = Member::new(context, own, (model, from), first + index as u32, before)?;
-            let trained = if index == 0 { pose_choice::train(&member, &data)? } else { member.run(&data)? };
+            let trained =
+                if index == 0 { pose_choice::train(&member, &data)? } else { member.run(&data)? };
             trained.warnings.iter().for_each(|warning| context.say(format!("{WARNING}{warning}")));
             done += trained.rays;
             log.add(trained);
@@ -138,7 +164,9 @@ impl Stage for TrainSs {
         context.write_json(TRAINING_FILE, &log)?;
         let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
         let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
-        let summary = format!("{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB");
+        let summary = format!(
+            "{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB"
+        );
         context.write_summary(&with_warnings(&summary, &log.warnings))
     }
 }

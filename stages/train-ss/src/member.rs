@@ -41,7 +41,10 @@ const DONE_WEIGHTS: &str = "field.safetensors";
 const DONE_LOG: &str = "training.json";
 
 fn far_warning(moved: &Moved) -> String {
-    format!("pose refinement: cameras have {moved}, which is far: unless the given poses are that far off, train without it")
+    format!(
+        "pose refinement: cameras have {moved}, which is far: unless the given poses are that far \
+        off, train without it"
+    )
 }
 
 impl<'a> Member<'a> {
@@ -77,8 +80,15 @@ impl<'a> Member<'a> {
         &self.output
     }
 
-    /// The same with or without pose refinement, with checkpoints in a folder of its own, its weights elsewhere, and so many rays more before it.
-    pub(crate) fn variant(&self, pose_refinement: bool, name: &str, output: PathBuf, more: u64) -> Self {
+    /// The same with or without pose refinement, with checkpoints in a folder of its own, its
+    /// weights elsewhere, and so many rays more before it.
+    pub(crate) fn variant(
+        &self,
+        pose_refinement: bool,
+        name: &str,
+        output: PathBuf,
+        more: u64,
+    ) -> Self {
         Self {
             context: self.context,
             params: Resolved { pose_refinement, ..self.params.clone() },
@@ -90,7 +100,8 @@ impl<'a> Member<'a> {
         }
     }
 
-    /// Trains it, unless an earlier run did; a network that collapses starts over where that is allowed.
+    /// Trains it, unless an earlier run did; a network that collapses starts over where that is
+    /// allowed.
     pub(crate) fn run(&self, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
         if let Some(log) = self.finished() {
             self.context.say("going on from a field that an earlier run has trained");
@@ -98,12 +109,17 @@ impl<'a> Member<'a> {
         }
         let mut said = String::new();
         for restart in 0..=self.params.restarts() {
-            let params = Resolved { seed: self.params.seed.wrapping_add(u64::from(restart)), ..self.params.clone() };
+            let params = Resolved {
+                seed: self.params.seed.wrapping_add(u64::from(restart)),
+                ..self.params.clone()
+            };
             if restart > 0 {
                 self.context.say(format!("{said}: starting over with seed {}", params.seed));
             }
             // A folder each, so that a checkpoint goes on with the seed it began with.
-            let work = self.work.as_ref().map(|w| if restart == 0 { w.clone() } else { w.join(format!("restart-{restart}")) });
+            let work = self.work.as_ref().map(|w| {
+                if restart == 0 { w.clone() } else { w.join(format!("restart-{restart}")) }
+            });
             match self.train(&params, work.as_deref(), data) {
                 Err(error) => match error.downcast_ref() {
                     Some(Collapsed(message)) => said.clone_from(message),
@@ -124,25 +140,37 @@ impl<'a> Member<'a> {
     }
 
     /// Trains to the end, with checkpoints, progress and a curve.
-    fn train(&self, params: &Resolved, work: Option<&Path>, data: &TrainingData<'_>) -> anyhow::Result<TrainingLog> {
+    fn train(
+        &self,
+        params: &Resolved,
+        work: Option<&Path>,
+        data: &TrainingData<'_>,
+    ) -> anyhow::Result<TrainingLog> {
         let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
         let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
         if let Some(work) = work {
-            std::fs::create_dir_all(work).with_context(|| format!("cannot make {}", work.display()))?;
+            std::fs::create_dir_all(work)
+                .with_context(|| format!("cannot make {}", work.display()))?;
         }
-        let mut supervision = supervision(input, params, data.references, folder, &|text| context.say(text))?;
+        let mut supervision =
+            supervision(input, params, data.references, folder, &|text| context.say(text))?;
         let (total, bundle) = (params.rays, supervision.full_side().iter().product::<usize>());
         if total < bundle as u64 {
-            let message = format!("parameter rays: {total} for a field is less than the {bundle} of one pixel");
+            let message = format!(
+                "parameter rays: {total} for a field is less than the {bundle} of one pixel"
+            );
             return Err(Failure::Usage(message).into());
         }
         let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
         let mut trainer = start(params, from, views.bounds, &context.device)?;
         let mut checkpoints = Checkpoints::new(work);
-        let mut curve = checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
+        let mut curve =
+            checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
         loop {
             if context.interrupted() {
-                checkpoints.write(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+                checkpoints
+                    .write(&*trainer, &supervision, &curve)
+                    .context("cannot write the checkpoint")?;
                 return Err(Failure::Interrupted.into());
             }
             let Some(report) = trainer.step(&mut supervision)? else { break };
@@ -151,7 +179,8 @@ impl<'a> Member<'a> {
             }
             if report.skipped {
                 context.say(format!(
-                    "step {}: something wasn't finite; the step was thrown away and the rate halved",
+                    "step {}: something wasn't finite; the step was thrown away and the rate \
+                    halved",
                     trainer.steps()
                 ));
             }
@@ -159,20 +188,25 @@ impl<'a> Member<'a> {
             supervision.refine_poses(rays as f64 / total as f64, || trainer.field())?;
             curve.add(&report, rays, total);
             progress.set(self.before + rays, &curve.note());
-            checkpoints.write_when_due(&*trainer, &supervision, &curve).context("cannot write the checkpoint")?;
+            checkpoints
+                .write_when_due(&*trainer, &supervision, &curve)
+                .context("cannot write the checkpoint")?;
         }
         let moved = supervision.moved(|| trainer.field())?;
         moved.iter().for_each(|moved| context.say(format!("cameras have {moved}")));
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         log.exposures = supervision.exposures().to_vec();
-        log.poses = supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
+        log.poses =
+            supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
         log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
         trainer.finish(&self.output)?;
         if let Some((from, Combine::AverageWeights)) = &self.from {
-            average(self.model, views.bounds, from, &self.output).context("cannot average the weights")?;
+            average(self.model, views.bounds, from, &self.output)
+                .context("cannot average the weights")?;
         }
         if let Some(work) = &self.work {
-            std::fs::copy(&self.output, work.join(DONE_WEIGHTS)).context("cannot keep the field")?;
+            std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
+                .context("cannot keep the field")?;
             artifact::write_json(&work.join(DONE_LOG), &log)?;
         }
         Ok(log)

@@ -13,7 +13,8 @@ use crate::supervision::{SupersamplingOptions, Supervision};
 pub(crate) struct MemoryNeed {
     /// The field and all that its optimiser keeps.
     pub(crate) field: u64,
-    /// Photographs as they are kept, and the field's HR pixels: in memory, or in a file where they are too many.
+    /// Photographs as they are kept, and the field's HR pixels: in memory, or in a file where they
+    /// are too many.
     pub(crate) pixels: u64,
     /// Photographs as pose refinement compares them.
     pub(crate) poses: u64,
@@ -21,33 +22,45 @@ pub(crate) struct MemoryNeed {
     pub(crate) reading: u64,
 }
 
-/// The most pixels that are kept in memory, so that a stage with many photographs leaves place for other programs.
+/// The most pixels that are kept in memory, so that a stage with many photographs leaves place for
+/// other programs.
 const MOST_PIXELS: u64 = 4_000_000_000;
 /// The program, without libtorch and with it.
 const PROGRAM: u64 = if cfg!(feature = "torch") { 150_000_000 } else { 30_000_000 };
-/// Numbers a parameter of the grid: it, its gradient, two moments, an average; and what a checkpoint copies.
+/// Numbers a parameter of the grid: it, its gradient, two moments, an average; and what a
+/// checkpoint copies.
 const NUMBERS: u64 = 5;
 /// Bytes a pixel of a photograph in floats, RGBA.
 const IN_FLOATS: u64 = 16;
-/// Bytes a pixel of its pyramid in floats, RGB: 1 + 1/4 + 1/16 + …, and of the photograph that is compared at the end.
+/// Bytes a pixel of its pyramid in floats, RGB: 1 + 1/4 + 1/16 + …, and of the photograph that is
+/// compared at the end.
 const OF_POSES: u64 = 16 + 12;
 
 impl MemoryNeed {
     /// Of a training with such a field on such views. `references` are HR.
-    pub(crate) fn of(params: &Resolved, options: &SupersamplingOptions, views: &Views, references: &[View]) -> Self {
+    pub(crate) fn of(
+        params: &Resolved,
+        options: &SupersamplingOptions,
+        views: &Views,
+        references: &[View],
+    ) -> Self {
         let mut need = Self { field: field(params), ..Self::default() };
         let packed = if views.background == Background::Opaque { 3 } else { 4 };
-        for (view, is_reference) in views.views.iter().map(|v| (v, false)).chain(references.iter().map(|v| (v, true))) {
+        for (view, is_reference) in
+            views.views.iter().map(|v| (v, false)).chain(references.iter().map(|v| (v, true)))
+        {
             let k = view.camera.intrinsics;
             let size = (k.width as usize, k.height as usize);
             let (pixels, hr) = ((size.0 * size.1) as u64, options.hr_size(size));
-            let is_cached =
-                !is_reference && options.supervision == Supervision::Kernel && HrCache::is_needed(options.filter, hr, size);
+            let is_cached = !is_reference
+                && options.supervision == Supervision::Kernel
+                && HrCache::is_needed(options.filter, hr, size);
             let cached = if is_cached { (hr.0 * hr.1) as u64 } else { 0 };
             // A bit a pixel for its mask and one for its detail.
             need.pixels += packed * pixels + pixels / 4 + 3 * cached;
             // As floats twice, or as floats, enlarged along one axis and both, and in 8 bits.
-            let enlarging = if is_cached { 12 * (hr.0 * size.1) as u64 + (12 + 3) * cached } else { 0 };
+            let enlarging =
+                if is_cached { 12 * (hr.0 * size.1) as u64 + (12 + 3) * cached } else { 0 };
             need.reading = need.reading.max((IN_FLOATS + 12) * pixels + enlarging);
             if options.pose_refinement {
                 need.poses += OF_POSES * pixels;
@@ -61,13 +74,16 @@ impl MemoryNeed {
         PROGRAM + self.poses + self.field.max(self.reading)
     }
 
-    /// Where pixels go when so much memory is free: into memory as far as there is place, and then into a file in `folder`.
+    /// Where pixels go when so much memory is free: into memory as far as there is place, and then
+    /// into a file in `folder`.
     pub(crate) fn plan(&self, free: Option<u64>, folder: PathBuf) -> Result<PixelMemory, Failure> {
         let least = self.least();
         let free = free.unwrap_or(u64::MAX);
         let left = free.checked_sub(least).ok_or_else(|| {
             let (least, free) = (sized(least), sized(free));
-            Failure::Usage(format!("the training needs {least} of memory, and {free} are free; {MEMORY_REMEDY}"))
+            Failure::Usage(format!(
+                "the training needs {least} of memory, and {free} are free; {MEMORY_REMEDY}"
+            ))
         })?;
         Ok(PixelMemory::new(MOST_PIXELS.min(left), folder))
     }
@@ -79,11 +95,14 @@ impl MemoryNeed {
         let field = sized(self.field);
         let pixels = sized(in_memory);
         match self.pixels.saturating_sub(budget) {
-            0 => format!("memory: about {total}, of it {field} for the field and {pixels} for pixels"),
+            0 => format!(
+                "memory: about {total}, of it {field} for the field and {pixels} for pixels"
+            ),
             rest => {
                 let rest = sized(rest);
                 format!(
-                    "memory: about {total}, of it {field} for the field and {pixels} for pixels; {rest} of pixels go into a file"
+                    "memory: about {total}, of it {field} for the field and {pixels} for pixels; \
+                    {rest} of pixels go into a file"
                 )
             }
         }
@@ -94,7 +113,8 @@ impl MemoryNeed {
 fn field(params: &Resolved) -> u64 {
     match &params.field {
         ResolvedField::Grid { architecture, .. } => 4 * NUMBERS * architecture.grid_len() as u64,
-        // Two networks of some half a million weights; what libtorch takes for a step doesn't show in their number.
+        // Two networks of some half a million weights; what libtorch takes for a step doesn't show
+        // in their number.
         ResolvedField::Mlp { .. } => 2_000_000_000,
     }
 }
@@ -114,8 +134,13 @@ mod tests {
             intrinsics: Intrinsics::from_angle_x(2000, 1500, 0.7),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
         };
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
-        let views = Views::new(Background::Opaque, bounds, (0..images).map(|i| View::camera_only(camera(i))).collect());
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let views = Views::new(
+            Background::Opaque,
+            bounds,
+            (0..images).map(|i| View::camera_only(camera(i))).collect(),
+        );
         let params = Params::default().resolve(&SceneFacts::of(&views, true));
         let options = SupersamplingOptions {
             supervision: Supervision::Kernel,
@@ -132,32 +157,48 @@ mod tests {
         MemoryNeed::of(&params, &options, &views, &[])
     }
 
-    /// Images of three megapixels: three bytes a pixel, twelve more where HR pixels are cached, two bits besides.
+    /// Images of three megapixels: three bytes a pixel, twelve more where HR pixels are cached, two
+    /// bits besides.
     #[test]
     fn pixels_take_what_their_kernel_asks_for() {
         for (filter, bytes) in [(Filter::Box, 3), (Filter::Lanczos, 15)] {
             let [few, many] = [10, 40].map(|images| need(images, filter, false));
             assert_eq!(few.pixels, 10 * 3_000_000 * bytes + 10 * 750_000);
-            assert_eq!((many.pixels, many.field, many.reading), (4 * few.pixels, few.field, few.reading));
+            assert_eq!(
+                (many.pixels, many.field, many.reading),
+                (4 * few.pixels, few.field, few.reading)
+            );
             assert_eq!((few.poses, need(10, filter, true).poses), (0, 10 * 3_000_000 * OF_POSES));
         }
     }
 
-    /// As many pixels stay in memory as there is place for, and where the rest has none, both numbers are said.
+    /// As many pixels stay in memory as there is place for, and where the rest has none, both
+    /// numbers are said.
     #[test]
     fn little_memory_sends_pixels_to_a_file() {
-        let need = MemoryNeed { field: 300_000_000, pixels: 5_000_000_000, poses: 0, reading: 100_000_000 };
+        let need = MemoryNeed {
+            field: 300_000_000,
+            pixels: 5_000_000_000,
+            poses: 0,
+            reading: 100_000_000,
+        };
         let least = PROGRAM + 300_000_000;
         let budget = |free| need.plan(free, PathBuf::new()).map(|memory| memory.left());
         assert_eq!(budget(None).unwrap(), MOST_PIXELS);
         assert_eq!(budget(Some(least + 77)).unwrap(), 77);
         let said = budget(Some(least - 1_000_000)).unwrap_err().to_string();
         let [needed, free] = [least, least - 1_000_000].map(sized);
-        assert_eq!(said, format!("the training needs {needed} of memory, and {free} are free; {MEMORY_REMEDY}"));
+        assert_eq!(
+            said,
+            format!("the training needs {needed} of memory, and {free} are free; {MEMORY_REMEDY}")
+        );
         let total = sized(least + MOST_PIXELS);
         assert_eq!(
             need.in_words(MOST_PIXELS),
-            format!("memory: about {total}, of it 300.0 MB for the field and 4.0 GB for pixels; 1.0 GB of pixels go into a file")
+            format!(
+                "memory: about {total}, of it 300.0 MB for the field and 4.0 GB for pixels; 1.0 \
+                GB of pixels go into a file"
+            )
         );
         let total = sized(least + 2_000_000);
         assert_eq!(

@@ -15,11 +15,12 @@ pub(crate) struct MovingCameras {
 
 /// Rounds of a training.
 const ROUNDS: u32 = 24;
-/// Shares of the training at the first and after the last round. It begins early, before the field has explained photographs that don't fit
-/// by floaters, and ends before weights are averaged.
+/// Shares of the training at the first and after the last round. It begins early, before the field
+/// has explained photographs that don't fit by floaters, and ends before weights are averaged.
 const FIRST: f64 = 0.02;
 const LAST: f64 = 0.7;
-/// Share at which photographs are compared at their own size; before it at smaller ones, since a field that isn't sharp yet pulls from afar.
+/// Share at which photographs are compared at their own size; before it at smaller ones, since a
+/// field that isn't sharp yet pulls from afar.
 const OWN_SIZE: f64 = 0.4;
 /// Renderings of a camera in a round.
 const RENDERINGS: u32 = 3;
@@ -44,7 +45,8 @@ impl MovingCameras {
 
     /// Whether it is time for a round, with such a share of the training done.
     pub(crate) fn are_due(&self, done: f64) -> bool {
-        self.rounds < ROUNDS && done >= FIRST + (LAST - FIRST) * f64::from(self.rounds) / f64::from(ROUNDS)
+        self.rounds < ROUNDS
+            && done >= FIRST + (LAST - FIRST) * f64::from(self.rounds) / f64::from(ROUNDS)
     }
 
     /// Moves every camera; `exposure` has what the field's colours are to a photograph's.
@@ -58,7 +60,8 @@ impl MovingCameras {
         for (i, (camera, photograph)) in self.now.iter_mut().zip(&self.photographs).enumerate() {
             let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE);
             let options = Options { renderings: RENDERINGS, background, exposure: exposure(i) };
-            *camera = refine(field, camera, photograph, smaller.max(0.0).ceil() as u32, &options)?.camera;
+            *camera =
+                refine(field, camera, photograph, smaller.max(0.0).ceil() as u32, &options)?.camera;
         }
         take_back_common_motion(&mut self.now, &self.were);
         self.rounds += 1;
@@ -74,9 +77,16 @@ impl MovingCameras {
     ) -> Result<Moved, Box<dyn std::error::Error + Send + Sync>> {
         let options = Options { renderings: 1, background, ..Options::default() };
         let seen = self.now.iter().zip(&self.photographs).take(count);
-        let depths = seen.map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
-        let depths = depths.collect::<Result<Vec<_>, Box<dyn std::error::Error + Send + Sync>>>()?;
-        let steps = self.were.iter().zip(&self.now).zip(depths).map(|((from, to), depth)| CameraMove { from, to, depth });
+        let depths = seen
+            .map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
+        let depths =
+            depths.collect::<Result<Vec<_>, Box<dyn std::error::Error + Send + Sync>>>()?;
+        let steps = self
+            .were
+            .iter()
+            .zip(&self.now)
+            .zip(depths)
+            .map(|((from, to), depth)| CameraMove { from, to, depth });
         Ok(Moved::between(steps))
     }
 
@@ -96,7 +106,8 @@ impl MovingCameras {
         let Some((rounds, poses)) = bytes.split_first_chunk::<4>() else { return };
         self.rounds = u32::from_le_bytes(*rounds);
         let numbers = poses.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b));
-        let places = self.now.iter_mut().flat_map(|camera| camera.camera_to_world.as_flattened_mut());
+        let places =
+            self.now.iter_mut().flat_map(|camera| camera.camera_to_world.as_flattened_mut());
         places.zip(numbers).for_each(|(place, number)| *place = number);
     }
 }
@@ -107,11 +118,17 @@ mod tests {
     use radiance::{Architecture, Field};
     use scene::{Bounds, Intrinsics};
 
-    /// Rounds come at their times, each once, and a checkpoint knows how many there were and where they led.
+    /// Rounds come at their times, each once, and a checkpoint knows how many there were and where
+    /// they led.
     #[test]
     fn rounds_are_counted_and_kept() {
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
-        let field = Field::new(Architecture { finest: 32, levels: 4, log2_entries: 10, ..Architecture::default() }, bounds, 3);
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let field = Field::new(
+            Architecture { finest: 32, levels: 4, log2_entries: 10, ..Architecture::default() },
+            bounds,
+            3,
+        );
         let intrinsics = Intrinsics::from_angle_x(24, 24, 0.69);
         let camera = |x: f64| Camera {
             name: format!("at {x}"),

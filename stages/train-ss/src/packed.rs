@@ -11,9 +11,11 @@ use scene::Photograph;
 
 use crate::pixel_set::PixelSet;
 
-/// Where pixels are kept: in memory, and beyond a budget in a file without a name, which goes with the process.
+/// Where pixels are kept: in memory, and beyond a budget in a file without a name, which goes with
+/// the process.
 ///
-/// The system keeps of that file in memory what it has place for, so little is lost while there is some.
+/// The system keeps of that file in memory what it has place for, so little is lost while there is
+/// some.
 #[derive(Debug)]
 pub(crate) struct PixelMemory {
     /// Bytes that may still be kept in memory.
@@ -61,7 +63,8 @@ impl PixelMemory {
         self.left
     }
 
-    /// The first thing that went wrong with the file, if anything did: pixels read since then mean nothing.
+    /// The first thing that went wrong with the file, if anything did: pixels read since then mean
+    /// nothing.
     pub(crate) fn fault(&self) -> Option<&io::Error> {
         self.file.as_ref()?.fault.get()
     }
@@ -120,7 +123,9 @@ impl Bytes {
     pub(crate) fn write(&mut self, at: usize, bytes: &[u8]) {
         match self {
             Self::Memory(kept) => kept[at..at + bytes.len()].copy_from_slice(bytes),
-            Self::File { file, start, .. } => file.note(file.file.write_all_at(bytes, *start + at as u64)),
+            Self::File { file, start, .. } => {
+                file.note(file.file.write_all_at(bytes, *start + at as u64))
+            }
         }
     }
 }
@@ -151,7 +156,12 @@ impl Samples {
         match self {
             Self::Rgb8 => bytes.copy_from_slice(&straight(pixel)[..3]),
             Self::Rgba8 => bytes.copy_from_slice(&straight(pixel)),
-            Self::Rgba32 => bytes.as_chunks_mut::<4>().0.iter_mut().zip(pixel).for_each(|(b, v)| *b = v.to_le_bytes()),
+            Self::Rgba32 => bytes
+                .as_chunks_mut::<4>()
+                .0
+                .iter_mut()
+                .zip(pixel)
+                .for_each(|(b, v)| *b = v.to_le_bytes()),
         }
     }
 
@@ -254,7 +264,8 @@ impl PackedPhotograph {
         }
     }
 
-    /// What was photographed, whether it counts or not: RGB over a background, premultiplied RGBA where that is open.
+    /// What was photographed, whether it counts or not: RGB over a background, premultiplied RGBA
+    /// where that is open.
     pub(crate) fn whole(&self) -> Image {
         self.image(Self::whole_row)
     }
@@ -271,7 +282,10 @@ impl PackedPhotograph {
             || vec![[0.0; 4]; self.width],
             |row, (y, samples)| {
                 read(self, y * self.width..(y + 1) * self.width, row);
-                samples.chunks_exact_mut(channels).zip(row).for_each(|(out, pixel)| out.copy_from_slice(&pixel[..channels]));
+                samples
+                    .chunks_exact_mut(channels)
+                    .zip(row)
+                    .for_each(|(out, pixel)| out.copy_from_slice(&pixel[..channels]));
             },
         );
         Image::new(self.width, self.height, channels, data)
@@ -309,7 +323,10 @@ fn straight([r, g, b, a]: [f32; 4]) -> [u8; 4] {
 /// The bytes of an image, RGBA or RGB: 8-bit levels where they give every sample back.
 fn packed(image: &Image) -> (Samples, Vec<u8>) {
     let channels = image.channels;
-    let row_of = |y: usize| image.data[y * image.width * channels..(y + 1) * image.width * channels].chunks_exact(channels);
+    let row_of = |y: usize| {
+        image.data[y * image.width * channels..(y + 1) * image.width * channels]
+            .chunks_exact(channels)
+    };
     let pixel = |p: &[f32]| [p[0], p[1], p[2], p.get(3).copied().unwrap_or(1.0)];
     let is_level = |p: &[f32]| premultiplied(straight(pixel(p))) == pixel(p);
     let rows = || (0..image.height).into_par_iter();
@@ -335,14 +352,20 @@ mod tests {
 
     use super::*;
 
-    fn packed_photograph(image: Image, mask: Option<Mask>, memory: &mut PixelMemory) -> PackedPhotograph {
+    fn packed_photograph(
+        image: Image,
+        mask: Option<Mask>,
+        memory: &mut PixelMemory,
+    ) -> PackedPhotograph {
         PackedPhotograph::new(&Photograph { image, mask }, memory).unwrap()
     }
 
     proptest! {
-        /// Whatever a PNG holds takes a byte a sample, and comes back to the last bit, from memory and from a file.
+        /// Whatever a PNG holds takes a byte a sample, and comes back to the last bit, from memory
+        /// and from a file.
         #[test]
-        fn eight_bits_come_back(bytes in prop::collection::vec(any::<u8>(), 4 * 6), opaque: bool, background in 0.0f32..1.0) {
+        fn eight_bits_come_back(bytes in prop::collection::vec(any::<u8>(), 4 * 6), opaque: bool,
+            background in 0.0f32..1.0) {
             let mut bytes = bytes;
             if opaque {
                 bytes.iter_mut().skip(3).step_by(4).for_each(|alpha| *alpha = 255);
@@ -353,7 +376,8 @@ mod tests {
                 let mut memory = PixelMemory::new(budget, folder.path().to_path_buf());
                 let packed = packed_photograph(image.clone(), None, &mut memory);
                 let is_opaque = image.data.chunks_exact(4).all(|p| p[3] == 1.0);
-                prop_assert_eq!(packed.samples, if is_opaque { Samples::Rgb8 } else { Samples::Rgba8 });
+                prop_assert_eq!(packed.samples,
+                    if is_opaque { Samples::Rgb8 } else { Samples::Rgba8 });
                 prop_assert_eq!(memory.in_file() > 0, budget == 0);
                 prop_assert_eq!(packed.whole(), image.clone());
                 let over = packed.over(background);
@@ -368,9 +392,13 @@ mod tests {
     fn floats_and_masks_come_back() {
         let image = Image::new(2, 1, 4, vec![0.1, 0.2, 0.3, 0.77, 0.5, 0.25, 0.125, 1.0]);
         let mask = Mask { width: 2, height: 1, counts: vec![false, true] };
-        let packed = packed_photograph(image.clone(), Some(mask.clone()), &mut PixelMemory::unlimited());
+        let packed =
+            packed_photograph(image.clone(), Some(mask.clone()), &mut PixelMemory::unlimited());
         assert_eq!(packed.samples, Samples::Rgba32);
-        assert!(packed.pixel(0).iter().all(|v| v.is_nan()) && packed.pixel(1) == [0.5, 0.25, 0.125, 1.0]);
+        assert!(
+            packed.pixel(0).iter().all(|v| v.is_nan())
+                && packed.pixel(1) == [0.5, 0.25, 0.125, 1.0]
+        );
         assert_eq!(packed.unpacked(), Photograph { image, mask: Some(mask) });
         assert!(packed.is_known());
         let none = Mask { width: 2, height: 1, counts: vec![false; 2] };
@@ -383,7 +411,8 @@ mod tests {
     fn files_are_written_and_their_faults_known() {
         let folder = tempfile::tempdir().unwrap();
         let mut memory = PixelMemory::new(2, folder.path().to_path_buf());
-        let (mut first, mut second) = (memory.keep(vec![1, 2]).unwrap(), memory.keep(vec![3, 4, 5]).unwrap());
+        let (mut first, mut second) =
+            (memory.keep(vec![1, 2]).unwrap(), memory.keep(vec![3, 4, 5]).unwrap());
         assert!(matches!(first, Bytes::Memory(_)) && matches!(second, Bytes::File { .. }));
         let mut buffer = Vec::new();
         for bytes in [&mut first, &mut second] {

@@ -5,39 +5,43 @@ use serde::{Deserialize, Serialize};
 use crate::pixel_sampler::Order;
 use crate::supervision::Supervision;
 
-/// Parameters of `train-ss`. Those that stay unset get a default from the scene ([`Params::resolve`]).
+/// Parameters of `train-ss`. Those that stay unset get a default from the scene
+/// ([`Params::resolve`]).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
     /// Kind of field: the hash grid, or the paper's MLPs, which take hours on a CPU.
     #[schemars(extend("x-group" = "field"))]
     pub field: FieldParams,
-    /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. It may differ from the scale of the
-    /// views: fewer rays per pixel mean more pixels for the same `rays`. With `supervision: kernel` it is the number of HR pixels
-    /// along each side of an LR pixel and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
+    /// Sub-pixel rays along each side of an LR pixel, called s in the paper; 1 is plain NeRF. It
+    /// may differ from the scale of the views: fewer rays per pixel mean more pixels for the same
+    /// `rays`. With `supervision: kernel` it is the number of HR pixels along each side of an LR
+    /// pixel and may be fractional: at 1.5, an LR pixel casts 2 × 2 rays.
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "sampling"))]
     pub supersample: f64,
-    /// How rays are compared with the LR pixel. Default: `kernel` for `grid` where `prep` made the LR images or assumes their
-    /// kernel and `background` isn't `alpha`, else `average`.
+    /// How rays are compared with the LR pixel. Default: `kernel` for `grid` where `prep` made the
+    /// LR images or assumes their kernel and `background` isn't `alpha`, else `average`.
     #[schemars(extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub supervision: Option<Supervision>,
-    /// Finds one factor for red, green and blue of each photograph, for photographs with several exposures or white balances.
-    /// Rendered views have the mean exposure of the photographs.
+    /// Finds one factor for red, green and blue of each photograph, for photographs with several
+    /// exposures or white balances. Rendered views have the mean exposure of the photographs.
     #[schemars(extend("x-group" = "data"))]
     pub exposure: bool,
-    /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras share is removed. Each field of
-    /// an `ensemble` finds its own poses. `nerf-sr run registered` then renders test views from registered cameras.
+    /// Optimises camera poses during training, for poses that aren't exact. Motion that all cameras
+    /// share is removed. Each field of an `ensemble` finds its own poses. `nerf-sr run registered`
+    /// then renders test views from registered cameras.
     #[schemars(extend("x-group" = "data"))]
     pub pose_refinement: bool,
     /// Maximum number of HR references: the first ones of input `references` are used.
     #[schemars(extend("x-group" = "data", "x-default" = "all"))]
     pub max_references: Option<u32>,
-    /// Number of fields to train independently. `rays` is divided among them, and their rendered images are averaged. Field m
-    /// equals a single field trained with seed `seed` + m.
+    /// Number of fields to train independently. `rays` is divided among them, and their rendered
+    /// images are averaged. Field m equals a single field trained with seed `seed` + m.
     #[schemars(range(min = 1, max = 16), extend("x-group" = "output"))]
     pub ensemble: u32,
-    /// How the initial field (input `init`) and the fine-tuned field are used. Default: `average_weights` in NDC, where all cameras
-    /// see the same side of the scene; `ensemble` elsewhere, where a reference tells nothing about the other sides.
+    /// How the initial field (input `init`) and the fine-tuned field are used. Default:
+    /// `average_weights` in NDC, where all cameras see the same side of the scene; `ensemble`
+    /// elsewhere, where a reference tells nothing about the other sides.
     #[schemars(extend("x-group" = "output", "x-default" = BY_SCENE))]
     pub combine: Option<Combine>,
     /// Seed of all random numbers.
@@ -90,37 +94,45 @@ pub struct GridParams {
     /// Maximum number of rays in a step.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
-    /// Number of samples that a step aims at. Steps have fewer rays while space is full of semi-transparent density.
+    /// Number of samples that a step aims at. Steps have fewer rays while space is full of
+    /// semi-transparent density.
     #[schemars(range(min = 1024, max = 16_777_216), extend("x-group" = "sampling"))]
     pub samples_per_step: u32,
     /// Order in which pixels are drawn.
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
-    /// How many times more often a pixel with detail around it is drawn than a flat one, with `order: random`. The pixel's weight
-    /// in the loss is divided by this factor, which keeps the expected loss unchanged. Default: 10 with `order: random`, else 1.
+    /// How many times more often a pixel with detail around it is drawn than a flat one, with
+    /// `order: random`. The pixel's weight in the loss is divided by this factor, which keeps the
+    /// expected loss unchanged. Default: 10 with `order: random`, else 1.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling", "x-default" = "10"))]
     pub pixel_importance: Option<f64>,
-    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up to `supersample`.
+    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up
+    /// to `supersample`.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
     pub supersample_warmup: f64,
-    /// Number of steps at the start that draw pixels only from the middle half of each image's width and height.
+    /// Number of steps at the start that draw pixels only from the middle half of each image's
+    /// width and height.
     #[schemars(extend("x-group" = "sampling"))]
     pub precrop_steps: u32,
-    /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses the whole cube; else 512.
+    /// Samples along the diagonal of the unit cube. Default: 256 in NDC, where every ray crosses
+    /// the whole cube; else 512.
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
-    /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default: 0.004 in NDC with `background:
-    /// opaque`, where empty space would otherwise fill with density; else 0, because the loss costs detail.
+    /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:
+    /// 0.004 in NDC with `background: opaque`, where empty space would otherwise fill with density;
+    /// else 0, because the loss costs detail.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub distortion: Option<f64>,
-    /// Weight of the floater loss, which penalises semi-transparent density of the background's colour. No image can tell such
-    /// density from empty space. Default: 0.001 where the background is white or black, else 0.
+    /// Weight of the floater loss, which penalises semi-transparent density of the background's
+    /// colour. No image can tell such density from empty space. Default: 0.001 where the background
+    /// is white or black, else 0.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub floater_loss: Option<f64>,
     /// Highest learning rate of the grid's coarsest level.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate: f64,
-    /// Ratio of a level's learning rate to that of the next coarser level. Below 1, coarse levels fit the images first.
+    /// Ratio of a level's learning rate to that of the next coarser level. Below 1, coarse levels
+    /// fit the images first.
     #[schemars(range(min = 0.01, max = 2.0), extend("x-group" = "optimiser"))]
     pub level_rate: f64,
     /// Highest learning rate of the MLPs.
@@ -129,7 +141,8 @@ pub struct GridParams {
     /// Learning rates at the end, as a share of the highest ones. They fall exponentially.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
-    /// Decay of the moving average of the weights, which starts late in training. 0 uses the final weights without averaging.
+    /// Decay of the moving average of the weights, which starts late in training. 0 uses the final
+    /// weights without averaging.
     #[schemars(range(min = 0.0, max = 0.999), extend("x-group" = "optimiser"))]
     pub ema_decay: f64,
     /// Weight decay of the MLPs.
@@ -141,16 +154,16 @@ pub struct GridParams {
     /// Cells along an axis of the coarsest level.
     #[schemars(range(min = 2, max = 512), extend("x-group" = "field"))]
     pub base_resolution: u32,
-    /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the unit cube as the cameras see it,
-    /// at least `base_resolution`.
+    /// Cells along an axis of the finest level. Default: 2.56 cells for each LR pixel across the
+    /// unit cube as the cameras see it, at least `base_resolution`.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub max_resolution: Option<u32>,
-    /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, no more than a ray has samples;
-    /// elsewhere no limit.
+    /// Maximum number of cells along z, of any level. Default: in NDC, where rays run along z, no
+    /// more than a ray has samples; elsewhere no limit.
     #[schemars(range(min = 2, max = 4096), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub finest_z: Option<u32>,
-    /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a `max_resolution` of 256, plus 2 for each
-    /// doubling of `max_resolution`.
+    /// Base-2 logarithm of the maximum number of entries per level. Default: 17 at a
+    /// `max_resolution` of 256, plus 2 for each doubling of `max_resolution`.
     #[schemars(range(min = 8, max = 22), extend("x-group" = "field", "x-default" = BY_SCENE))]
     pub log2_hashmap_size: Option<u32>,
     /// Width of the MLPs' hidden layers.
@@ -192,8 +205,8 @@ impl Default for GridParams {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct MlpParams {
-    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default: 20 epochs, or 30 in NDC. An epoch
-    /// is one pass over all pixels.
+    /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble. Default: 20
+    /// epochs, or 30 in NDC. An epoch is one pass over all pixels.
     #[schemars(range(min = 1), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub rays: Option<u64>,
     /// Maximum number of rays in a step.
@@ -202,15 +215,17 @@ pub struct MlpParams {
     /// Order in which pixels are drawn.
     #[schemars(extend("x-group" = "sampling"))]
     pub order: Order,
-    /// How many times more often a pixel with detail around it is drawn than a flat one, with `order: random`. The pixel's weight
-    /// in the loss is divided by this factor, which keeps the expected loss unchanged.
+    /// How many times more often a pixel with detail around it is drawn than a flat one, with
+    /// `order: random`. The pixel's weight in the loss is divided by this factor, which keeps the
+    /// expected loss unchanged.
     #[schemars(range(min = 1.0, max = 100.0), extend("x-group" = "sampling"))]
     pub pixel_importance: f64,
-    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up to `supersample`.
+    /// Fraction of the rays that warms up with fewer sub-pixel rays per side: 1, 2, 4 and so on, up
+    /// to `supersample`.
     #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "sampling"))]
     pub supersample_warmup: f64,
-    /// Number of steps at the start that draw pixels only from the middle half of each image's width and height. Default: 0 in NDC,
-    /// else 1000.
+    /// Number of steps at the start that draw pixels only from the middle half of each image's
+    /// width and height. Default: 0 in NDC, else 1000.
     #[schemars(extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub precrop_steps: Option<u32>,
     /// Samples of the coarse MLP along a ray.
@@ -228,11 +243,12 @@ pub struct MlpParams {
     /// Learning rate at the end, as a share of the highest one.
     #[schemars(range(min = 1e-6, max = 1.0), extend("x-group" = "optimiser"))]
     pub learning_rate_decay: f64,
-    /// How the learning rate falls. A training shorter than the paper's compresses the whole schedule into its steps.
+    /// How the learning rate falls. A training shorter than the paper's compresses the whole
+    /// schedule into its steps.
     #[schemars(extend("x-group" = "optimiser"))]
     pub schedule: RateSchedule,
-    /// Maximum number of restarts, each with the next seed, of an MLP that has collapsed to the background or to a wall in front of
-    /// every camera.
+    /// Maximum number of restarts, each with the next seed, of an MLP that has collapsed to the
+    /// background or to a wall in front of every camera.
     #[schemars(range(min = 0, max = 100), extend("x-group" = "optimiser"))]
     pub restarts: u32,
     /// Octaves of the encoding of positions.
@@ -241,7 +257,8 @@ pub struct MlpParams {
     /// Octaves of the encoding of directions.
     #[schemars(range(min = 0, max = 16), extend("x-group" = "field"))]
     pub direction_frequencies: u32,
-    /// In NDC, colours depend on the ray's direction in NDC, as in the paper's code, and not on its direction in the world.
+    /// In NDC, colours depend on the ray's direction in NDC, as in the paper's code, and not on its
+    /// direction in the world.
     #[schemars(extend("x-group" = "field"))]
     pub ndc_directions: bool,
     /// Number of layers that density and colour share.
@@ -282,7 +299,8 @@ impl Default for MlpParams {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Combine {
-    /// The mean of their weights is kept (Wortsman et al. 2022, "Robust fine-tuning"): one field to render.
+    /// The mean of their weights is kept (Wortsman et al. 2022, "Robust fine-tuning"): one field to
+    /// render.
     AverageWeights,
     /// Their rendered images are averaged: better, and as slow as two fields.
     Ensemble,

@@ -15,10 +15,18 @@ pub(crate) struct Photographs {
 
 impl Photographs {
     /// Reads the first photographs of an input, at most so many, and packs each at once.
-    pub(crate) fn read(input: &GivenInput, most: usize, memory: &mut PixelMemory) -> anyhow::Result<Self> {
+    pub(crate) fn read(
+        input: &GivenInput,
+        most: usize,
+        memory: &mut PixelMemory,
+    ) -> anyhow::Result<Self> {
         let mut views = Views::read(input)?;
         views.views.truncate(most);
-        let images = views.views.iter().map(|view| read(input, view, memory)).collect::<anyhow::Result<_>>()?;
+        let images = views
+            .views
+            .iter()
+            .map(|view| read(input, view, memory))
+            .collect::<anyhow::Result<_>>()?;
         Ok(Self { views, images })
     }
 
@@ -28,7 +36,8 @@ impl Photographs {
         if background == Background::Alpha {
             return self;
         }
-        let images = self.images.into_iter().map(|photograph| photograph.over(background.shown())).collect();
+        let images =
+            self.images.into_iter().map(|photograph| photograph.over(background.shown())).collect();
         Self { images, ..self }
     }
 }
@@ -37,24 +46,37 @@ impl Photographs {
 impl Photographs {
     /// An image that a camera took, RGB or premultiplied RGBA.
     pub(crate) fn taken_by(camera: scene::Camera, image: pixels::Image) -> Self {
-        let views = Views::new(Background::White, scene::Bounds::default(), vec![View::camera_only(camera)]);
+        let views = Views::new(
+            Background::White,
+            scene::Bounds::default(),
+            vec![View::camera_only(camera)],
+        );
         let packed = PackedPhotograph::new(&image.into(), &mut PixelMemory::unlimited()).unwrap();
         Self { views, images: vec![packed] }
     }
 }
 
-fn read(input: &GivenInput, view: &View, memory: &mut PixelMemory) -> anyhow::Result<PackedPhotograph> {
+fn read(
+    input: &GivenInput,
+    view: &View,
+    memory: &mut PixelMemory,
+) -> anyhow::Result<PackedPhotograph> {
     let (name, k) = (&view.camera.name, view.camera.intrinsics);
     let place = input.folder().display();
     let photograph = view.read_photograph(input).bad_input(&place)?;
-    let photograph = photograph.with_context(|| format!("view {name}: it has no image")).bad_input(&place)?;
+    let photograph =
+        photograph.with_context(|| format!("view {name}: it has no image")).bad_input(&place)?;
     let (width, height) = (photograph.image.width, photograph.image.height);
     if (width, height) != (k.width as usize, k.height as usize) {
-        let message = format!("{place}: view {name}: {width}×{height} pixels where its camera has {}×{}", k.width, k.height);
+        let message = format!(
+            "{place}: view {name}: {width}×{height} pixels where its camera has {}×{}",
+            k.width, k.height
+        );
         return Err(Failure::BadInput(message).into());
     }
     Ok(PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?)
 }
 
 /// What to say where pixels can't be written to their file.
-pub(crate) const NO_PLACE: &str = "cannot keep pixels in a file beside the output; make place on that disk";
+pub(crate) const NO_PLACE: &str =
+    "cannot keep pixels in a file beside the output; make place on that disk";

@@ -5,7 +5,8 @@ use scene::{Camera, Intrinsics};
 pub(crate) struct PixelRays {
     intrinsics: Intrinsics,
     origin: [f32; 3],
-    /// Of a pinhole: direction of image position (0, 0), and what one pixel to the right or down adds; not of unit length.
+    /// Of a pinhole: direction of image position (0, 0), and what one pixel to the right or down
+    /// adds; not of unit length.
     corner: [f64; 3],
     right: [f64; 3],
     down: [f64; 3],
@@ -27,7 +28,8 @@ impl PixelRays {
     /// The ray through a place, in pixels.
     pub(crate) fn ray(&self, place: [f64; 2], background: [f32; 3]) -> Ray {
         let [u, v] = self.intrinsics.undistort(place);
-        let d: [f64; 3] = std::array::from_fn(|i| self.corner[i] + u * self.right[i] + v * self.down[i]);
+        let d: [f64; 3] =
+            std::array::from_fn(|i| self.corner[i] + u * self.right[i] + v * self.down[i]);
         let length = d.iter().map(|x| x * x).sum::<f64>().sqrt();
         Ray { origin: self.origin, direction: d.map(|x| (x / length) as f32), background }
     }

@@ -16,7 +16,8 @@ pub enum Order {
     Epochs,
 }
 
-/// Draws the pixel that a bundle trains on. Pixels of all views have numbers, one view after the other.
+/// Draws the pixel that a bundle trains on. Pixels of all views have numbers, one view after the
+/// other.
 pub(crate) struct PixelSampler {
     views: Vec<Numbered>,
     /// Numbers of all pixels.
@@ -54,13 +55,23 @@ impl PixelSampler {
         Self { views, numbers, focus, order, precrop_bundles, seed }
     }
 
-    /// The view and pixel that a bundle trains on. `counts` says of one whether anything is known of it.
-    pub(crate) fn draw(&self, bundle: u64, counts: impl Fn(usize, usize) -> bool) -> (usize, usize) {
+    /// The view and pixel that a bundle trains on. `counts` says of one whether anything is known
+    /// of it.
+    pub(crate) fn draw(
+        &self,
+        bundle: u64,
+        counts: impl Fn(usize, usize) -> bool,
+    ) -> (usize, usize) {
         let mut rng = CounterRng::new(self.seed, PIXEL, bundle);
         let (view, pixel) = match self.order {
             Order::Epochs if bundle >= self.precrop_bundles => {
                 let bundle = bundle - self.precrop_bundles;
-                self.place(shuffled(self.seed, bundle / self.numbers, bundle % self.numbers, self.numbers))
+                self.place(shuffled(
+                    self.seed,
+                    bundle / self.numbers,
+                    bundle % self.numbers,
+                    self.numbers,
+                ))
             }
             _ => {
                 let mut place = self.place(self.focus.draw(self.numbers, &mut rng));
@@ -75,7 +86,8 @@ impl PixelSampler {
         };
         if bundle < self.precrop_bundles {
             let Numbered { width, height, .. } = self.views[view];
-            let mut middle = |length: usize| length / 4 + rng.below((length as u64 / 2).max(1)) as usize;
+            let mut middle =
+                |length: usize| length / 4 + rng.below((length as u64 / 2).max(1)) as usize;
             let (x, y) = (middle(width), middle(height));
             return (view, y * width + x);
         }
@@ -91,7 +103,11 @@ impl PixelSampler {
 
     /// Weight of the loss of a bundle that trains on a pixel of a view.
     pub(crate) fn weight(&self, bundle: u64, (view, pixel): (usize, usize)) -> f32 {
-        if bundle < self.precrop_bundles { 1.0 } else { self.focus.weight(self.views[view].before + pixel as u64) }
+        if bundle < self.precrop_bundles {
+            1.0
+        } else {
+            self.focus.weight(self.views[view].before + pixel as u64)
+        }
     }
 
     /// Numbers of all pixels.
@@ -101,8 +117,9 @@ impl PixelSampler {
     }
 }
 
-/// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's loss by how much more rarely than
-/// evenly it is drawn: the expectation of the loss and of its gradient is that of even draws.
+/// Draws pixels that have detail around them more often than flat ones, and weighs each pixel's
+/// loss by how much more rarely than evenly it is drawn: the expectation of the loss and of its
+/// gradient is that of even draws.
 pub(crate) struct Focus {
     /// Numbers of the pixels with detail, among those of all views.
     detailed: PixelSet,
@@ -119,8 +136,13 @@ impl Focus {
     /// Detailed pixels are drawn `importance` times as often as flat ones.
     pub(crate) fn new(importance: f64, pixels: u64, detailed: PixelSet) -> Self {
         let share = detailed.len() as f64 / pixels.max(1) as f64;
-        let even = if importance > 1.0 && share > 0.0 { 1.0 / (importance - 1.0).mul_add(share, 1.0) } else { 1.0 };
-        let weights = [1.0 / even, 1.0 / (even * importance)].map(|w| if even < 1.0 { w as f32 } else { 1.0 });
+        let even = if importance > 1.0 && share > 0.0 {
+            1.0 / (importance - 1.0).mul_add(share, 1.0)
+        } else {
+            1.0
+        };
+        let weights = [1.0 / even, 1.0 / (even * importance)]
+            .map(|w| if even < 1.0 { w as f32 } else { 1.0 });
         Self { detailed, even: even as f32, weights }
     }
 
@@ -146,29 +168,34 @@ pub(crate) fn detailed(image: &Image) -> Vec<bool> {
     let mut detailed = vec![false; width * image.height];
     // Ranges over three rows, and then of three such columns.
     let buffers = || (vec![0.0f32; row], vec![0.0f32; row]);
-    detailed.par_chunks_mut(width.max(1)).enumerate().for_each_init(buffers, |(low, high), (y, detailed)| {
-        low.fill(f32::MAX);
-        high.fill(f32::MIN);
-        for line in near(y, image.height).map(|j| &image.data[j * row..(j + 1) * row]) {
-            low.iter_mut().zip(line).for_each(|(low, v)| *low = low.min(*v));
-            high.iter_mut().zip(line).for_each(|(high, v)| *high = high.max(*v));
-        }
-        for (x, detailed) in detailed.iter_mut().enumerate() {
-            *detailed = (0..channels).any(|c| {
-                let columns = near(x, width).map(|i| i * channels + c);
-                let (low, high) = columns.fold((f32::MAX, f32::MIN), |(l, h), at| (l.min(low[at]), h.max(high[at])));
-                high - low > FLAT
-            });
-        }
-    });
+    detailed.par_chunks_mut(width.max(1)).enumerate().for_each_init(
+        buffers,
+        |(low, high), (y, detailed)| {
+            low.fill(f32::MAX);
+            high.fill(f32::MIN);
+            for line in near(y, image.height).map(|j| &image.data[j * row..(j + 1) * row]) {
+                low.iter_mut().zip(line).for_each(|(low, v)| *low = low.min(*v));
+                high.iter_mut().zip(line).for_each(|(high, v)| *high = high.max(*v));
+            }
+            for (x, detailed) in detailed.iter_mut().enumerate() {
+                *detailed = (0..channels).any(|c| {
+                    let columns = near(x, width).map(|i| i * channels + c);
+                    let (low, high) = columns
+                        .fold((f32::MAX, f32::MIN), |(l, h), at| (l.min(low[at]), h.max(high[at])));
+                    high - low > FLAT
+                });
+            }
+        },
+    );
     detailed
 }
 
 /// Purpose of an epoch's draws; the first of four.
 const ORDER: u64 = 110;
 
-/// Where the i-th of n numbers comes in an epoch's random order: a Feistel cipher over the next power of four, which is gone
-/// through again from what lies beyond n. So the order needs no memory, and any thread may ask for any place.
+/// Where the i-th of n numbers comes in an epoch's random order: a Feistel cipher over the next
+/// power of four, which is gone through again from what lies beyond n. So the order needs no
+/// memory, and any thread may ask for any place.
 pub(crate) fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
     let bits = (64 - (n - 1).leading_zeros()).div_ceil(2).max(1);
     let mask = (1u64 << bits) - 1;
@@ -190,16 +217,19 @@ pub(crate) fn shuffled(seed: u64, epoch: u64, i: u64, n: u64) -> u64 {
 mod tests {
     use super::*;
 
-    /// Pixels with detail are drawn as often as asked for, and the weighted loss expects what even draws do.
+    /// Pixels with detail are drawn as often as asked for, and the weighted loss expects what even
+    /// draws do.
     #[test]
     fn focus_keeps_the_expectation() {
         let mut flat = Image::new(20, 10, 3, vec![0.5; 600]);
         flat.data[3 * (3 * 20 + 4)] = 0.9;
-        let around_dot = |pixel: usize| (2..5).contains(&(pixel / 20)) && (3..6).contains(&(pixel % 20));
+        let around_dot =
+            |pixel: usize| (2..5).contains(&(pixel / 20)) && (3..6).contains(&(pixel % 20));
         assert!(detailed(&flat).into_iter().eq((0..200).map(around_dot)));
         let focus = Focus::new(7.0, 200, detailed(&flat).into_iter().collect());
         let (mut counts, draws) = ([0u32; 200], 400_000);
-        (0..draws).for_each(|k| counts[focus.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1);
+        (0..draws)
+            .for_each(|k| counts[focus.draw(200, &mut CounterRng::new(1, 2, k)) as usize] += 1);
         for (pixel, &count) in (0..200).zip(&counts) {
             let mean = f64::from(count) * 200.0 / draws as f64 * f64::from(focus.weight(pixel));
             assert!((mean - 1.0).abs() < 0.12, "{pixel}: {mean}");

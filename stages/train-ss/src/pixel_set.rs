@@ -1,4 +1,5 @@
-/// A set of pixels among many: a bit each, and how many there are before every block of them, so that the n-th is found quickly.
+/// A set of pixels among many: a bit each, and how many there are before every block of them, so
+/// that the n-th is found quickly.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PixelSet {
     words: Vec<u64>,
@@ -77,10 +78,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn it_is_the_list_of_its_pixels(pixels in prop::collection::vec(prop::bool::weighted(0.2), 0..2000)) {
+        fn it_is_the_list_of_its_pixels(pixels in prop::collection::vec(prop::bool::weighted(0.2),
+            0..2000)) {
             let mut set: PixelSet = pixels.iter().copied().take(700).collect();
             set.extend(pixels.iter().copied().skip(700));
-            let list: Vec<u64> = (0..).zip(&pixels).filter(|(_, is_in)| **is_in).map(|(pixel, _)| pixel).collect();
+            let list: Vec<u64> = (0..).zip(&pixels).filter(|(_, is_in)| **is_in).map(|(pixel,
+                _)| pixel).collect();
             prop_assert_eq!(set.len(), list.len() as u64);
             prop_assert!((0..).zip(&list).all(|(n, pixel)| set.nth(n) == Some(*pixel)));
             prop_assert!(set.nth(set.len()).is_none());

@@ -5,17 +5,20 @@ use scene::Camera;
 use crate::packed::{PackedPhotograph, PixelMemory};
 use crate::photographs::{NO_PLACE, Photographs};
 
-/// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else where it differs by more than this, in dB.
+/// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else
+/// where it differs by more than this, in dB.
 const ALIKE: f64 = 25.0;
 
 /// Alpha of an LR pixel that is made of opaque ones alone, up to rounding.
 const OPAQUE: f32 = 1.0 - 1e-4;
 
-/// References as they should join a training: of one with an LR photograph of its own the exposure is that photograph's, and it is left out where it
-/// shows something else. What was done is said. `kernel` made the LR photographs.
+/// References as they should join a training: of one with an LR photograph of its own the exposure
+/// is that photograph's, and it is left out where it shows something else. What was done is said.
+/// `kernel` made the LR photographs.
 ///
-/// Images with alpha are compared as they are stored, colours premultiplied: over a background, what a kernel overshoots at the
-/// border of a thing would look like another exposure, since stored images have none of that.
+/// Images with alpha are compared as they are stored, colours premultiplied: over a background,
+/// what a kernel overshoots at the border of a thing would look like another exposure, since stored
+/// images have none of that.
 pub(crate) fn checked(
     mut references: Photographs,
     photographs: &Photographs,
@@ -33,9 +36,14 @@ pub(crate) fn checked(
         let mut photograph = packed.unpacked();
         let (name, reference) = (&view.camera.name, &mut photograph.image);
         let [mut shrunk, own] = compared(reference, &own, kernel);
-        if let Some(exposure) = Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none()) {
+        if let Some(exposure) =
+            Exposure::between(&own, &shrunk, 1).filter(|exposure| !exposure.is_none())
+        {
             let [r, g, b] = exposure.gain;
-            say(format!("reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"));
+            say(format!(
+                "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): \
+                taken back"
+            ));
             exposure.take_back(reference);
             exposure.take_back(&mut shrunk);
             packed = PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?;
@@ -43,7 +51,8 @@ pub(crate) fn checked(
         let alike = alikeness(&shrunk, &own);
         if alike < ALIKE {
             say(format!(
-                "reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and is left out: another view, or something that moved?"
+                "reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and \
+                is left out: another view, or something that moved?"
             ));
         }
         if alike >= ALIKE {
@@ -62,18 +71,23 @@ fn own_photograph(photographs: &Photographs, camera: &Camera) -> Option<Image> {
     Some(photographs.images[place].whole())
 }
 
-/// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as `prep` does it, from 8 bits to 8 bits.
+/// A reference as the kernel shrinks it, and its own LR photograph. With alpha it is shrunk as
+/// `prep` does it, from 8 bits to 8 bits.
 fn compared(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
     if is_transparent(reference) && kernel != Kernel::Average {
         let shrunk = resize_pillow(&as_stored(reference), own.width, own.height, kernel.filter());
         return [Image::premultiplied(&shrunk), own.clone()];
     }
     let sizes = [reference, own].map(|image| (image.width, image.height));
-    let mut pair = [Resampling::new(kernel.filter(), sizes[0], sizes[1]).apply(reference), own.clone()];
+    let mut pair =
+        [Resampling::new(kernel.filter(), sizes[0], sizes[1]).apply(reference), own.clone()];
     if is_transparent(reference) {
-        // That kernel averages straight colours, those of what is transparent, too: only alpha is known there.
-        let hidden: Vec<usize> = (0..own.width * own.height).filter(|i| own.data[4 * i + 3] < OPAQUE).collect();
-        pair.iter_mut().for_each(|image| hidden.iter().for_each(|i| image.data[4 * i..4 * i + 3].fill(0.0)));
+        // That kernel averages straight colours, those of what is transparent, too: only alpha is
+        // known there.
+        let hidden: Vec<usize> =
+            (0..own.width * own.height).filter(|i| own.data[4 * i + 3] < OPAQUE).collect();
+        pair.iter_mut()
+            .for_each(|image| hidden.iter().for_each(|i| image.data[4 * i..4 * i + 3].fill(0.0)));
     }
     pair
 }
@@ -91,11 +105,17 @@ fn is_transparent(image: &Image) -> bool {
     image.channels == 4 && image.data.chunks_exact(4).any(|pixel| pixel[3] < 1.0)
 }
 
-/// How alike two images of one size are, in dB over their colours; what differs in alpha counts, too.
+/// How alike two images of one size are, in dB over their colours; what differs in alpha counts,
+/// too.
 fn alikeness(one: &Image, other: &Image) -> f64 {
     let channels = if is_transparent(one) || is_transparent(other) { 4 } else { 3 };
     let samples = |image: &Image| -> Vec<f32> {
-        image.data.chunks_exact(image.channels).flat_map(|pixel| &pixel[..channels]).copied().collect()
+        image
+            .data
+            .chunks_exact(image.channels)
+            .flat_map(|pixel| &pixel[..channels])
+            .copied()
+            .collect()
     };
     let (a, b) = (samples(one), samples(other));
     let colours = (3 * one.width * one.height) as f64;
@@ -112,7 +132,15 @@ mod tests {
     /// Patches with fine stripes, as seen from there.
     fn photographs(name: &str, image: Image) -> Photographs {
         let (width, height) = (image.width as u32, image.height as u32);
-        let intrinsics = Intrinsics { width, height, fx: 20.0, fy: 20.0, cx: 8.0, cy: 8.0, distortion: Default::default() };
+        let intrinsics = Intrinsics {
+            width,
+            height,
+            fx: 20.0,
+            fy: 20.0,
+            cx: 8.0,
+            cy: 8.0,
+            distortion: Default::default(),
+        };
         let camera_to_world = [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]];
         let camera = Camera { name: name.into(), intrinsics, camera_to_world };
         Photographs::taken_by(camera, image)
@@ -121,27 +149,49 @@ mod tests {
     fn hr() -> Image {
         let sample = |i: usize| {
             let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
-            0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64) + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
+            0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
+                + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
         };
         Image::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
     }
 
     #[test]
     fn exposures_are_taken_back_and_other_images_are_left_out() {
-        let lr = || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr()));
+        let lr =
+            || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr()));
         let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
             let said = std::cell::RefCell::new(String::new());
             let mut image = hr();
             image.data.iter_mut().for_each(|v| *v = change(*v));
             let say = |text: String| said.borrow_mut().push_str(&text);
-            let kept = checked(photographs(name, image), &lr(), Kernel::Lanczos, &mut PixelMemory::unlimited(), &say).unwrap();
-            (kept.images.first().map(|packed| packed.whole().over(0.0)), kept.views.views.len(), said.into_inner())
+            let kept = checked(
+                photographs(name, image),
+                &lr(),
+                Kernel::Lanczos,
+                &mut PixelMemory::unlimited(),
+                &say,
+            )
+            .unwrap();
+            (
+                kept.images.first().map(|packed| packed.whole().over(0.0)),
+                kept.views.views.len(),
+                said.into_inner(),
+            )
         };
         let (same, views, said) = checked("a", &|v| v);
         assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
         let (dark, views, said) = checked("a", &|v| 0.6 * v + 0.1);
-        let off = dark.unwrap().data.iter().zip(&hr().data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        assert!(off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"), "{off} {said}");
+        let off = dark
+            .unwrap()
+            .data
+            .iter()
+            .zip(&hr().data)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
+        assert!(
+            off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"),
+            "{off} {said}"
+        );
         let (other, views, said) = checked("a", &|v| 1.0 - v);
         assert!(other.is_none() && views == 0 && said.contains("left out"), "{said}");
         // Nothing is known of a view that has no LR photograph.
@@ -149,14 +199,19 @@ mod tests {
         assert!(unknown.is_some() && said.is_empty(), "{said}");
     }
 
-    /// A ball before nothing, of a colour that Lanczos overshoots at its border, as `prep` stores it at both sizes.
+    /// A ball before nothing, of a colour that Lanczos overshoots at its border, as `prep` stores
+    /// it at both sizes.
     #[test]
     fn an_lr_photograph_with_alpha_is_its_own_reference_at_any_size() {
         for size in [32, 48, 64, 100] {
             let pixel = |i: usize| {
                 let (x, y) = ((i % size) as f32 + 0.5, (i / size) as f32 + 0.5);
                 let away = (x - 0.45 * size as f32).hypot(y - 0.55 * size as f32);
-                if away < 0.3 * size as f32 { [250, 240, 90 + (x * 2.0) as u8 / 4, 255] } else { [0; 4] }
+                if away < 0.3 * size as f32 {
+                    [250, 240, 90 + (x * 2.0) as u8 / 4, 255]
+                } else {
+                    [0; 4]
+                }
             };
             let hr = pixels::Rgba8::new(size, size, (0..size * size).flat_map(pixel).collect());
             for kernel in [Kernel::Lanczos, Kernel::Bicubic, Kernel::Box, Kernel::Average] {
@@ -166,14 +221,20 @@ mod tests {
                         lr.data.chunks_exact_mut(4).for_each(|p| (0..3).for_each(|c| p[c] *= p[3]));
                         lr
                     }
-                    _ => Image::premultiplied(&resize_pillow(&hr, size / 2, size / 2, kernel.filter())),
+                    _ => Image::premultiplied(&resize_pillow(
+                        &hr,
+                        size / 2,
+                        size / 2,
+                        kernel.filter(),
+                    )),
                 };
                 let hr = Image::premultiplied(&hr);
                 let said = std::cell::RefCell::new(String::new());
                 let given = photographs("a", lr.clone());
                 let say = |text: String| said.borrow_mut().push_str(&text);
                 let memory = &mut PixelMemory::unlimited();
-                let kept = checked(photographs("a", hr.clone()), &given, kernel, memory, &say).unwrap();
+                let kept =
+                    checked(photographs("a", hr.clone()), &given, kernel, memory, &say).unwrap();
                 assert_eq!(said.into_inner(), "", "{size} {kernel:?}");
                 assert_eq!(kept.images[0].whole(), hr);
                 let [shrunk, own] = compared(&hr, &lr, kernel);
@@ -195,7 +256,12 @@ mod tests {
         };
         let mut dark = image(0.6, 0.1);
         Exposure { gain: [0.6; 3], offset: [0.1; 3] }.take_back(&mut dark);
-        let off = dark.data.iter().zip(&image(1.0, 0.0).data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let off = dark
+            .data
+            .iter()
+            .zip(&image(1.0, 0.0).data)
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
         assert!(off < 1e-6, "{off}");
     }
 }

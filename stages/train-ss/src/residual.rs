@@ -11,7 +11,8 @@ fn residual(prediction: f32, target: f32) -> f32 {
     if target.is_nan() { 0.0 } else { prediction - target }
 }
 
-/// What a bundle's colours are compared with, besides a photograph's samples, and how much that counts. Losses are means over the three channels.
+/// What a bundle's colours are compared with, besides a photograph's samples, and how much that
+/// counts. Losses are means over the three channels.
 pub(crate) struct Target {
     /// Takes the photograph's exposure back.
     pub(crate) back: [f32; 3],
@@ -27,10 +28,12 @@ impl Target {
         [0, 1, 2].map(|c| self.back[c] * (sample[c] + (1.0 - sample[3]) * self.behind[c]))
     }
 
-    /// Prediction less sample, and nothing where the sample was clipped and the prediction lies beyond it.
+    /// Prediction less sample, and nothing where the sample was clipped and the prediction lies
+    /// beyond it.
     pub(crate) fn unclipped_residual(&self, channel: usize, prediction: f32, sample: f32) -> f32 {
         let residual = residual(prediction, self.back[channel] * sample);
-        let is_beyond = (sample >= SATURATED && residual > 0.0) || (sample <= 1.0 - SATURATED && residual < 0.0);
+        let is_beyond = (sample >= SATURATED && residual > 0.0)
+            || (sample <= 1.0 - SATURATED && residual < 0.0);
         if is_beyond { 0.0 } else { residual }
     }
 
@@ -53,7 +56,8 @@ impl Target {
             let target = self.colour(sample);
             for c in 0..3 {
                 let residual = residual(colour[c], target[c]);
-                loss += f64::from(self.weight * share) * f64::from(residual) * f64::from(residual) / 3.0;
+                loss += f64::from(self.weight * share) * f64::from(residual) * f64::from(residual)
+                    / 3.0;
                 gradient[c] = self.weight * residual * share * (2.0 / 3.0);
             }
         }
@@ -61,7 +65,12 @@ impl Target {
     }
 
     /// The loss of the mean of colours (the paper's eq. 4), and its gradient.
-    pub(crate) fn of_mean(&self, colours: &[[f32; 3]], sample: [f32; 4], gradients: &mut [[f32; 3]]) -> f64 {
+    pub(crate) fn of_mean(
+        &self,
+        colours: &[[f32; 3]],
+        sample: [f32; 4],
+        gradients: &mut [[f32; 3]],
+    ) -> f64 {
         let share = 1.0 / colours.len() as f32;
         let target = self.colour(sample);
         let mut loss = 0.0;
@@ -86,10 +95,19 @@ mod tests {
     /// A clipped sample says no more than that the true value lies beyond.
     #[test]
     fn what_was_clipped_is_no_residual() {
-        let cases =
-            [(1.1, 1.0, 0.0), (0.9, 1.0, -0.1), (-0.1, 0.0, 0.0), (0.1, 0.0, 0.1), (1.1, 0.99, 0.11), (-0.1, 0.01, -0.11)];
+        let cases = [
+            (1.1, 1.0, 0.0),
+            (0.9, 1.0, -0.1),
+            (-0.1, 0.0, 0.0),
+            (0.1, 0.0, 0.1),
+            (1.1, 0.99, 0.11),
+            (-0.1, 0.01, -0.11),
+        ];
         for (prediction, sample, expected) in cases {
-            assert!((PLAIN.unclipped_residual(1, prediction, sample) - expected).abs() < 1e-6, "{prediction} {sample}");
+            assert!(
+                (PLAIN.unclipped_residual(1, prediction, sample) - expected).abs() < 1e-6,
+                "{prediction} {sample}"
+            );
         }
         assert!(is_clipped(1.0) && is_clipped(0.0) && !is_clipped(0.99));
     }
@@ -112,6 +130,9 @@ mod tests {
     fn samples_ask_for_colours() {
         let target = Target { back: [2.0, 1.0, 0.5], behind: [0.4, 0.8, 1.0], weight: 1.0 };
         let colour = target.colour([0.1, 0.2, 0.3, 0.75]);
-        assert!(colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6), "{colour:?}");
+        assert!(
+            colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),
+            "{colour:?}"
+        );
     }
 }

@@ -46,7 +46,8 @@ pub struct SceneFacts {
 impl SceneFacts {
     /// Those of a scene whose training begins with nothing.
     pub fn of(views: &Views, has_kernel: bool) -> Self {
-        let pixels = |v: &View| u64::from(v.camera.intrinsics.width) * u64::from(v.camera.intrinsics.height);
+        let pixels =
+            |v: &View| u64::from(v.camera.intrinsics.width) * u64::from(v.camera.intrinsics.height);
         Self {
             space: views.bounds.space,
             background: views.background,
@@ -139,9 +140,11 @@ impl Params {
     /// Fails on parameters that can't be meant together.
     pub fn check(&self) -> Result<(), String> {
         match &self.field {
-            FieldParams::Grid(GridParams { base_resolution, max_resolution: Some(max), .. }) if max < base_resolution => {
-                Err(format!("parameter base_resolution: {base_resolution} is above max_resolution = {max}"))
-            }
+            FieldParams::Grid(GridParams {
+                base_resolution, max_resolution: Some(max), ..
+            }) if max < base_resolution => Err(format!(
+                "parameter base_resolution: {base_resolution} is above max_resolution = {max}"
+            )),
             _ => Ok(()),
         }
     }
@@ -159,10 +162,18 @@ impl Params {
             FieldParams::Grid(grid) => (true, grid.sampling()),
             FieldParams::Mlp(mlp) => (false, mlp.sampling(scene, epoch)),
         };
-        let supervision = if is_grid && scene.has_kernel && has_background { Supervision::Kernel } else { Supervision::Average };
+        let supervision = if is_grid && scene.has_kernel && has_background {
+            Supervision::Kernel
+        } else {
+            Supervision::Average
+        };
         let combine = if scene.is_ndc() { Combine::AverageWeights } else { Combine::Ensemble };
         // The rough shape of a field that is fine-tuned is known.
-        let at_start = if scene.is_fine_tuning { (0.0, 0) } else { (sampling.supersample_warmup, sampling.precrop_steps) };
+        let at_start = if scene.is_fine_tuning {
+            (0.0, 0)
+        } else {
+            (sampling.supersample_warmup, sampling.precrop_steps)
+        };
         Resolved {
             field: self.field.resolve(scene),
             supersample: self.supersample,
@@ -211,7 +222,8 @@ impl GridParams {
         let by_width = (CELLS_PER_PIXEL * scene.pixels_across).round().clamp(64.0, 2048.0) as u32;
         let finest = self.max_resolution.unwrap_or(by_width.max(self.base_resolution));
         // Surfaces grow with the square of the resolution.
-        let by_finest = (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
+        let by_finest =
+            (17.0 + 2.0 * (f64::from(finest) / 256.0).log2()).round().clamp(14.0, 20.0) as u32;
         let steps = self.march_steps.unwrap_or(if scene.is_ndc() { 256 } else { 512 });
         let unlimited = Architecture::default().finest_z;
         // Rays run along z in NDC: cells needn't lie closer than their samples.
@@ -231,7 +243,8 @@ impl GridParams {
 
 impl MlpParams {
     fn sampling(&self, scene: &SceneFacts, epoch: u64) -> Sampling {
-        let (epochs, precrop_steps) = if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
+        let (epochs, precrop_steps) =
+            if scene.is_ndc() { (EPOCHS_IN_NDC, 0) } else { (EPOCHS, PRECROP_STEPS) };
         Sampling {
             rays: self.rays.unwrap_or(epochs * epoch),
             max_rays_per_step: self.max_rays_per_step,
@@ -263,14 +276,26 @@ impl FieldParams {
                 let has_colour = matches!(scene.background, Background::White | Background::Black);
                 ResolvedField::Grid {
                     architecture: grid.architecture(scene),
-                    distortion: grid.distortion.unwrap_or(if is_open { DISTORTION_IN_NDC } else { 0.0 }),
-                    floater_loss: grid.floater_loss.unwrap_or(if has_colour { FLOATER_LOSS } else { 0.0 }),
+                    distortion: grid.distortion.unwrap_or(if is_open {
+                        DISTORTION_IN_NDC
+                    } else {
+                        0.0
+                    }),
+                    floater_loss: grid.floater_loss.unwrap_or(if has_colour {
+                        FLOATER_LOSS
+                    } else {
+                        0.0
+                    }),
                     given: grid.clone(),
                 }
             }
             Self::Mlp(mlp) => ResolvedField::Mlp {
                 architecture: mlp.architecture(),
-                density_noise_std: mlp.density_noise_std.unwrap_or(if scene.is_ndc() { 1.0 } else { 0.0 }),
+                density_noise_std: mlp.density_noise_std.unwrap_or(if scene.is_ndc() {
+                    1.0
+                } else {
+                    0.0
+                }),
                 given: mlp.clone(),
             },
         }
@@ -278,7 +303,8 @@ impl FieldParams {
 }
 
 impl Resolved {
-    /// The parameters whose defaults the scene decides, by name, with the values in use: for `training.json`.
+    /// The parameters whose defaults the scene decides, by name, with the values in use: for
+    /// `training.json`.
     pub fn record(&self) -> BTreeMap<String, Value> {
         let common = json!({
             "combine": self.combine,
@@ -297,7 +323,9 @@ impl Resolved {
                 "march_steps": architecture.steps,
                 "max_resolution": architecture.finest,
             }),
-            ResolvedField::Mlp { density_noise_std, .. } => json!({ "density_noise_std": density_noise_std }),
+            ResolvedField::Mlp { density_noise_std, .. } => {
+                json!({ "density_noise_std": density_noise_std })
+            }
         };
         let entries = [common, own].into_iter().filter_map(|values| values.as_object().cloned());
         entries.flatten().collect()
@@ -319,19 +347,29 @@ impl Resolved {
         }
     }
 
-    /// Parameters by which a field of the ensemble is trained as if it were alone, with its share of the rays.
+    /// Parameters by which a field of the ensemble is trained as if it were alone, with its share
+    /// of the rays.
     #[must_use]
     pub fn member(&self, index: u32) -> Self {
         let members = u64::from(self.ensemble.max(1));
         let own = self.rays / members + u64::from(u64::from(index) < self.rays % members);
-        Self { ensemble: 1, rays: own, seed: self.seed.wrapping_add(u64::from(index)), ..self.clone() }
+        Self {
+            ensemble: 1,
+            rays: own,
+            seed: self.seed.wrapping_add(u64::from(index)),
+            ..self.clone()
+        }
     }
 
-    /// Bundles of rays that are drawn from the middle of the images: those of the first `precrop_steps` steps.
+    /// Bundles of rays that are drawn from the middle of the images: those of the first
+    /// `precrop_steps` steps.
     pub fn precrop_bundles(&self) -> u64 {
-        let (batch, side) = (u64::from(self.max_rays_per_step), (self.supersample - 1e-6).ceil() as u64);
+        let (batch, side) =
+            (u64::from(self.max_rays_per_step), (self.supersample - 1e-6).ceil() as u64);
         let doublings = warmup_stages(side);
-        let steps_of_stage = (self.supersample_warmup * self.rays as f64 / f64::from(doublings.max(1))) as u64 / batch;
+        let steps_of_stage = (self.supersample_warmup * self.rays as f64
+            / f64::from(doublings.max(1))) as u64
+            / batch;
         let stages = (0..doublings).map(|i| (steps_of_stage, 1 << i)).chain([(u64::MAX, side)]);
         let mut left = u64::from(self.precrop_steps);
         let mut bundles = 0;
@@ -344,7 +382,12 @@ impl Resolved {
     }
 
     /// How a grid is trained.
-    pub fn grid_training(&self, grid: &GridParams, distortion: f64, floater_loss: f64) -> TrainingOptions {
+    pub fn grid_training(
+        &self,
+        grid: &GridParams,
+        distortion: f64,
+        floater_loss: f64,
+    ) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
             max_rays_per_step: self.max_rays_per_step as usize,
@@ -365,7 +408,11 @@ impl Resolved {
 
     /// How the paper's field is trained.
     #[cfg(feature = "torch")]
-    pub fn mlp_training(&self, mlp: &MlpParams, density_noise_std: f64) -> torch_field::MlpTraining {
+    pub fn mlp_training(
+        &self,
+        mlp: &MlpParams,
+        density_noise_std: f64,
+    ) -> torch_field::MlpTraining {
         use crate::params::RateSchedule;
         let epochs = self.rays.div_ceil(self.epoch.max(1));
         torch_field::MlpTraining {
@@ -391,11 +438,24 @@ mod tests {
     use super::*;
 
     fn facts(space: Space, background: Background) -> SceneFacts {
-        SceneFacts { space, background, pixels_across: 340.0, lr_pixels: 25, has_kernel: true, is_fine_tuning: false }
+        SceneFacts {
+            space,
+            background,
+            pixels_across: 340.0,
+            lr_pixels: 25,
+            has_kernel: true,
+            is_fine_tuning: false,
+        }
     }
 
     fn ndc() -> Space {
-        Space::Ndc(Frustum { camera_to_world: [[0.0; 4]; 3], min: [0.0; 2], max: [1.0; 2], near: 1.0, far: 2.0 })
+        Space::Ndc(Frustum {
+            camera_to_world: [[0.0; 4]; 3],
+            min: [0.0; 2],
+            max: [1.0; 2],
+            near: 1.0,
+            far: 2.0,
+        })
     }
 
     fn value(params: &Params, scene: &SceneFacts, name: &str) -> Value {
@@ -405,8 +465,12 @@ mod tests {
     /// A default holds where nothing else is said, for its own field alone.
     #[test]
     fn scenes_decide_defaults() {
-        let (grid, mlp) = (Params::default(), Params { field: FieldParams::Mlp(MlpParams::default()), ..Params::default() });
-        let said = |field: GridParams| Params { field: FieldParams::Grid(field), ..Params::default() };
+        let (grid, mlp) = (
+            Params::default(),
+            Params { field: FieldParams::Mlp(MlpParams::default()), ..Params::default() },
+        );
+        let said =
+            |field: GridParams| Params { field: FieldParams::Grid(field), ..Params::default() };
         let own = GridParams {
             distortion: Some(0.5),
             march_steps: Some(999),
@@ -456,18 +520,25 @@ mod tests {
         ] {
             assert_eq!(value(params, &scene, name), expected, "{name} of {params:?} for {scene:?}");
         }
-        let many = said(GridParams { march_steps: Some(8192), ..GridParams::default() }).resolve(&forward);
-        assert!(matches!(many.field, ResolvedField::Grid { architecture, .. } if architecture.check().is_ok()));
+        let many =
+            said(GridParams { march_steps: Some(8192), ..GridParams::default() }).resolve(&forward);
+        assert!(matches!(many.field, ResolvedField::Grid { architecture,
+                .. } if architecture.check().is_ok()));
     }
 
     /// `training.json` says every default that `plan` leaves to the scene.
     #[test]
     fn what_is_by_scene_is_recorded() {
-        let schema = artifact::Schema::new("train-ss", &crate::TrainSs::describe("", "").parameters).unwrap();
+        let schema =
+            artifact::Schema::new("train-ss", &crate::TrainSs::describe("", "").parameters)
+                .unwrap();
         let scene = facts(Space::Box, Background::White);
-        for (name, field) in [("grid", FieldParams::default()), ("mlp", FieldParams::Mlp(MlpParams::default()))] {
+        for (name, field) in
+            [("grid", FieldParams::default()), ("mlp", FieldParams::Mlp(MlpParams::default()))]
+        {
             let recorded = Params { field, ..Params::default() }.resolve(&scene).record();
-            let parameters = schema.resolve(&json!({ "field": name }).as_object().cloned().unwrap()).unwrap();
+            let parameters =
+                schema.resolve(&json!({ "field": name }).as_object().cloned().unwrap()).unwrap();
             let open = schema.by_scene(&parameters);
             assert!(open.len() > 3, "{open:?}");
             for name in open {
@@ -480,19 +551,26 @@ mod tests {
     #[test]
     fn precrop_steps_are_steps_whatever_is_cast() {
         let resolved = Params::default().resolve(&facts(Space::Box, Background::White));
-        let resolved = Resolved { precrop_steps: 10, max_rays_per_step: 64, rays: 6400, ..resolved };
-        let bundles =
-            |supersample_warmup, supersample| Resolved { supersample_warmup, supersample, ..resolved.clone() }.precrop_bundles();
+        let resolved =
+            Resolved { precrop_steps: 10, max_rays_per_step: 64, rays: 6400, ..resolved };
+        let bundles = |supersample_warmup, supersample| {
+            Resolved { supersample_warmup, supersample, ..resolved.clone() }.precrop_bundles()
+        };
         // 16 bundles of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with 16.
-        assert_eq!([bundles(0.0, 2.0), bundles(0.5, 2.0), bundles(0.06, 4.0)], [160, 640, 3 * 64 + 3 * 16 + 4 * 4]);
+        assert_eq!(
+            [bundles(0.0, 2.0), bundles(0.5, 2.0), bundles(0.06, 4.0)],
+            [160, 640, 3 * 64 + 3 * 16 + 4 * 4]
+        );
     }
 
     /// The fields of an ensemble spend all rays between them, each with a seed of its own.
     #[test]
     fn members_share_the_rays() {
-        let all = Params { ensemble: 3, seed: 7, ..Params::default() }.resolve(&facts(Space::Box, Background::White));
+        let all = Params { ensemble: 3, seed: 7, ..Params::default() }
+            .resolve(&facts(Space::Box, Background::White));
         let all = Resolved { rays: 100, ..all };
-        let members: Vec<(u64, u64)> = (0..3).map(|i| all.member(i)).map(|own| (own.rays, own.seed)).collect();
+        let members: Vec<(u64, u64)> =
+            (0..3).map(|i| all.member(i)).map(|own| (own.rays, own.seed)).collect();
         assert_eq!(members, [(34, 7), (33, 8), (33, 9)]);
     }
 }

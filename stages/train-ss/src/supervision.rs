@@ -30,16 +30,19 @@ pub enum Supervision {
     Kernel,
 }
 
-/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel rays are cast through it.
+/// Supersampling: a training pixel is drawn at random, those with detail more often, and sub-pixel
+/// rays are cast through it.
 ///
-/// `average` compares their mean with the LR pixel (mean squared error over the three channels). `kernel` minimises the squared
-/// distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones that K makes the LR image y of: those of the drawn LR pixel are
-/// rendered, those around it cached ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each
-/// sub-pixel ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine detail once more,
-/// learns slower.) Where K is the mean of whole pixels, both are alike, and nothing is cached.
+/// `average` compares their mean with the LR pixel (mean squared error over the three channels).
+/// `kernel` minimises the squared distance |K⁺·(K·c - y)|² of the HR pixels c from the nearest ones
+/// that K makes the LR image y of: those of the drawn LR pixel are rendered, those around it cached
+/// ([`HrCache`]), so that the whole footprint costs no more rays than the average. Each sub-pixel
+/// ray gets its own share of K⁺·(K·c - y). (|K·c - y|² itself, whose gradient Kᵀ weakens fine
+/// detail once more, learns slower.) Where K is the mean of whole pixels, both are alike, and
+/// nothing is cached.
 ///
-/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and altogether four times as
-/// many blocks as an LR image has pixels.
+/// Of an HR reference a block of pixels is drawn at a time, one for each sub-pixel ray to meet, and
+/// altogether four times as many blocks as an LR image has pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
     views: Vec<TrainingView>,
@@ -94,14 +97,17 @@ pub(crate) struct SupersamplingOptions {
 impl SupersamplingOptions {
     /// Size of the HR images for an LR size, (width, height).
     pub(crate) fn hr_size(&self, (width, height): (usize, usize)) -> (usize, usize) {
-        let length = |length: usize, i: usize| ((length as f64 * self.scale[i]).round() as usize).max(1);
+        let length =
+            |length: usize, i: usize| ((length as f64 * self.scale[i]).round() as usize).max(1);
         (length(width, 0), length(height, 1))
     }
 
     /// Sub-pixel rays along x and y: no more than the smallest view has HR pixels.
     fn full_side(&self, photographs: &Photographs, references: Option<&Photographs>) -> [usize; 2] {
-        let lr = photographs.images.iter().map(|image| self.hr_size((image.width(), image.height())));
-        let hr = references.iter().flat_map(|r| &r.images).map(|image| (image.width(), image.height()));
+        let lr =
+            photographs.images.iter().map(|image| self.hr_size((image.width(), image.height())));
+        let hr =
+            references.iter().flat_map(|r| &r.images).map(|image| (image.width(), image.height()));
         let smallest = lr.chain(hr).reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or((1, 1));
         let side = |scale: f64, most: usize| ((scale - 1e-6).ceil() as usize).clamp(1, most);
         [side(self.scale[0], smallest.0), side(self.scale[1], smallest.1)]
@@ -111,12 +117,13 @@ impl SupersamplingOptions {
 /// Purpose of a draw.
 const BACKGROUND: u64 = 101;
 
-/// How many times as often something of a reference is drawn as of an LR image. On a small demo scene, six of twelve views at
-/// HR, there are 21.66 dB without them, 21.63 and 22.12 with 1 and 4.
+/// How many times as often something of a reference is drawn as of an LR image. On a small demo
+/// scene, six of twelve views at HR, there are 21.66 dB without them, 21.63 and 22.12 with 1 and 4.
 const REFERENCE_DRAWS: u64 = 4;
 
 impl Supersampling {
-    /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are neither drawn nor compared with.
+    /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are
+    /// neither drawn nor compared with.
     pub(crate) fn new(
         photographs: Photographs,
         references: Option<Photographs>,
@@ -129,7 +136,8 @@ impl Supersampling {
         let mut cache = None;
         let mut kernels = BTreeMap::new();
         let (mut views, mut cameras) = (Vec::with_capacity(lr_views), Vec::with_capacity(lr_views));
-        let (mut numbered, mut numbers, mut with_detail) = (Vec::with_capacity(lr_views), 0, PixelSet::default());
+        let (mut numbered, mut numbers, mut with_detail) =
+            (Vec::with_capacity(lr_views), 0, PixelSet::default());
         let mut pyramids = Vec::new();
         let all = [Some(photographs), references].into_iter().flatten();
         for (view, photograph) in all.flat_map(|p| p.views.views.into_iter().zip(p.images)) {
@@ -147,7 +155,11 @@ impl Supersampling {
                         let enlarge = Resampling::new(Filter::Lanczos, lr, hr);
                         (enlarge, Arc::new(KernelOperator::new(options.filter, hr, lr)))
                     });
-                    cache.get_or_insert_with(|| HrCache::new(full)).add(&enlarge.apply(&whole), kernel.clone(), &mut memory)?;
+                    cache.get_or_insert_with(|| HrCache::new(full)).add(
+                        &enlarge.apply(&whole),
+                        kernel.clone(),
+                        &mut memory,
+                    )?;
                 }
             }
             let (image, hr) = if is_reference {
@@ -159,14 +171,26 @@ impl Supersampling {
             };
             let count = image.pixels() as u64;
             // Each block of a reference has so many numbers.
-            let draws = if is_reference { (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1) } else { 1 };
+            let draws = if is_reference {
+                (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1)
+            } else {
+                1
+            };
             if options.pixel_importance > 1.0 {
                 let mut detailed = detailed(&whole);
-                // What the kernel needs to know of pixels around those that don't count stays; they themselves aren't drawn.
-                detailed.iter_mut().enumerate().for_each(|(pixel, is_detailed)| *is_detailed &= image.counts(pixel));
+                // What the kernel needs to know of pixels around those that don't count stays; they
+                // themselves aren't drawn.
+                detailed
+                    .iter_mut()
+                    .enumerate()
+                    .for_each(|(pixel, is_detailed)| *is_detailed &= image.counts(pixel));
                 (0..draws).for_each(|_| with_detail.extend(detailed.iter().copied()));
             }
-            numbered.push(Numbered { width: image.width(), height: image.height(), before: numbers });
+            numbered.push(Numbered {
+                width: image.width(),
+                height: image.height(),
+                before: numbers,
+            });
             numbers += draws * count;
             views.push(TrainingView { image, hr, rays: PixelRays::of(&view.camera) });
             cameras.push(view.camera);
@@ -199,7 +223,8 @@ impl Supersampling {
         self.cache.as_ref().filter(|_| self.side == self.full && view < self.lr_views)
     }
 
-    /// Writes what it has come to know in the training, for a checkpoint: HR pixels as last rendered, what exposures follow from, and poses.
+    /// Writes what it has come to know in the training, for a checkpoint: HR pixels as last
+    /// rendered, what exposures follow from, and poses.
     pub(crate) fn write(&self, to: &mut impl io::Write) -> io::Result<()> {
         self.cache.iter().try_for_each(|cache| cache.write(to))?;
         self.exposures.iter().try_for_each(|exposures| to.write_all(&exposures.bytes()))?;
@@ -209,7 +234,9 @@ impl Supersampling {
     /// Bytes that [`Supersampling::write`] writes.
     pub(crate) fn written_len(&self) -> usize {
         let exposures = self.exposures.as_ref().map_or(0, Exposures::len);
-        self.cache.as_ref().map_or(0, HrCache::len) + exposures + self.moving.as_ref().map_or(0, MovingCameras::len)
+        self.cache.as_ref().map_or(0, HrCache::len)
+            + exposures
+            + self.moving.as_ref().map_or(0, MovingCameras::len)
     }
 
     /// Restores what was written.
@@ -234,16 +261,22 @@ impl Supersampling {
         self.memory.fault()
     }
 
-    /// Moves cameras, where that was asked for and it is time for it, to where the field's renderings meet their photographs best. `field` is
-    /// only made when it is.
+    /// Moves cameras, where that was asked for and it is time for it, to where the field's
+    /// renderings meet their photographs best. `field` is only made when it is.
     pub(crate) fn refine_poses<'a>(
         &mut self,
         done: f64,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<()> {
-        let Some(moving) = self.moving.as_mut().filter(|moving| moving.are_due(done)) else { return Ok(()) };
-        let exposure = |view: usize| self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(view).map(f32::recip));
-        moving.step(&*field()?, done, self.background.shown(), exposure).map_err(|e| anyhow::anyhow!(e))?;
+        let Some(moving) = self.moving.as_mut().filter(|moving| moving.are_due(done)) else {
+            return Ok(());
+        };
+        let exposure = |view: usize| {
+            self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(view).map(f32::recip))
+        };
+        moving
+            .step(&*field()?, done, self.background.shown(), exposure)
+            .map_err(|e| anyhow::anyhow!(e))?;
         self.place_views();
         Ok(())
     }
@@ -251,16 +284,22 @@ impl Supersampling {
     /// Has rays cast from where cameras have moved to.
     fn place_views(&mut self) {
         let cameras = self.moving.iter().flat_map(MovingCameras::cameras);
-        self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.rays = PixelRays::of(camera));
+        self.views
+            .iter_mut()
+            .zip(cameras)
+            .for_each(|(view, camera)| view.rays = PixelRays::of(camera));
     }
 
-    /// How far cameras of photographs have gone, where that was asked for. `field` is only made then.
+    /// How far cameras of photographs have gone, where that was asked for. `field` is only made
+    /// then.
     pub(crate) fn moved<'a>(
         &self,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<Moved>> {
         let Some(moving) = &self.moving else { return Ok(None) };
-        let moved = moving.moved(&*field()?, self.lr_views, self.background.shown()).map_err(|e| anyhow::anyhow!(e))?;
+        let moved = moving
+            .moved(&*field()?, self.lr_views, self.background.shown())
+            .map_err(|e| anyhow::anyhow!(e))?;
         Ok(Some(moved))
     }
 
@@ -269,7 +308,8 @@ impl Supersampling {
         self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
     }
 
-    /// What each photograph is so many times as bright as, red, green and blue, where that was asked for.
+    /// What each photograph is so many times as bright as, red, green and blue, where that was
+    /// asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
         self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
     }
@@ -279,7 +319,8 @@ impl Supersampling {
         self.sampler.draw(bundle, |view, pixel| self.views[view].image.counts(pixel))
     }
 
-    /// What lies behind a bundle's rays: with an open background, or none, another colour each time, so that opacity is learnt.
+    /// What lies behind a bundle's rays: with an open background, or none, another colour each
+    /// time, so that opacity is learnt.
     fn behind(&self, bundle: u64) -> [f32; 3] {
         if matches!(self.background, Background::Alpha | Background::Opaque) {
             let mut rng = CounterRng::new(self.seed, BACKGROUND, bundle);
@@ -300,11 +341,17 @@ fn block_means(image: &Image, block: [usize; 2]) -> Image {
     let (width, height) = (image.width.div_ceil(block[0]), image.height.div_ceil(block[1]));
     let mut data = Vec::with_capacity(width * height * image.channels);
     for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
-        let (left, top) = (block_start(x, block[0], image.width), block_start(y, block[1], image.height));
+        let (left, top) =
+            (block_start(x, block[0], image.width), block_start(y, block[1], image.height));
         let rows = top..(top + block[1]).min(image.height);
-        let pixels = rows.flat_map(|j| (left..(left + block[0]).min(image.width)).map(move |i| j * image.width + i));
+        let pixels = rows.flat_map(|j| {
+            (left..(left + block[0]).min(image.width)).map(move |i| j * image.width + i)
+        });
         data.extend((0..image.channels).map(|c| {
-            let known = pixels.clone().map(|pixel| image.data[pixel * image.channels + c]).filter(|v| !v.is_nan());
+            let known = pixels
+                .clone()
+                .map(|pixel| image.data[pixel * image.channels + c])
+                .filter(|v| !v.is_nan());
             let (sum, count) = known.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0f32));
             sum / count
         }));
@@ -312,7 +359,8 @@ fn block_means(image: &Image, block: [usize; 2]) -> Image {
     Image::new(width, height, image.channels, data)
 }
 
-/// How often the sub-pixel rays along a side double before all are cast: as many stages has the warm-up.
+/// How often the sub-pixel rays along a side double before all are cast: as many stages has the
+/// warm-up.
 pub(crate) fn warmup_stages(side: u64) -> u32 {
     side.next_power_of_two().trailing_zeros()
 }
@@ -341,33 +389,51 @@ impl radiance::Supervisor for Supersampling {
         let (start, apart) = match (self.kernel(index), &view.hr) {
             (Some(cache), _) => cache.block_in_pixels(index, x, y),
             (None, Some(hr)) => {
-                let start = [block_start(x, self.full[0], hr.width()), block_start(y, self.full[1], hr.height())];
+                let start = [
+                    block_start(x, self.full[0], hr.width()),
+                    block_start(y, self.full[1], hr.height()),
+                ];
                 (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
             }
             (None, None) => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
         };
         for (k, ray) in rays.iter_mut().enumerate() {
             let (a, b) = (k % self.side[0], k / self.side[0]);
-            let place = [start[0] + (a as f64 + 0.5) * apart[0], start[1] + (b as f64 + 0.5) * apart[1]];
+            let place =
+                [start[0] + (a as f64 + 0.5) * apart[0], start[1] + (b as f64 + 0.5) * apart[1]];
             *ray = view.rays.ray(place, background);
         }
     }
 
-    fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+    fn loss_and_gradient(
+        &self,
+        bundle: u64,
+        colours: &[[f32; 3]],
+        gradients: &mut [[f32; 3]],
+    ) -> f64 {
         let (index, pixel) = self.pixel(bundle);
         let view = &self.views[index];
-        let back = self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
-        let target = Target { back, behind: self.behind(bundle), weight: self.sampler.weight(bundle, (index, pixel)) };
+        let back = self
+            .exposures
+            .as_ref()
+            .map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
+        let target = Target {
+            back,
+            behind: self.behind(bundle),
+            weight: self.sampler.weight(bundle, (index, pixel)),
+        };
         let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
         if let Some(cache) = self.kernel(index) {
-            let judge = |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
+            let judge =
+                |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
             let own = cache.back_project(index, [x, y], colours, &view.image, judge, gradients);
             return target.of_back_projected(own, gradients);
         }
         if let Some(hr) = view.hr.as_ref().filter(|_| self.side == self.full) {
             let left = block_start(x, self.full[0], hr.width());
             let top = block_start(y, self.full[1], hr.height());
-            let samples = (0..colours.len()).map(|k| hr.pixel((top + k / self.full[0]) * hr.width() + left + k % self.full[0]));
+            let samples = (0..colours.len())
+                .map(|k| hr.pixel((top + k / self.full[0]) * hr.width() + left + k % self.full[0]));
             return target.of_each(colours, samples, gradients);
         }
         target.of_mean(colours, view.image.pixel(pixel), gradients)
@@ -381,8 +447,11 @@ impl radiance::Supervisor for Supersampling {
         let image = &self.views[index].image;
         if let Some(exposures) = &mut self.exposures {
             let sample = image.pixel(pixel);
-            let photographed = [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
-            let mean = |c: usize| colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32;
+            let photographed =
+                [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
+            let mean = |c: usize| {
+                colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
+            };
             exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
         }
         let is_cached = self.side == self.full && index < self.lr_views;
@@ -419,25 +488,51 @@ mod tests {
         Image::new(width, height, 3, (0..width * height * 3).map(sample).collect())
     }
 
-    fn example(supervision: Supervision, scale: [f64; 2], image: Option<Image>) -> (Supersampling, Camera) {
+    fn example(
+        supervision: Supervision,
+        scale: [f64; 2],
+        image: Option<Image>,
+    ) -> (Supersampling, Camera) {
         let distortion = Distortion { radial: [0.1, -0.02, 0.01], tangential: [0.005, -0.003] };
         let camera = Camera {
             name: "a".into(),
-            intrinsics: Intrinsics { width: 5, height: 4, fx: 6.0, fy: 7.0, cx: 2.4, cy: 2.1, distortion },
+            intrinsics: Intrinsics {
+                width: 5,
+                height: 4,
+                fx: 6.0,
+                fy: 7.0,
+                cx: 2.4,
+                cy: 2.1,
+                distortion,
+            },
             camera_to_world: [[0., 0., 1., 3.], [1., 0., 0., 0.5], [0., 1., 0., 0.2]],
         };
-        let image = image.unwrap_or_else(|| Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect()));
-        (supersampling(Photographs::taken_by(camera.clone(), image), None, &options(supervision, scale)), camera)
+        let image = image.unwrap_or_else(|| {
+            Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect())
+        });
+        (
+            supersampling(
+                Photographs::taken_by(camera.clone(), image),
+                None,
+                &options(supervision, scale),
+            ),
+            camera,
+        )
     }
 
-    fn supersampling(photographs: Photographs, references: Option<Photographs>, options: &SupersamplingOptions) -> Supersampling {
+    fn supersampling(
+        photographs: Photographs,
+        references: Option<Photographs>,
+        options: &SupersamplingOptions,
+    ) -> Supersampling {
         // All but the first bytes go to a file.
         let memory = PixelMemory::new(100, std::env::temp_dir());
         let references = references.map(Photographs::over_background);
         Supersampling::new(photographs.over_background(), references, options, memory).unwrap()
     }
 
-    /// The sub-pixel rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any scale.
+    /// The sub-pixel rays of a pixel are pixel rays of the finer image: no half-pixel shift, at any
+    /// scale.
     #[test]
     fn sub_pixel_rays_are_the_finer_cameras_pixel_rays() {
         let cases = [
@@ -456,19 +551,24 @@ mod tests {
                 supersampling.sample_rays(bundle, &mut rays);
                 for ray in &rays {
                     let pixel = (0..seen.len()).find(|i| {
-                        let (x, y) = ((i % size[0] as usize) as f64 + 0.5, (i / size[0] as usize) as f64 + 0.5);
+                        let (x, y) = (
+                            (i % size[0] as usize) as f64 + 0.5,
+                            (i / size[0] as usize) as f64 + 0.5,
+                        );
                         let expected = hr.ray(x, y).direction.as_vec3().to_array();
                         (0..3).all(|c| (ray.direction[c] - expected[c]).abs() < 1e-6)
                     });
-                    seen[pixel.unwrap_or_else(|| panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray"))] = true;
+                    seen[pixel.unwrap_or_else(|| {
+                        panic!("{kind:?} {scale:?}: {ray:?} is no pixel's ray")
+                    })] = true;
                 }
             }
             assert!(seen.iter().all(|s| *s), "{kind:?} {scale:?}: every HR pixel is seen");
         }
     }
 
-    /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the same: a field that is opaque alone
-    /// can give it.
+    /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the
+    /// same: a field that is opaque alone can give it.
     #[test]
     fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
         let behind = |background| -> Vec<[f32; 3]> {
@@ -485,7 +585,10 @@ mod tests {
         assert!(behind(Background::White).iter().all(|b| *b == [1.0; 3]));
         let colours = behind(Background::Opaque);
         assert!((0..40).all(|i| (0..i).all(|j| colours[i] != colours[j])));
-        assert!(colours.iter().flatten().any(|c| *c < 0.2) && colours.iter().flatten().any(|c| *c > 0.8));
+        assert!(
+            colours.iter().flatten().any(|c| *c < 0.2)
+                && colours.iter().flatten().any(|c| *c > 0.8)
+        );
     }
 
     #[test]
@@ -505,7 +608,8 @@ mod tests {
         }
     }
 
-    /// Once the field renders the true HR image, the kernel is content: no loss and no gradient. The average isn't.
+    /// Once the field renders the true HR image, the kernel is content: no loss and no gradient.
+    /// The average isn't.
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
         let truth = hr_image(10, 8);
@@ -516,14 +620,18 @@ mod tests {
             for bundle in 0..800 {
                 let pixel = supersampling.pixel(bundle).1;
                 let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
-                let colours: Vec<[f32; 3]> =
-                    (0..4).map(|k| std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])).collect();
+                let colours: Vec<[f32; 3]> = (0..4)
+                    .map(|k| {
+                        std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])
+                    })
+                    .collect();
                 let mut gradients = [[0.0; 3]; 4];
                 let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
                 supersampling.remember(bundle, &colours);
                 // Until then the cache isn't full of the truth.
                 if bundle >= 400 {
-                    let gradient = gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
+                    let gradient =
+                        gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
                     worst = (worst.0.max(loss), worst.1.max(gradient));
                 }
             }
@@ -540,8 +648,14 @@ mod tests {
         let white = Image::new(5, 4, 3, vec![1.0; 60]);
         let (supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], Some(white));
         let mut gradients = [[0.0; 3]; 4];
-        assert!(supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10, "rounding alone");
-        assert!(supersampling.loss_and_gradient(3, &[[0.1; 3]; 4], &mut gradients) > 0.1, "what is too dark is still wrong");
+        assert!(
+            supersampling.loss_and_gradient(3, &[[1.0; 3]; 4], &mut gradients) < 1e-10,
+            "rounding alone"
+        );
+        assert!(
+            supersampling.loss_and_gradient(3, &[[0.1; 3]; 4], &mut gradients) > 0.1,
+            "what is too dark is still wrong"
+        );
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
@@ -554,19 +668,26 @@ mod tests {
             supersampling.set_progress(done);
             supersampling.rays_per_bundle()
         };
-        for (scale, expected) in [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])] {
+        for (scale, expected) in
+            [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])]
+        {
             assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
         }
     }
 
-    /// In epochs every pixel comes once before any comes again, each time in another order; the first come from the middle.
+    /// In epochs every pixel comes once before any comes again, each time in another order; the
+    /// first come from the middle.
     #[test]
     fn epochs_draw_without_replacement() {
         let (mut supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
         (supersampling.sampler.order, supersampling.sampler.precrop_bundles) = (Order::Epochs, 50);
-        let drawn = |range: std::ops::Range<u64>| range.map(|g| supersampling.pixel(g).1).collect::<Vec<_>>();
+        let drawn = |range: std::ops::Range<u64>| {
+            range.map(|g| supersampling.pixel(g).1).collect::<Vec<_>>()
+        };
         // 5 × 4 pixels.
-        assert!(drawn(0..50).iter().all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5))));
+        assert!(
+            drawn(0..50).iter().all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5)))
+        );
         let (mut first, mut second) = (drawn(50..70), drawn(70..90));
         assert_ne!(first, second);
         for epoch in [&mut first, &mut second] {
@@ -575,16 +696,19 @@ mod tests {
         }
     }
 
-    /// Pixels that don't count are neither drawn, nor pulled to what the photograph has there; what counts beside them is.
+    /// Pixels that don't count are neither drawn, nor pulled to what the photograph has there; what
+    /// counts beside them is.
     #[test]
     fn masked_pixels_say_nothing() {
         for kind in [Supervision::Average, Supervision::Kernel] {
             let (plain, camera) = example(kind, [2.0, 2.0], None);
-            let mask = pixels::Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
+            let mask =
+                pixels::Mask { width: 5, height: 4, counts: (0..20).map(|i| i % 5 < 3).collect() };
             let image = Image::new(5, 4, 3, (0..60).map(|i| (i + 1) as f32 / 62.0).collect());
             let photograph = Photograph { image: image.clone(), mask: Some(mask) };
             let mut masked = Photographs::taken_by(camera, image);
-            masked.images = vec![PackedPhotograph::new(&photograph, &mut PixelMemory::unlimited()).unwrap()];
+            masked.images =
+                vec![PackedPhotograph::new(&photograph, &mut PixelMemory::unlimited()).unwrap()];
             let masked = supersampling(masked, None, &options(kind, [2.0, 2.0]));
             let mut drawn = [false; 20];
             (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
@@ -605,13 +729,14 @@ mod tests {
         }
     }
 
-    /// References join LR images as they are: whatever made those, each sub-pixel ray is a reference's pixel, and all are met
-    /// by some.
+    /// References join LR images as they are: whatever made those, each sub-pixel ray is a
+    /// reference's pixel, and all are met by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
         let given = |name: &str, width: usize, height: usize| {
-            let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
+            let camera =
+                Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
             Photographs::taken_by(camera, hr_image(width, height))
         };
         // The last column of blocks overlaps the one before it.
@@ -619,7 +744,11 @@ mod tests {
         let truth = hr_image(width, height);
         let camera = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Kernel] {
-            let mut joined = supersampling(given("a", 5, 4), Some(given("a", width, height)), &options(kind, [2.0, 2.0]));
+            let mut joined = supersampling(
+                given("a", 5, 4),
+                Some(given("a", width, height)),
+                &options(kind, [2.0, 2.0]),
+            );
             assert_eq!(joined.sampler.numbers(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
             let mut rays = [Ray { origin: [0.0; 3], direction: [0.0; 3], background: [0.0; 3] }; 4];
             let mut seen = [false; 72];
@@ -629,9 +758,15 @@ mod tests {
                 }
                 joined.sample_rays(bundle, &mut rays);
                 let pixels = rays.map(|ray| {
-                    let of =
-                        |pixel: usize| camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3();
-                    (0..72).find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6).expect("a pixel's ray")
+                    let of = |pixel: usize| {
+                        camera
+                            .ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5)
+                            .direction
+                            .as_vec3()
+                    };
+                    (0..72)
+                        .find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6)
+                        .expect("a pixel's ray")
                 });
                 pixels.iter().for_each(|&pixel| seen[pixel] = true);
                 // A tenth too bright in the last sub-pixel ray's red, and right in all else.
@@ -642,7 +777,8 @@ mod tests {
                 assert!((loss - 0.01 / 12.0).abs() < 1e-6, "{kind:?} {loss}");
                 let pulled = gradients[3][0];
                 assert!(
-                    (pulled - 0.2 / 12.0).abs() < 1e-6 && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
+                    (pulled - 0.2 / 12.0).abs() < 1e-6
+                        && gradients.as_flattened().iter().filter(|g| g.abs() > 1e-6).count() == 1
                 );
                 joined.remember(bundle, &colours);
             }
@@ -652,7 +788,10 @@ mod tests {
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);
-            assert!(camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6, "{kind:?}");
+            assert!(
+                camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6,
+                "{kind:?}"
+            );
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
             let mean = [0, 1, 2].map(|c| block.iter().map(|p| p[c]).sum::<f32>() / 4.0);
             assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
@@ -667,7 +806,11 @@ mod tests {
             assert_eq!(gradients[0], gradients[1], "{kind:?}");
         }
         // Of a larger one no more is drawn.
-        let larger = supersampling(given("a", 5, 4), Some(given("a", 20, 16)), &options(Supervision::Kernel, [2.0, 2.0]));
+        let larger = supersampling(
+            given("a", 5, 4),
+            Some(given("a", 20, 16)),
+            &options(Supervision::Kernel, [2.0, 2.0]),
+        );
         assert_eq!(larger.sampler.numbers(), 20 + 80);
         let mut masked = truth;
         masked.data[..3].fill(f32::NAN);

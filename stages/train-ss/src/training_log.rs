@@ -20,12 +20,13 @@ pub struct TrainingLog {
     pub resolved: BTreeMap<String, Value>,
     /// PSNR of training pixels against rays, about a hundred points a member.
     pub curve: Vec<CurvePoint>,
-    /// How many times as bright as all together each training view is, in the order of `views.json`, red, green and blue, where that was asked
-    /// for; of the first member.
+    /// How many times as bright as all together each training view is, in the order of
+    /// `views.json`, red, green and blue, where that was asked for; of the first member.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub exposures: Vec<[f32; 3]>,
-    /// Where each training view was found to be taken from, `camera_to_world` in the order of `views.json`, where that was asked for; of the first
-    /// member. The given poses where no better ones were found.
+    /// Where each training view was found to be taken from, `camera_to_world` in the order of
+    /// `views.json`, where that was asked for; of the first member. The given poses where no better
+    /// ones were found.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub poses: Vec<[[f64; 4]; 3]>,
     /// What looks wrong about it, a line each.
@@ -36,13 +37,15 @@ pub struct TrainingLog {
 impl TrainingLog {
     /// Appends another training's.
     pub(crate) fn add(&mut self, next: TrainingLog) {
-        let samples = self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
+        let samples =
+            self.samples_per_ray * self.rays as f64 + next.samples_per_ray * next.rays as f64;
         let before = self.rays;
         if self.steps == 0 {
             (self.exposures, self.poses) = (next.exposures, next.poses);
         }
         self.warnings.extend(next.warnings);
-        self.curve.extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
+        self.curve
+            .extend(next.curve.into_iter().map(|p| CurvePoint { rays: before + p.rays, ..p }));
         self.steps += next.steps;
         self.rays += next.rays;
         self.samples_per_ray = samples / self.rays.max(1) as f64;

@@ -1,4 +1,5 @@
-//! Networks against PyTorch's (`scripts/make-goldens-upsample.py`), and what their readers make of broken files.
+//! Networks against PyTorch's (`scripts/make-goldens-upsample.py`), and what their readers make of
+//! broken files.
 
 use std::path::{Path, PathBuf};
 
@@ -11,8 +12,15 @@ use crate::liif::Liif;
 use crate::swinir::SwinIr;
 use crate::{Network, fit};
 
-const FILES: [&str; 7] =
-    ["imdn", "liif", "swinir_classical", "swinir_classical_x3", "swinir_light", "swinir_real", "swinir_real_x2"];
+const FILES: [&str; 7] = [
+    "imdn",
+    "liif",
+    "swinir_classical",
+    "swinir_classical_x3",
+    "swinir_light",
+    "swinir_real",
+    "swinir_real_x2",
+];
 
 fn golden(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{name}.safetensors"))
@@ -51,7 +59,8 @@ fn networks_are_those_of_pytorch() {
     }
 }
 
-/// A file that lacks a tensor, or has an empty one in its place, is refused or means another network; it never panics.
+/// A file that lacks a tensor, or has an empty one in its place, is refused or means another
+/// network; it never panics.
 #[test]
 fn broken_weights_are_refused() {
     let folder = tempfile::tempdir().unwrap();
@@ -59,8 +68,10 @@ fn broken_weights_are_refused() {
     for name in FILES {
         let bytes = std::fs::read(golden(name)).unwrap();
         let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
-        let header: serde_json::Map<String, serde_json::Value> = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
-        let names: Vec<&String> = header.keys().filter(|n| !n.starts_with("golden") && !n.starts_with("__")).collect();
+        let header: serde_json::Map<String, serde_json::Value> =
+            serde_json::from_slice(&bytes[8..8 + length]).unwrap();
+        let names: Vec<&String> =
+            header.keys().filter(|n| !n.starts_with("golden") && !n.starts_with("__")).collect();
         let whole = Weights::read(&golden(name)).unwrap();
         let all: Vec<(String, Tensor)> = names
             .iter()
@@ -105,17 +116,21 @@ fn sizes_that_a_network_cannot_make_are_said() {
 /// IMDN as released, on ten real views, against PyTorch's scores.
 #[test]
 fn imdn_as_released_scores_as_in_pytorch() {
-    let data = std::env::var("NERF_SR_DATA")
-        .map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data"), PathBuf::from);
+    let data = std::env::var("NERF_SR_DATA").map_or_else(
+        |_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data"),
+        PathBuf::from,
+    );
     if !data.join("weights/imdn_x2.safetensors").is_file() {
         eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", data.display());
         return;
     }
     nets::deterministic();
     let scores = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/imdn-lego.json");
-    let scores: serde_json::Value = serde_json::from_slice(&std::fs::read(scores).unwrap()).unwrap();
+    let scores: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(scores).unwrap()).unwrap();
     for scale in [2usize, 4] {
-        let weights = Weights::read(&data.join(format!("weights/imdn_x{scale}.safetensors"))).unwrap();
+        let weights =
+            Weights::read(&data.join(format!("weights/imdn_x{scale}.safetensors"))).unwrap();
         let network = Imdn::read(&weights).unwrap();
         assert_eq!(network.scale(), Some(scale as i64));
         let rows = scores[format!("x{scale}")].as_array().unwrap();
@@ -128,11 +143,20 @@ fn imdn_as_released_scores_as_in_pytorch() {
             let lr = resize_pillow(&hr, 200 / scale, 200 / scale, Filter::Bicubic);
             let input = nets::tensor_of(&Image::premultiplied(&lr).over(0.0)).unwrap();
             let enlarged = no_grad(|| network.enlarge(&input, [200, 200])).unwrap().clamp(0.0, 1.0);
-            let (enlarged, truth) = (nets::image_of(&enlarged).unwrap(), Image::premultiplied(&hr).over(0.0));
-            let error: f64 = enlarged.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
-            let (found, expected) = (psnr_of(error / truth.data.len() as f64), row["psnr"].as_f64().unwrap());
-            assert!((found - expected).abs() < 0.02, "{view} ×{scale}: {found} dB where PyTorch has {expected}");
-            assert!(expected > row["bicubic_psnr"].as_f64().unwrap() + 1.0, "{view} ×{scale}: no better than bicubic");
+            let (enlarged, truth) =
+                (nets::image_of(&enlarged).unwrap(), Image::premultiplied(&hr).over(0.0));
+            let error: f64 =
+                enlarged.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+            let (found, expected) =
+                (psnr_of(error / truth.data.len() as f64), row["psnr"].as_f64().unwrap());
+            assert!(
+                (found - expected).abs() < 0.02,
+                "{view} ×{scale}: {found} dB where PyTorch has {expected}"
+            );
+            assert!(
+                expected > row["bicubic_psnr"].as_f64().unwrap() + 1.0,
+                "{view} ×{scale}: no better than bicubic"
+            );
         }
     }
 }

@@ -4,8 +4,8 @@ use tch::{TchError, Tensor};
 use crate::Network;
 use crate::layers::{contrast, count, leaky, root};
 
-/// IMDN (Hui et al. 2019, "Lightweight Image Super-Resolution with Information Multi-distillation Network"), by the names of its released
-/// weights. Width and scale are what the file says.
+/// IMDN (Hui et al. 2019, "Lightweight Image Super-Resolution with Information Multi-distillation
+/// Network"), by the names of its released weights. Width and scale are what the file says.
 pub(crate) struct Imdn {
     first: Conv,
     blocks: Vec<Block>,
@@ -15,7 +15,8 @@ pub(crate) struct Imdn {
     scale: i64,
 }
 
-/// Keeps a quarter of the channels after each of three layers and works on with the rest; then weighs the channels by their contrast.
+/// Keeps a quarter of the channels after each of three layers and works on with the rest; then
+/// weighs the channels by their contrast.
 struct Block {
     layers: [Conv; 4],
     attention: [Conv; 2],
@@ -36,7 +37,9 @@ impl Imdn {
         let scale = root(outputs / 3);
         Ok(Self {
             first: Conv::read(weights, &name("fea_conv"), [width, 3, 3, 3])?,
-            blocks: (1..=blocks).map(|i| Block::read(weights, &name(&format!("IMDB{i}")), width)).collect::<Result<_, _>>()?,
+            blocks: (1..=blocks)
+                .map(|i| Block::read(weights, &name(&format!("IMDB{i}")), width))
+                .collect::<Result<_, _>>()?,
             fuse: Conv::read(weights, &name("c.0"), [width, width * blocks as i64, 1, 1])?,
             last: Conv::read(weights, &name("LR_conv"), [width, width, 3, 3])?,
             up: Conv::read(weights, &name("upsampler.0"), [3 * scale * scale, width, 3, 3])?,
@@ -78,7 +81,10 @@ impl Block {
                 conv("c3", width, rest, 3)?,
                 conv("c4", kept, rest, 3)?,
             ],
-            attention: [conv("cca.conv_du.0", narrow, 4 * kept, 1)?, conv("cca.conv_du.2", 4 * kept, narrow, 1)?],
+            attention: [
+                conv("cca.conv_du.0", narrow, 4 * kept, 1)?,
+                conv("cca.conv_du.2", 4 * kept, narrow, 1)?,
+            ],
             fuse: conv("c5", width, 4 * kept, 1)?,
             kept,
         })

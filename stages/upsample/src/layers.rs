@@ -8,7 +8,11 @@ pub(crate) struct Linear {
 }
 
 impl Linear {
-    pub(crate) fn read(weights: &Weights, name: &str, shape: [i64; 2]) -> Result<Self, WeightsError> {
+    pub(crate) fn read(
+        weights: &Weights,
+        name: &str,
+        shape: [i64; 2],
+    ) -> Result<Self, WeightsError> {
         Ok(Self {
             weight: weights.tensor(&format!("{name}.weight"), &shape)?,
             bias: weights.tensor(&format!("{name}.bias"), &shape[..1])?,
@@ -19,7 +23,8 @@ impl Linear {
         x.f_linear(&self.weight, Some(&self.bias))
     }
 
-    /// The same from some of the inputs alone, from the `first` to before the `end`; without the bias.
+    /// The same from some of the inputs alone, from the `first` to before the `end`; without the
+    /// bias.
     pub(crate) fn part(&self, x: &Tensor, first: i64, end: i64) -> Result<Tensor, TchError> {
         x.f_linear(&self.weight.f_narrow(1, first, end - first)?, None::<&Tensor>)
     }
@@ -53,7 +58,8 @@ pub(crate) fn leaky(x: &Tensor, slope: f64) -> Result<Tensor, TchError> {
     x.f_maximum(&x.f_mul_scalar(slope)?)
 }
 
-/// How many numbered things there are, from `first` on: `name` says what their first tensor is called.
+/// How many numbered things there are, from `first` on: `name` says what their first tensor is
+/// called.
 pub(crate) fn count(weights: &Weights, first: usize, name: impl Fn(usize) -> String) -> usize {
     (first..).take_while(|&i| weights.has(&name(i))).count()
 }
@@ -63,7 +69,8 @@ pub(crate) fn root(square: i64) -> i64 {
     (square.max(0) as f64).sqrt().round() as i64
 }
 
-/// Standard deviation and mean of each channel over an image, added: the contrast that channel attention looks at.
+/// Standard deviation and mean of each channel over an image, added: the contrast that channel
+/// attention looks at.
 pub(crate) fn contrast(x: &Tensor) -> Result<Tensor, TchError> {
     let places: &[i64] = &[2, 3];
     let mean = x.f_mean_dim(places, true, Kind::Float)?;

@@ -1,15 +1,19 @@
-//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone: the baselines of the
-//! paper's tables, and the training photographs at HR size, which `refine` takes the mean with.
+//! `upsample`: enlarges views to the size of HR cameras by a method that looks at each image alone:
+//! the baselines of the paper's tables, and the training photographs at HR size, which `refine`
+//! takes the mean with.
 //!
 //! * `bicubic`: Pillow's, on 8 bits, to the last bit.
-//! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much smaller.
+//! * `imdn`, `swinir`: networks for one scale, which their weights say; the views must be that much
+//!   smaller.
 //! * `liif`: a network for any scale.
 //!
-//! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py` makes them from released checkpoints);
-//! every tensor's shape is checked. Images are composited on their background, enlarged as display-encoded sRGB, and are opaque
-//! afterwards: there is no depth to them. What doesn't count of a photograph, by its mask, doesn't when it is enlarged.
+//! Weights are safetensors files with the tensors' published names (`scripts/convert-weights.py`
+//! makes them from released checkpoints); every tensor's shape is checked. Images are composited on
+//! their background, enlarged as display-encoded sRGB, and are opaque afterwards: there is no depth
+//! to them. What doesn't count of a photograph, by its mask, doesn't when it is enlarged.
 //!
-//! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on how many there are.
+//! Convolutions and attention go through libtorch, a view in one thread, so bytes don't depend on
+//! how many there are.
 
 #[cfg(test)]
 mod goldens;
@@ -21,7 +25,9 @@ mod swinir;
 use anyhow::Context as _;
 use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
 use nets::Weights;
-use pixels::{Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png};
+use pixels::{
+    Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png,
+};
 use rayon::prelude::*;
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
@@ -35,7 +41,8 @@ use tch::{TchError, Tensor, no_grad};
 pub struct Params {
     /// Method that enlarges views.
     pub method: Method,
-    /// The network's file in input `weights`. Default: `imdn_xS.safetensors` or `swinir_xS.safetensors` for scale S, or `liif.safetensors`.
+    /// The network's file in input `weights`. Default: `imdn_xS.safetensors` or
+    /// `swinir_xS.safetensors` for scale S, or `liif.safetensors`.
     #[schemars(extend("x-default" = "by method"))]
     pub file: Option<String>,
 }
@@ -49,7 +56,8 @@ pub enum Method {
     Bicubic,
     /// IMDN, a light convolutional network (Hui et al. 2019).
     Imdn,
-    /// LIIF, a local implicit image function behind EDSR's baseline encoder, for any scale (Chen et al. 2021).
+    /// LIIF, a local implicit image function behind EDSR's baseline encoder, for any scale (Chen et
+    /// al. 2021).
     Liif,
     /// SwinIR, a transformer (Liang et al. 2021).
     Swinir,
@@ -69,9 +77,18 @@ impl Stage for Upsample {
     fn inputs() -> Vec<(&'static str, Input)> {
         let cameras = ["scene/cameras", "scene/truth", "cameras"];
         vec![
-            ("views", Input::required(&["views", "scene/train"], "rendered views, or photographs, at LR")),
-            ("cameras", Input::required(&cameras, "their cameras, at HR: how large the views become")),
-            ("weights", Input::optional(&["weights"], "folder with the network's safetensors file")),
+            (
+                "views",
+                Input::required(&["views", "scene/train"], "rendered views, or photographs, at LR"),
+            ),
+            (
+                "cameras",
+                Input::required(&cameras, "their cameras, at HR: how large the views become"),
+            ),
+            (
+                "weights",
+                Input::optional(&["weights"], "folder with the network's safetensors file"),
+            ),
         ]
     }
 
@@ -81,36 +98,58 @@ impl Stage for Upsample {
 
     fn rules() -> Vec<Rule> {
         let message = format!(
-            "input weights is missing: methods imdn, liif and swinir need a folder with their network's safetensors file; {MAKE_WEIGHTS}"
+            "input weights is missing: methods imdn, liif and swinir need a folder with their \
+            network's safetensors file; {MAKE_WEIGHTS}"
         );
-        vec![Rule::new(&message).when("method", json!({"enum": ["imdn", "liif", "swinir"]})).needs("weights")]
+        vec![
+            Rule::new(&message)
+                .when("method", json!({"enum": ["imdn", "liif", "swinir"]}))
+                .needs("weights"),
+        ]
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         nets::deterministic();
         let input = context.input("views")?;
         let (views, cameras) = (Views::read(input)?, Views::read(context.input("cameras")?)?);
-        let pairs = views.views.iter().map(|view| pair(view, &cameras)).collect::<anyhow::Result<Vec<_>>>()?;
+        let pairs = views
+            .views
+            .iter()
+            .map(|view| pair(view, &cameras))
+            .collect::<anyhow::Result<Vec<_>>>()?;
         let networks = networks(context, params, &pairs)?;
         let progress = context.progress("enlarging", pairs.len() as u64);
         let lanes = networks.len();
-        let work = networks.into_par_iter().enumerate().map(|(lane, network)| -> anyhow::Result<()> {
-            for (view, camera) in pairs.iter().skip(lane).step_by(lanes) {
-                context.check_interrupt()?;
-                let place = || format!("view {}", camera.name);
-                let photograph =
-                    view.read_photograph(input).bad_input(place())?.with_context(|| format!("{}: it has no image", place()));
-                let Photograph { image: lr, mask } = photograph.bad_input("input views")?.over(views.background.shown());
-                let hr = enlarge(network.as_deref(), &lr, camera).with_context(place)?;
-                write(context, &camera.name, &hr, mask.map(|mask| mask.resized((hr.width, hr.height), 0)))?;
-                progress.add(1);
-            }
-            Ok(())
-        });
+        let work =
+            networks.into_par_iter().enumerate().map(|(lane, network)| -> anyhow::Result<()> {
+                for (view, camera) in pairs.iter().skip(lane).step_by(lanes) {
+                    context.check_interrupt()?;
+                    let place = || format!("view {}", camera.name);
+                    let photograph = view
+                        .read_photograph(input)
+                        .bad_input(place())?
+                        .with_context(|| format!("{}: it has no image", place()));
+                    let Photograph { image: lr, mask } =
+                        photograph.bad_input("input views")?.over(views.background.shown());
+                    let hr = enlarge(network.as_deref(), &lr, camera).with_context(place)?;
+                    write(
+                        context,
+                        &camera.name,
+                        &hr,
+                        mask.map(|mask| mask.resized((hr.width, hr.height), 0)),
+                    )?;
+                    progress.add(1);
+                }
+                Ok(())
+            });
         work.collect::<anyhow::Result<Vec<_>>>()?;
         let hr = pairs.iter().map(|(view, camera)| {
             let image = Some(format!("images/{}.exr", camera.name));
-            View { image, mask: view.mask.as_ref().map(|_| mask_file(&camera.name)), ..View::camera_only((*camera).clone()) }
+            View {
+                image,
+                mask: view.mask.as_ref().map(|_| mask_file(&camera.name)),
+                ..View::camera_only((*camera).clone())
+            }
         });
         let hr = Views::new(views.background, views.bounds, hr.collect());
         context.write_json(VIEWS_FILE, &hr)?;
@@ -124,7 +163,8 @@ trait Network: Send {
     /// Times that it enlarges; `None`: any.
     fn scale(&self) -> Option<i64>;
 
-    /// An image (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one scale enlarges by that.
+    /// An image (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one
+    /// scale enlarges by that.
     fn enlarge(&self, image: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
 }
 
@@ -134,29 +174,49 @@ type Read = fn(&Weights) -> Result<Box<dyn Network>, nets::WeightsError>;
 /// A view and its HR camera.
 fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a Camera)> {
     let camera = cameras.taken_by(&view.camera).map(|v| &v.camera);
-    let missing = || Failure::BadInput(format!("input cameras: no camera {} with that view's pose", view.camera.name));
+    let missing = || {
+        Failure::BadInput(format!(
+            "input cameras: no camera {} with that view's pose",
+            view.camera.name
+        ))
+    };
     Ok((view, camera.ok_or_else(missing)?))
 }
 
 /// A network for each thread, none for what needs none.
-fn networks(context: &Context, params: &Params, pairs: &[(&View, &Camera)]) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
-    let widths = pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
+fn networks(
+    context: &Context,
+    params: &Params,
+    pairs: &[(&View, &Camera)],
+) -> anyhow::Result<Vec<Option<Box<dyn Network>>>> {
+    let widths =
+        pairs.first().map(|(view, camera)| (view.camera.intrinsics.width, camera.intrinsics.width));
     let (lr, hr) = widths.unwrap_or((1, 1));
     let scale = (f64::from(hr) / f64::from(lr)).round();
     let (default, read): (String, Read) = match params.method {
         Method::Bicubic => return Ok((0..context.threads).map(|_| None).collect()),
-        Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| Ok(Box::new(imdn::Imdn::read(weights)?))),
-        Method::Swinir => (format!("swinir_x{scale}.safetensors"), |weights| Ok(Box::new(swinir::SwinIr::read(weights)?))),
-        Method::Liif => ("liif.safetensors".to_owned(), |weights| Ok(Box::new(liif::Liif::read(weights)?))),
+        Method::Imdn => (format!("imdn_x{scale}.safetensors"), |weights| {
+            Ok(Box::new(imdn::Imdn::read(weights)?))
+        }),
+        Method::Swinir => (format!("swinir_x{scale}.safetensors"), |weights| {
+            Ok(Box::new(swinir::SwinIr::read(weights)?))
+        }),
+        Method::Liif => {
+            ("liif.safetensors".to_owned(), |weights| Ok(Box::new(liif::Liif::read(weights)?)))
+        }
     };
     let file = params.file.as_ref().unwrap_or(&default);
     let weights = open(context.input("weights")?, file)?;
-    let networks = (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
+    let networks =
+        (0..context.threads).map(|_| read(&weights).map(Some)).collect::<Result<Vec<_>, _>>();
     let networks = networks.bad_input("input weights")?;
     let scale = networks.first().and_then(|n| n.as_ref()?.scale());
     for (view, camera) in pairs {
-        let [lr, hr] = [&view.camera, *camera].map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        fit(scale, lr, hr).map_err(|reason| Failure::BadInput(format!("view {}: {file} {reason}", camera.name)))?;
+        let [lr, hr] = [&view.camera, *camera]
+            .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
+        fit(scale, lr, hr).map_err(|reason| {
+            Failure::BadInput(format!("view {}: {file} {reason}", camera.name))
+        })?;
     }
     Ok(networks)
 }
@@ -166,7 +226,8 @@ fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), String> {
     match scale.filter(|by| lr.map(|size| size * by) != hr) {
         None => Ok(()),
         Some(by) => Err(format!(
-            "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, or bicubic or liif",
+            "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, \
+            or bicubic or liif",
             hr[0], hr[1], lr[0], lr[1]
         )),
     }
@@ -175,11 +236,17 @@ fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), String> {
 /// The network's tensors, from a file of that name in the input.
 fn open(input: &GivenInput, file: &str) -> anyhow::Result<Weights> {
     if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
-        return Err(Failure::Usage(format!("file: {file:?} is no name of a file in input weights")).into());
+        return Err(Failure::Usage(format!(
+            "file: {file:?} is no name of a file in input weights"
+        ))
+        .into());
     }
     let path = input.path(file);
     if !path.is_file() {
-        return Err(Failure::BadInput(format!("input weights: no file {file} in it; {MAKE_WEIGHTS}")).into());
+        return Err(Failure::BadInput(format!(
+            "input weights: no file {file} in it; {MAKE_WEIGHTS}"
+        ))
+        .into());
     }
     Weights::read(&path).bad_input("input weights")
 }

@@ -4,8 +4,9 @@ use tch::{TchError, Tensor};
 use crate::Network;
 use crate::layers::{Linear, count};
 
-/// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image Function") behind EDSR's baseline encoder,
-/// by the names of its released weights: unfolded features, a local ensemble, decoding by cells. Any scale.
+/// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image
+/// Function") behind EDSR's baseline encoder, by the names of its released weights: unfolded
+/// features, a local ensemble, decoding by cells. Any scale.
 pub(crate) struct Liif {
     head: Conv,
     blocks: Vec<[Conv; 2]>,
@@ -26,9 +27,11 @@ const CHUNK: usize = 16_384;
 impl Liif {
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
         let [width, ..] = weights.shape::<4>("encoder.head.0.weight")?;
-        let conv = |name: &str| Conv::read(weights, &format!("encoder.{name}"), [width, width, 3, 3]);
+        let conv =
+            |name: &str| Conv::read(weights, &format!("encoder.{name}"), [width, width, 3, 3]);
         let blocks = count(weights, 0, |i| format!("encoder.body.{i}.body.0.weight"));
-        let block = |i: usize| Ok([conv(&format!("body.{i}.body.0"))?, conv(&format!("body.{i}.body.2"))?]);
+        let block =
+            |i: usize| Ok([conv(&format!("body.{i}.body.0"))?, conv(&format!("body.{i}.body.2"))?]);
         let name = |i: usize| format!("imnet.layers.{}", 2 * i);
         let count = count(weights, 0, |i| format!("{}.weight", name(i)));
         let mut inputs = UNFOLDED * width + 4;
@@ -58,23 +61,30 @@ impl Liif {
             x = two.forward(&one.forward(&x, 1, 1)?.f_relu()?, 1, 1)?.f_add(&x)?;
         }
         let features = self.tail.forward(&x, 1, 1)?.f_add(&first)?;
-        features.f_im2col([3, 3], [1, 1], [1, 1], [1, 1])?.f_squeeze_dim(0)?.f_transpose(0, 1)?.f_contiguous()
+        features
+            .f_im2col([3, 3], [1, 1], [1, 1], [1, 1])?
+            .f_squeeze_dim(0)?
+            .f_transpose(0, 1)?
+            .f_contiguous()
     }
 }
 
-/// Along an axis: which feature a pixel takes, and how far the pixel lies from it, in features' half steps.
+/// Along an axis: which feature a pixel takes, and how far the pixel lies from it, in features'
+/// half steps.
 struct Nearest {
     index: usize,
     offset: f64,
 }
 
-/// What each of `to` pixels along an axis takes of `from` features, shifted by half a feature to one side.
+/// What each of `to` pixels along an axis takes of `from` features, shifted by half a feature to
+/// one side.
 fn nearest(from: i64, to: i64, side: f64) -> Vec<Nearest> {
     let (from_f, to_f) = (from as f64, to as f64);
     let pixel = |i: i64| {
         let place = -1.0 + (2 * i + 1) as f64 / to_f;
         let shifted = (place + side / from_f + SHIFT).clamp(-1.0 + SHIFT, 1.0 - SHIFT);
-        let index = (((shifted + 1.0) * from_f - 1.0) / 2.0).round_ties_even().clamp(0.0, from_f - 1.0);
+        let index =
+            (((shifted + 1.0) * from_f - 1.0) / 2.0).round_ties_even().clamp(0.0, from_f - 1.0);
         let centre = -1.0 + (2.0 * index + 1.0) / from_f;
         Nearest { index: index as usize, offset: (place - centre) * from_f }
     };
@@ -90,19 +100,29 @@ impl Network for Liif {
         let [_, _, lr_rows, lr_columns] = image.size()[..] else {
             return Err(TchError::Shape("an image has four dimensions".to_owned()));
         };
-        let (first, others) = self.layers.split_first().ok_or_else(|| TchError::Shape("no layers".to_owned()))?;
+        let (first, others) =
+            self.layers.split_first().ok_or_else(|| TchError::Shape("no layers".to_owned()))?;
         let features = self.features(image)?;
         let width = features.size()[1];
-        // The first layer is linear: what features give it is the same for all pixels that take them, and so is the cell.
+        // The first layer is linear: what features give it is the same for all pixels that take
+        // them, and so is the cell.
         let known = first.part(&features, 0, width)?;
-        let cell = [2.0 * lr_rows as f64 / rows as f64, 2.0 * lr_columns as f64 / columns as f64].map(|c| c as f32);
-        let constant = first.part(&Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?, width + 2, width + 4)?.f_add(first.bias())?;
+        let cell = [2.0 * lr_rows as f64 / rows as f64, 2.0 * lr_columns as f64 / columns as f64]
+            .map(|c| c as f32);
+        let constant = first
+            .part(&Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?, width + 2, width + 4)?
+            .f_add(first.bias())?;
         let sides = [-1.0, 1.0];
-        let (down, across) = (sides.map(|s| nearest(lr_rows, rows, s)), sides.map(|s| nearest(lr_columns, columns, s)));
+        let (down, across) = (
+            sides.map(|s| nearest(lr_rows, rows, s)),
+            sides.map(|s| nearest(lr_columns, columns, s)),
+        );
         let mut chunks = Vec::new();
         for start in (0..(rows * columns) as usize).step_by(CHUNK) {
             let pixels = start..(start + CHUNK).min((rows * columns) as usize);
-            let place = |p: usize, v: usize, h: usize| (&down[v][p / columns as usize], &across[h][p % columns as usize]);
+            let place = |p: usize, v: usize, h: usize| {
+                (&down[v][p / columns as usize], &across[h][p % columns as usize])
+            };
             let area = |p: usize, v: usize, h: usize| {
                 let (y, x) = place(p, v, h);
                 (y.offset * x.offset).abs() + LEAST_AREA
@@ -133,7 +153,8 @@ impl Network for Liif {
             }
             chunks.extend(sum);
         }
-        let colours = Tensor::f_cat(&chunks, 0)?.f_transpose(0, 1)?.f_reshape([1, 3, rows, columns])?;
+        let colours =
+            Tensor::f_cat(&chunks, 0)?.f_transpose(0, 1)?.f_reshape([1, 3, rows, columns])?;
         colours.f_mul_scalar(0.5)?.f_add_scalar(0.5)
     }
 }

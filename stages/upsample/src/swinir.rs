@@ -4,8 +4,9 @@ use tch::{Kind, TchError, Tensor};
 use crate::Network;
 use crate::layers::{LayerNorm, Linear, count, leaky, root};
 
-/// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for super-resolution, by the names of its released weights:
-/// the classical, the lightweight and the real-world models. Width, depth, heads, window, scale and kind are what the file says.
+/// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for
+/// super-resolution, by the names of its released weights: the classical, the lightweight and the
+/// real-world models. Width, depth, heads, window, scale and kind are what the file says.
 pub(crate) struct SwinIr {
     first: Conv,
     embedded: Option<LayerNorm>,
@@ -63,13 +64,18 @@ impl SwinIr {
         let [width, ..] = weights.shape::<4>("conv_first.weight")?;
         let table = "layers.0.residual_group.blocks.0.attn.relative_position_bias_table";
         let window = ((root(weights.shape::<2>(table)?[0]) + 1) / 2).max(1);
-        let groups = count(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
+        let groups =
+            count(weights, 0, |i| format!("layers.{i}.residual_group.blocks.0.norm1.weight"));
         let (head, scale) = Head::read(weights, width)?;
-        let embedded = weights.has("patch_embed.norm.weight").then(|| LayerNorm::read(weights, "patch_embed.norm", width));
+        let embedded = weights
+            .has("patch_embed.norm.weight")
+            .then(|| LayerNorm::read(weights, "patch_embed.norm", width));
         Ok(Self {
             first: Conv::read(weights, "conv_first", [width, 3, 3, 3])?,
             embedded: embedded.transpose()?,
-            groups: (0..groups).map(|i| Group::read(weights, i, width, window)).collect::<Result<_, _>>()?,
+            groups: (0..groups)
+                .map(|i| Group::read(weights, i, width, window))
+                .collect::<Result<_, _>>()?,
             norm: LayerNorm::read(weights, "norm", width)?,
             after: Convs::read(weights, "conv_after_body", width)?,
             head,
@@ -99,7 +105,8 @@ impl Network for SwinIr {
         for group in &self.groups {
             x = group.forward(&x, self.window, &mask)?;
         }
-        let deep = self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
+        let deep =
+            self.after.forward(&self.norm.forward(&x)?.f_permute([0, 3, 1, 2])?)?.f_add(&first)?;
         let hr = self.head.forward(&deep)?.f_add(&mean)?;
         hr.f_narrow(2, 0, rows * self.scale)?.f_narrow(3, 0, columns * self.scale)
     }
@@ -113,9 +120,11 @@ impl SwinIr {
             let size = image.size()[axis];
             let lacks = size.rem_euclid(self.window);
             if lacks > 0 {
-                // Mirrored at the last one, as often as it takes: an image may be smaller than a window.
+                // Mirrored at the last one, as often as it takes: an image may be smaller than a
+                // window.
                 let period = (2 * (size - 1)).max(1);
-                let source = |i: i64| if i % period < size { i % period } else { period - i % period };
+                let source =
+                    |i: i64| if i % period < size { i % period } else { period - i % period };
                 let index: Vec<i64> = (0..size + self.window - lacks).map(source).collect();
                 x = x.f_index_select(axis as i64, &Tensor::f_from_slice(&index)?)?;
             }
@@ -125,11 +134,24 @@ impl SwinIr {
 }
 
 impl Group {
-    fn read(weights: &Weights, index: usize, width: i64, window: i64) -> Result<Self, WeightsError> {
+    fn read(
+        weights: &Weights,
+        index: usize,
+        width: i64,
+        window: i64,
+    ) -> Result<Self, WeightsError> {
         let name = |i: usize| format!("layers.{index}.residual_group.blocks.{i}");
         let blocks = count(weights, 0, |i| format!("{}.norm1.weight", name(i)));
         // Windows of every other block are shifted by half a window.
-        let block = |i: usize| TransformerBlock::read(weights, &name(i), width, window, if i % 2 == 1 { window / 2 } else { 0 });
+        let block = |i: usize| {
+            TransformerBlock::read(
+                weights,
+                &name(i),
+                width,
+                window,
+                if i % 2 == 1 { window / 2 } else { 0 },
+            )
+        };
         Ok(Self {
             blocks: (0..blocks).map(block).collect::<Result<_, _>>()?,
             after: Convs::read(weights, &format!("layers.{index}.conv"), width)?,
@@ -172,16 +194,24 @@ impl Convs {
 impl Head {
     /// The head that the weights are for, and how much it enlarges.
     fn read(weights: &Weights, width: i64) -> Result<(Self, i64), WeightsError> {
-        let conv = |name: &str, outputs: i64, inputs: i64| Conv::read(weights, name, [outputs, inputs, 3, 3]);
+        let conv = |name: &str, outputs: i64, inputs: i64| {
+            Conv::read(weights, name, [outputs, inputs, 3, 3])
+        };
         if !weights.has("conv_before_upsample.0.weight") {
             let scale = root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
-            return Ok((Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)?, by: scale }, scale));
+            return Ok((
+                Self::Direct { up: conv("upsample.0", 3 * scale * scale, width)?, by: scale },
+                scale,
+            ));
         }
         let [middle, ..] = weights.shape::<4>("conv_before_upsample.0.weight")?;
-        let (before, last) = (conv("conv_before_upsample.0", middle, width)?, conv("conv_last", 3, middle)?);
+        let (before, last) =
+            (conv("conv_before_upsample.0", middle, width)?, conv("conv_last", 3, middle)?);
         if weights.has("conv_up1.weight") {
             let steps = count(weights, 1, |i| format!("conv_up{i}.weight"));
-            let read = (1..=steps).map(|i| conv(&format!("conv_up{i}"), middle, middle)).collect::<Result<Vec<_>, _>>()?;
+            let read = (1..=steps)
+                .map(|i| conv(&format!("conv_up{i}"), middle, middle))
+                .collect::<Result<Vec<_>, _>>()?;
             let hr = conv("conv_hr", middle, middle)?;
             return Ok((Self::Repeated { before, steps: read, hr, last }, 1 << steps.min(8)));
         }
@@ -208,7 +238,9 @@ impl Head {
             Self::Repeated { before, steps, hr, last } => {
                 let mut x = leaky(&before.forward(x, 1, 1)?, HEAD_SLOPE)?;
                 for conv in steps {
-                    let repeated = x.f_repeat_interleave_self_int(2, 2, None)?.f_repeat_interleave_self_int(2, 3, None)?;
+                    let repeated = x
+                        .f_repeat_interleave_self_int(2, 2, None)?
+                        .f_repeat_interleave_self_int(2, 3, None)?;
                     x = leaky(&conv.forward(&repeated, 1, 1)?, SLOPE)?;
                 }
                 last.forward(&leaky(&hr.forward(&x, 1, 1)?, SLOPE)?, 1, 1)
@@ -218,18 +250,32 @@ impl Head {
 }
 
 impl TransformerBlock {
-    fn read(weights: &Weights, name: &str, width: i64, window: i64, shift: i64) -> Result<Self, WeightsError> {
+    fn read(
+        weights: &Weights,
+        name: &str,
+        width: i64,
+        window: i64,
+        shift: i64,
+    ) -> Result<Self, WeightsError> {
         let part = |part: &str| format!("{name}.{part}");
         let table = part("attn.relative_position_bias_table");
         let heads = weights.shape::<2>(&table)?[1].max(1);
         let reach = 2 * window - 1;
         let table = weights.tensor(&table, &[reach * reach, heads])?;
         let [hidden, _] = weights.shape::<2>(&part("mlp.fc1.weight"))?;
-        let linear = |of: &str, outputs: i64, inputs: i64| Linear::read(weights, &part(of), [outputs, inputs]);
+        let linear = |of: &str, outputs: i64, inputs: i64| {
+            Linear::read(weights, &part(of), [outputs, inputs])
+        };
         Ok(Self {
-            norms: [LayerNorm::read(weights, &part("norm1"), width)?, LayerNorm::read(weights, &part("norm2"), width)?],
+            norms: [
+                LayerNorm::read(weights, &part("norm1"), width)?,
+                LayerNorm::read(weights, &part("norm2"), width)?,
+            ],
             qkv: linear("attn.qkv", 3 * width, width)?,
-            bias: table.index_select(0, &relative(window)).reshape([window * window, window * window, heads]).permute([2, 0, 1]),
+            bias: table
+                .index_select(0, &relative(window))
+                .reshape([window * window, window * window, heads])
+                .permute([2, 0, 1]),
             projection: linear("attn.proj", width, width)?,
             layers: [linear("mlp.fc1", hidden, width)?, linear("mlp.fc2", width, hidden)?],
             heads,
@@ -244,20 +290,38 @@ impl TransformerBlock {
         };
         let shifted = self.norms[0].forward(x)?.f_roll([-self.shift, -self.shift], [1, 2])?;
         let (down, across, places) = (rows / window, columns / window, window * window);
-        let windows = shifted.f_reshape([down, window, across, window, width])?.f_permute([0, 2, 1, 3, 4])?;
+        let windows =
+            shifted.f_reshape([down, window, across, window, width])?.f_permute([0, 2, 1, 3, 4])?;
         let windows = windows.f_reshape([down * across, places, width])?;
-        let parts = self.qkv.forward(&windows)?.f_reshape([down * across, places, 3, self.heads, width / self.heads])?;
+        let parts = self.qkv.forward(&windows)?.f_reshape([
+            down * across,
+            places,
+            3,
+            self.heads,
+            width / self.heads,
+        ])?;
         let parts = parts.f_permute([2, 0, 3, 1, 4])?;
         let part = |i: i64| parts.f_select(0, i);
         let scale = 1.0 / ((width / self.heads) as f64).sqrt();
-        let mut attention = part(0)?.f_mul_scalar(scale)?.f_matmul(&part(1)?.f_transpose(-2, -1)?)?.f_add(&self.bias)?;
+        let mut attention = part(0)?
+            .f_mul_scalar(scale)?
+            .f_matmul(&part(1)?.f_transpose(-2, -1)?)?
+            .f_add(&self.bias)?;
         if self.shift > 0 {
             attention = attention.f_add(mask)?;
         }
         let seen = attention.f_softmax(-1, Kind::Float)?.f_matmul(&part(2)?)?;
-        let seen = self.projection.forward(&seen.f_transpose(1, 2)?.f_reshape([down * across, places, width])?)?;
-        let seen = seen.f_reshape([down, across, window, window, width])?.f_permute([0, 2, 1, 3, 4])?;
-        let x = seen.f_reshape([1, rows, columns, width])?.f_roll([self.shift, self.shift], [1, 2])?.f_add(x)?;
+        let seen = self.projection.forward(&seen.f_transpose(1, 2)?.f_reshape([
+            down * across,
+            places,
+            width,
+        ])?)?;
+        let seen =
+            seen.f_reshape([down, across, window, window, width])?.f_permute([0, 2, 1, 3, 4])?;
+        let x = seen
+            .f_reshape([1, rows, columns, width])?
+            .f_roll([self.shift, self.shift], [1, 2])?
+            .f_add(x)?;
         let inner = self.layers[0].forward(&self.norms[1].forward(&x)?)?.f_gelu("none")?;
         self.layers[1].forward(&inner)?.f_add(&x)
     }
@@ -266,20 +330,33 @@ impl TransformerBlock {
 /// For each pair of places in a window, which entry of the table has their bias.
 fn relative(window: i64) -> Tensor {
     let places = || (0..window).flat_map(|y| (0..window).map(move |x| (y, x)));
-    let index = |(a, b): ((i64, i64), (i64, i64))| (a.0 - b.0 + window - 1) * (2 * window - 1) + a.1 - b.1 + window - 1;
+    let index = |(a, b): ((i64, i64), (i64, i64))| {
+        (a.0 - b.0 + window - 1) * (2 * window - 1) + a.1 - b.1 + window - 1
+    };
     let all: Vec<i64> = places().flat_map(|a| places().map(move |b| index((a, b)))).collect();
     Tensor::from_slice(&all)
 }
 
-/// What is added to the attention of shifted windows (windows × 1 × places × places): what is rolled around from the other end isn't near.
+/// What is added to the attention of shifted windows (windows × 1 × places × places): what is
+/// rolled around from the other end isn't near.
 fn far(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
-    let region = |i: i64, size: i64| i64::from(i >= size - window) + i64::from(i >= size - window / 2);
+    let region =
+        |i: i64, size: i64| i64::from(i >= size - window) + i64::from(i >= size - window / 2);
     let (down, across, places) = (rows / window, columns / window, window * window);
     let mut mask = Vec::with_capacity((down * across * places * places) as usize);
     for w in 0..down * across {
-        let of = |p: i64| (region(w / across * window + p / window, rows), region(w % across * window + p % window, columns));
+        let of = |p: i64| {
+            (
+                region(w / across * window + p / window, rows),
+                region(w % across * window + p % window, columns),
+            )
+        };
         let regions: Vec<(i64, i64)> = (0..places).map(of).collect();
-        mask.extend(regions.iter().flat_map(|a| regions.iter().map(move |b| if a == b { 0.0 } else { FAR })));
+        mask.extend(
+            regions
+                .iter()
+                .flat_map(|a| regions.iter().map(move |b| if a == b { 0.0 } else { FAR })),
+        );
     }
     Tensor::f_from_slice(&mask)?.f_reshape([down * across, 1, places, places])
 }

@@ -1,14 +1,16 @@
 //! `video`: rendered views as a film, colour and depth side by side.
 //!
-//! A sink: it writes one PNG a frame and, where `ffmpeg` is installed, `video.mp4`; without it the frames are the film. A sweep's points
-//! get a folder each.
+//! A sink: it writes one PNG a frame and, where `ffmpeg` is installed, `video.mp4`; without it the
+//! frames are the film. A sweep's points get a folder each.
 
 use std::path::Path;
 use std::process::{Command, Stdio};
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, Input, Output, RunNode, RunRecord, Stage};
-use pixels::{Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png};
+use pixels::{
+    Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png,
+};
 use rayon::prelude::*;
 use scene::Views;
 use schemars::JsonSchema;
@@ -39,7 +41,13 @@ impl Stage for Video {
     const SINK: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        vec![("run", Input::required(&["run"], "folder with run.json: the record of what rendered the views"))]
+        vec![(
+            "run",
+            Input::required(
+                &["run"],
+                "folder with run.json: the record of what rendered the views",
+            ),
+        )]
     }
 
     fn output() -> Output {
@@ -51,28 +59,44 @@ impl Stage for Video {
         run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
         let rendered: Vec<&RunNode> = run.nodes.iter().filter(|n| n.kind == "views").collect();
         if rendered.is_empty() {
-            return Err(Failure::BadInput("run.json: nothing in it rendered views".to_owned()).into());
+            return Err(
+                Failure::BadInput("run.json: nothing in it rendered views".to_owned()).into()
+            );
         }
         for (i, node) in rendered.iter().enumerate() {
-            let prefix = if rendered.len() == 1 { String::new() } else { format!("{}-{}/", i + 1, folder_name(node)) };
-            film(context, params, &node.folder, &prefix).with_context(|| format!("{} {}", node.stage, node.point))?;
+            let prefix = if rendered.len() == 1 {
+                String::new()
+            } else {
+                format!("{}-{}/", i + 1, folder_name(node))
+            };
+            film(context, params, &node.folder, &prefix)
+                .with_context(|| format!("{} {}", node.stage, node.point))?;
         }
         Ok(())
     }
 }
 
-/// What tells a sweep's film from the others: its values, as far as a folder can have them in its name.
+/// What tells a sweep's film from the others: its values, as far as a folder can have them in its
+/// name.
 fn folder_name(node: &RunNode) -> String {
     let text = if node.point.is_empty() { &node.stage } else { &node.point };
-    text.replace(", ", "-").chars().map(|c| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' }).collect()
+    text.replace(", ", "-")
+        .chars()
+        .map(|c| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' })
+        .collect()
 }
 
 /// Frames, and the film where that can be made.
 fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyhow::Result<()> {
     let views = Views::of_folder(folder)?;
-    let size = |i: usize| (views.views[i].camera.intrinsics.width, views.views[i].camera.intrinsics.height);
+    let size = |i: usize| {
+        (views.views[i].camera.intrinsics.width, views.views[i].camera.intrinsics.height)
+    };
     if (1..views.views.len()).any(|i| size(i) != size(0)) {
-        return Err(Failure::BadInput("the views have several sizes; set size in render-depth".to_owned()).into());
+        return Err(Failure::BadInput(
+            "the views have several sizes; set size in render-depth".to_owned(),
+        )
+        .into());
     }
     let progress = context.progress("drawing", 2 * views.views.len() as u64);
     // One range of depths for all frames: colours that change with the frame would flicker.
@@ -90,12 +114,19 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
         .enumerate()
         .map(|(i, view)| {
             context.check_interrupt()?;
-            let image = view.image.as_ref().with_context(|| format!("view {}: it has no image", view.camera.name))?;
-            let colour = read_premultiplied(&folder.join(image))?.over(views.background.shown()).to_rgba8();
+            let image = view
+                .image
+                .as_ref()
+                .with_context(|| format!("view {}: it has no image", view.camera.name))?;
+            let colour =
+                read_premultiplied(&folder.join(image))?.over(views.background.shown()).to_rgba8();
             let depth = match (&view.depth, range) {
                 (Some(file), Some(range)) => {
                     let image = read_exr(&folder.join(file))?;
-                    image.channel("Z").zip(image.channel("A")).map(|(z, a)| draw_depth(image.width, z, a, range))
+                    image
+                        .channel("Z")
+                        .zip(image.channel("A"))
+                        .map(|(z, a)| draw_depth(image.width, z, a, range))
                 }
                 _ => None,
             };
@@ -112,7 +143,11 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
 /// Two images of one height as one.
 fn side_by_side(left: &Rgba8, right: &Rgba8) -> Rgba8 {
     let rows = left.data.chunks_exact(4 * left.width).zip(right.data.chunks_exact(4 * right.width));
-    Rgba8::new(left.width + right.width, left.height, rows.flat_map(|(a, b)| [a, b].concat()).collect())
+    Rgba8::new(
+        left.width + right.width,
+        left.height,
+        rows.flat_map(|(a, b)| [a, b].concat()).collect(),
+    )
 }
 
 /// With a last column and row twice where sizes are odd, which films can't have.
@@ -137,10 +172,14 @@ fn encode(context: &Context, params: &Params, frames: &Path, film: &Path) -> any
         Ok(output) if output.status.success() => Ok(()),
         Ok(output) => {
             let said = String::from_utf8_lossy(&output.stderr);
-            context
-                .say(format!("no video.mp4: ffmpeg said {:?}; the frames are there", said.lines().next().unwrap_or("nothing")));
+            context.say(format!(
+                "no video.mp4: ffmpeg said {:?}; the frames are there",
+                said.lines().next().unwrap_or("nothing")
+            ));
             // What it left is no film.
-            std::fs::remove_file(film).or_else(|e| if e.kind() == std::io::ErrorKind::NotFound { Ok(()) } else { Err(e) })?;
+            std::fs::remove_file(film).or_else(|e| {
+                if e.kind() == std::io::ErrorKind::NotFound { Ok(()) } else { Err(e) }
+            })?;
             Ok(())
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {

@@ -35,13 +35,18 @@ impl Folder {
         std::fs::write(path, bytes).expect("a file");
     }
 
-    /// Reads the data set and its first images. Errors are what is expected; a panic, a hang or much memory isn't.
+    /// Reads the data set and its first images. Errors are what is expected; a panic, a hang or
+    /// much memory isn't.
     pub fn read(&self) {
         if let Ok(set) = Dataset::read(self.0.path()) {
             for frame in set.frames.iter().take(2) {
                 // Nothing that a file names may lie outside the folder.
                 let image = frame.image.canonicalize().expect("an image that was looked at");
-                assert!(image.starts_with(self.0.path().canonicalize().expect("the folder")), "{}", image.display());
+                assert!(
+                    image.starts_with(self.0.path().canonicalize().expect("the folder")),
+                    "{}",
+                    image.display()
+                );
                 frame.photograph().ok();
             }
         }
@@ -54,8 +59,8 @@ impl Default for Folder {
     }
 }
 
-/// A COLMAP model's three files, binary, of two views: the seeds that `seeds.py` writes, less their first byte, which says which file they
-/// are.
+/// A COLMAP model's three files, binary, of two views: the seeds that `seeds.py` writes, less their
+/// first byte, which says which file they are.
 pub fn colmap_model() -> [(&'static str, &'static [u8]); 3] {
     macro_rules! seed {
         ($which:literal) => {

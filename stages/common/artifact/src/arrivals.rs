@@ -14,8 +14,9 @@ pub struct Arrival {
 }
 
 impl Store {
-    /// Looks at what came from another store: every file against the manifest, the manifest against the identity. Makes it
-    /// durable. This takes its time; taking it in ([`Store::take_in`]) doesn't.
+    /// Looks at what came from another store: every file against the manifest, the manifest against
+    /// the identity. Makes it durable. This takes its time; taking it in ([`Store::take_in`])
+    /// doesn't.
     pub fn check_arrival(&self, folder: &Path, identity: &str) -> Result<Arrival, StoreError> {
         let manifest = Manifest::read(folder)?;
         if manifest.identity() != identity {
@@ -23,22 +24,26 @@ impl Store {
         }
         manifest.check_contents(folder)?;
         make_durable(folder, &manifest)?;
-        let replaces = self.object(identity).symlink_metadata().is_ok() && self.verify(identity).is_err();
+        let replaces =
+            self.object(identity).symlink_metadata().is_ok() && self.verify(identity).is_err();
         Ok(Arrival { folder: folder.to_path_buf(), identity: identity.to_owned(), replaces })
     }
 
     /// Takes in an object that came from another store. A whole one that is there stays.
     pub fn take_in(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
-        // Somebody else may have put it there meanwhile: then readers shall not miss it for a moment.
+        // Somebody else may have put it there meanwhile: then readers shall not miss it for a
+        // moment.
         let is_there = !arrival.replaces && self.is_whole(&arrival.identity);
         self.place(&arrival.folder, &arrival.identity, is_there)
     }
 
-    /// Takes in a record that came from another store, after its object; whether it was new. The record that is there stays,
-    /// unless its object isn't whole and the new one's is.
+    /// Takes in a record that came from another store, after its object; whether it was new. The
+    /// record that is there stays, unless its object isn't whole and the new one's is.
     pub fn take_in_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
         let known = self.record(&record.key());
-        let stays = known.is_some_and(|known| self.is_whole(&known.output) || !self.is_whole(&record.output) || known == *record);
+        let stays = known.is_some_and(|known| {
+            self.is_whole(&known.output) || !self.is_whole(&record.output) || known == *record
+        });
         if !stays {
             self.write_record(record)?;
         }
@@ -62,7 +67,12 @@ mod tests {
     }
 
     fn record(output: &str, host: &str) -> Record {
-        Record { stage: "s".to_owned(), output: output.to_owned(), host: host.to_owned(), ..Record::default() }
+        Record {
+            stage: "s".to_owned(),
+            output: output.to_owned(),
+            host: host.to_owned(),
+            ..Record::default()
+        }
     }
 
     /// The first record of a whole artifact stays; damaged objects give way.
@@ -92,11 +102,20 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let (folder, identity) = arriving(&store, "1234");
-        assert!(matches!(store.check_arrival(&folder, &"0".repeat(64)), Err(StoreError::Damage(Damage::Content { .. }))));
+        assert!(matches!(
+            store.check_arrival(&folder, &"0".repeat(64)),
+            Err(StoreError::Damage(Damage::Content { .. }))
+        ));
         fs::write(folder.join("x"), "1235").unwrap();
-        assert!(matches!(store.check_arrival(&folder, &identity), Err(StoreError::Damage(Damage::Content { .. }))));
+        assert!(matches!(
+            store.check_arrival(&folder, &identity),
+            Err(StoreError::Damage(Damage::Content { .. }))
+        ));
         fs::remove_file(folder.join("x")).unwrap();
-        assert!(matches!(store.check_arrival(&folder, &identity), Err(StoreError::Damage(Damage::Unreadable { .. }))));
+        assert!(matches!(
+            store.check_arrival(&folder, &identity),
+            Err(StoreError::Damage(Damage::Unreadable { .. }))
+        ));
         assert!(store.objects().unwrap().is_empty());
     }
 }

@@ -1,7 +1,8 @@
 use serde::Serialize;
 use serde_json::Value;
 
-/// The canonical JSON of a value: keys sorted, no white space, numbers as `serde_json` prints them. Only this form is hashed.
+/// The canonical JSON of a value: keys sorted, no white space, numbers as `serde_json` prints them.
+/// Only this form is hashed.
 ///
 /// # Panics
 /// When the value can't be JSON at all (a map with keys that aren't strings): a programming error.
@@ -20,7 +21,8 @@ pub fn hash_json(value: &impl Serialize) -> String {
 fn write(value: &Value, out: &mut String) {
     match value {
         Value::Object(map) => {
-            // Sorted here, because `serde_json` keeps insertion order once any crate asks for its `preserve_order`.
+            // Sorted here, because `serde_json` keeps insertion order once any crate asks for its
+            // `preserve_order`.
             let mut entries: Vec<_> = map.iter().collect();
             entries.sort_by_key(|(key, _)| key.as_str());
             out.push('{');
@@ -64,7 +66,8 @@ mod tests {
         leaf.prop_recursive(4, 32, 6, |inner| {
             prop_oneof![
                 prop::collection::vec(inner.clone(), 0..6).prop_map(Value::from),
-                prop::collection::vec((".*", inner), 0..6).prop_map(|v| Value::Object(v.into_iter().collect())),
+                prop::collection::vec((".*", inner), 0..6)
+                    .prop_map(|v| Value::Object(v.into_iter().collect())),
             ]
         })
     }
@@ -79,8 +82,10 @@ mod tests {
         }
 
         #[test]
-        fn key_order_does_not_matter(mut entries in prop::collection::btree_map(".*", any::<i32>(), 0..8)) {
-            let forward: serde_json::Map<_, _> = entries.iter().map(|(k, v)| (k.clone(), (*v).into())).collect();
+        fn key_order_does_not_matter(mut entries in prop::collection::btree_map(".*", any::<i32>(),
+            0..8)) {
+            let forward: serde_json::Map<_, _> = entries.iter().map(|(k, v)| (k.clone(),
+                (*v).into())).collect();
             let mut backward = serde_json::Map::new();
             while let Some((k, v)) = entries.pop_last() {
                 backward.insert(k, v.into());

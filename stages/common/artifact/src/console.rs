@@ -1,12 +1,13 @@
-//! Words for people. Whoever reads them may go away (`| head -1`, a closed terminal): that stops nothing and changes no exit
-//! code, so a write that fails is passed over. Control characters are spelled out.
+//! Words for people. Whoever reads them may go away (`| head -1`, a closed terminal): that stops
+//! nothing and changes no exit code, so a write that fails is passed over. Control characters are
+//! spelled out.
 
 use std::io::Write;
 
 use crate::printable::printable;
 
-/// Prints one line to stdout, as `println!` does, but with control characters spelled out, and without a panic when stdout is
-/// closed.
+/// Prints one line to stdout, as `println!` does, but with control characters spelled out, and
+/// without a panic when stdout is closed.
 #[macro_export]
 macro_rules! print_line {
     ($($arguments:tt)*) => { $crate::print_text(&format!($($arguments)*)) };

@@ -21,8 +21,9 @@ pub struct Description {
     pub code: String,
     /// One sentence: what the stage makes of what.
     pub summary: String,
-    /// JSON Schema of the parameters: an object, every property with its default. `x-group` names a parameter's group; `x-default` stands for a default
-    /// that is null, and is `by scene` where the inputs decide.
+    /// JSON Schema of the parameters: an object, every property with its default. `x-group` names a
+    /// parameter's group; `x-default` stands for a default that is null, and is `by scene` where
+    /// the inputs decide.
     pub parameters: Value,
     /// Inputs by name.
     pub inputs: BTreeMap<String, Input>,
@@ -43,9 +44,11 @@ pub struct Description {
 }
 
 impl Description {
-    /// Says what is wrong with a description that has the right form: what it names must be there, and its folders inside the output.
+    /// Says what is wrong with a description that has the right form: what it names must be there,
+    /// and its folders inside the output.
     pub fn check(&self) -> Result<(), String> {
-        let schema = Schema::new(&self.name, &self.parameters).map_err(|e| format!("its parameter schema is {e}"))?;
+        let schema = Schema::new(&self.name, &self.parameters)
+            .map_err(|e| format!("its parameter schema is {e}"))?;
         if self.name.is_empty() {
             return Err("it has no name".to_owned());
         }
@@ -53,7 +56,8 @@ impl Description {
             relative_path(folder).map_err(|e| format!("its output: {e}"))?;
         }
         for (index, rule) in self.rules.iter().enumerate() {
-            rule.check(&schema.names(), &self.inputs).map_err(|e| format!("its rule {}: {e}", index + 1))?;
+            rule.check(&schema.names(), &self.inputs)
+                .map_err(|e| format!("its rule {}: {e}", index + 1))?;
         }
         Ok(())
     }
@@ -75,7 +79,11 @@ pub struct Input {
 impl Input {
     /// An input that must be given.
     pub fn required(kinds: &[&str], summary: &str) -> Self {
-        Self { kinds: kinds.iter().map(ToString::to_string).collect(), optional: false, summary: summary.to_owned() }
+        Self {
+            kinds: kinds.iter().map(ToString::to_string).collect(),
+            optional: false,
+            summary: summary.to_owned(),
+        }
     }
 
     /// An input that may be left out.
@@ -93,7 +101,8 @@ pub struct Output {
     /// Folders of it that an input may name (`prep/train`), with their kinds.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub subtrees: BTreeMap<String, String>,
-    /// A JSON file of it whose entry `resolved` has, by name, the values in use of parameters whose default depends on the inputs.
+    /// A JSON file of it whose entry `resolved` has, by name, the values in use of parameters whose
+    /// default depends on the inputs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resolved: Option<String>,
 }

@@ -1,6 +1,9 @@
-/// Checks what `--device` was given: `cpu`, `cuda` or `cuda:N`. Whether there is such a GPU is for who computes to say.
+/// Checks what `--device` was given: `cpu`, `cuda` or `cuda:N`. Whether there is such a GPU is for
+/// who computes to say.
 pub fn check_device(name: &str) -> Result<(), String> {
-    let is_number = |index: &str| !index.is_empty() && index.len() <= 4 && index.bytes().all(|b| b.is_ascii_digit());
+    let is_number = |index: &str| {
+        !index.is_empty() && index.len() <= 4 && index.bytes().all(|b| b.is_ascii_digit())
+    };
     if ["cpu", "cuda"].contains(&name) || name.strip_prefix("cuda:").is_some_and(is_number) {
         return Ok(());
     }
@@ -16,7 +19,8 @@ mod tests {
         for name in ["cpu", "cuda", "cuda:0", "cuda:12"] {
             assert!(check_device(name).is_ok(), "{name}");
         }
-        for name in ["", "gpu", "CPU", "cuda:", "cuda:x", "cuda:-1", "cuda:99999", "cuda0", "cpu:0"] {
+        for name in ["", "gpu", "CPU", "cuda:", "cuda:x", "cuda:-1", "cuda:99999", "cuda0", "cpu:0"]
+        {
             assert!(check_device(name).is_err(), "{name}");
         }
     }

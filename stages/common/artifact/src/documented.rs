@@ -7,8 +7,10 @@ use crate::parameters::DEFAULT_KEYWORD;
 use crate::tagged::Tag;
 use crate::values::Reader;
 
-/// Groups of parameters, in the order in which they are shown; a parameter without a group stands before all.
-pub const GROUPS: [&str; 7] = ["data", "sampling", "loss", "optimiser", "field", "network", "output"];
+/// Groups of parameters, in the order in which they are shown; a parameter without a group stands
+/// before all.
+pub const GROUPS: [&str; 7] =
+    ["data", "sampling", "loss", "optimiser", "field", "network", "output"];
 /// Keyword of a parameter's schema: its group.
 const GROUP_KEYWORD: &str = "x-group";
 
@@ -32,7 +34,8 @@ pub struct ParameterText {
 /// Parameters that stand together: all of a stage, or those that a variant has besides.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ParameterSection {
-    /// The choice that they belong to, such as `field: grid`; nothing for those that are always there.
+    /// The choice that they belong to, such as `field: grid`; nothing for those that are always
+    /// there.
     pub variant: Option<String>,
     /// The parameters, by group, then by name.
     pub parameters: Vec<ParameterText>,
@@ -47,12 +50,16 @@ impl Description {
             parameters: parameters(schema, names),
         };
         // A description is checked before it is used: two tags are an error there.
-        let Some(tag) = Tag::find(schema).ok().flatten() else { return vec![section(None, schema, &|_| true)] };
+        let Some(tag) = Tag::find(schema).ok().flatten() else {
+            return vec![section(None, schema, &|_| true)];
+        };
         let forms = tag.forms(schema);
         let is_common = |name: &str| schema["properties"].get(name).is_some();
         let mut sections = vec![section(None, &forms[0], &is_common)];
         for (variant, form) in tag.variants().zip(&forms) {
-            sections.push(section(Some(format!("{}: {variant}", tag.name())), form, &|name| !is_common(name)));
+            sections.push(section(Some(format!("{}: {variant}", tag.name())), form, &|name| {
+                !is_common(name)
+            }));
         }
         sections
     }
@@ -61,8 +68,11 @@ impl Description {
 fn parameters(schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Vec<ParameterText> {
     let properties = schema.get("properties").and_then(Value::as_object).into_iter().flatten();
     let wanted = properties.filter(|(name, _)| is_wanted(name));
-    let mut found: Vec<ParameterText> = wanted.map(|(name, property)| parameter(schema, name, property)).collect();
-    let place = |text: &ParameterText| GROUPS.iter().position(|group| *group == text.group).map_or(0, |at| at + 1);
+    let mut found: Vec<ParameterText> =
+        wanted.map(|(name, property)| parameter(schema, name, property)).collect();
+    let place = |text: &ParameterText| {
+        GROUPS.iter().position(|group| *group == text.group).map_or(0, |at| at + 1)
+    };
     found.sort_by(|a, b| (place(a), &a.name).cmp(&(place(b), &b.name)));
     found
 }
@@ -70,9 +80,12 @@ fn parameters(schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Vec<Parameter
 fn parameter(schema: &Value, name: &str, property: &Value) -> ParameterText {
     let text_of = |keyword: &str| property.get(keyword).and_then(Value::as_str).unwrap_or_default();
     let reader = Reader::new(schema);
-    let choices: Vec<(String, String)> = reader.choices(property).into_iter().flatten().map(choice).collect();
+    let choices: Vec<(String, String)> =
+        reader.choices(property).into_iter().flatten().map(choice).collect();
     let default = match property.get("default") {
-        None | Some(Value::Null) if !text_of(DEFAULT_KEYWORD).is_empty() => text_of(DEFAULT_KEYWORD).to_owned(),
+        None | Some(Value::Null) if !text_of(DEFAULT_KEYWORD).is_empty() => {
+            text_of(DEFAULT_KEYWORD).to_owned()
+        }
         None | Some(Value::Null) => "none".to_owned(),
         Some(default) => plain(default),
     };
@@ -102,7 +115,9 @@ fn allowed(property: &Value, present: &Value, choices: &[(String, String)]) -> S
     }
     let types: Vec<&str> = match present.get("type") {
         Some(Value::String(one)) => vec![one],
-        Some(Value::Array(several)) => several.iter().filter_map(Value::as_str).filter(|one| *one != "null").collect(),
+        Some(Value::Array(several)) => {
+            several.iter().filter_map(Value::as_str).filter(|one| *one != "null").collect()
+        }
         _ => Vec::new(),
     };
     let noun = match types[..] {
@@ -113,7 +128,8 @@ fn allowed(property: &Value, present: &Value, choices: &[(String, String)]) -> S
         ["array"] => "a list",
         _ => "JSON",
     };
-    let bound = |keyword: &str| property.get(keyword).or_else(|| present.get(keyword)).map(short_number);
+    let bound =
+        |keyword: &str| property.get(keyword).or_else(|| present.get(keyword)).map(short_number);
     match (bound("minimum"), bound("maximum")) {
         (Some(least), Some(most)) => format!("{noun} from {least} to {most}"),
         (Some(least), None) => format!("{noun} from {least}"),

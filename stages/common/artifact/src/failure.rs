@@ -72,9 +72,13 @@ mod tests {
 
     #[test]
     fn names_from_files_move_no_terminal() {
-        let error = anyhow::anyhow!("r_\u{1b}]0;PWN\u{7}.png: No such file").context("frame 3\nof many");
+        let error =
+            anyhow::anyhow!("r_\u{1b}]0;PWN\u{7}.png: No such file").context("frame 3\nof many");
         assert_eq!(one_line(&error), r"frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
         let bad = Err::<(), _>(error).bad_input("input scene").unwrap_err();
-        assert_eq!(one_line(&bad), r"input scene: frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
+        assert_eq!(
+            one_line(&bad),
+            r"input scene: frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file"
+        );
     }
 }

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-/// Writes a file so that a reader sees the old or the new content, never a part: temporary file, fsync, rename, fsync of the folder.
+/// Writes a file so that a reader sees the old or the new content, never a part: temporary file,
+/// fsync, rename, fsync of the folder.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let mut temporary = temporary(0o666).suffix(".partial").tempfile_in(folder)?;
@@ -15,15 +16,16 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     sync_folder(folder)
 }
 
-/// What makes a hidden temporary file (mode 0o666) or folder (0o777) whose permissions are left to the umask, so that a group
-/// can share what becomes of it; tempfile's own are the owner's alone.
+/// What makes a hidden temporary file (mode 0o666) or folder (0o777) whose permissions are left to
+/// the umask, so that a group can share what becomes of it; tempfile's own are the owner's alone.
 pub(crate) fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".").permissions(fs::Permissions::from_mode(mode));
     builder
 }
 
-/// Writes a value as indented JSON that ends in a line feed: the form of every JSON file people may open.
+/// Writes a value as indented JSON that ends in a line feed: the form of every JSON file people may
+/// open.
 pub fn write_json(path: &Path, value: &impl Serialize) -> io::Result<()> {
     let mut text = serde_json::to_string_pretty(value)?;
     text.push('\n');

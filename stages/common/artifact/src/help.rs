@@ -17,7 +17,10 @@ pub(crate) fn help_of(description: &Description) -> String {
         text.push_str("Inputs, with the kinds of artifact that they take:\n");
         for (name, input) in &description.inputs {
             let note = if input.optional { ", optional" } else { "" };
-            text.push_str(&entry(name, &format!("{} [{}{note}]", input.summary, input.kinds.join(" or "))));
+            text.push_str(&entry(
+                name,
+                &format!("{} [{}{note}]", input.summary, input.kinds.join(" or ")),
+            ));
         }
         text.push('\n');
     }
@@ -25,7 +28,9 @@ pub(crate) fn help_of(description: &Description) -> String {
     if sections.iter().all(|section| section.parameters.is_empty()) {
         return text + "It has no parameters.\n";
     }
-    text.push_str("Parameters: in pipeline.yaml under `parameters:`, or as -p NAME=VALUE of nerf-sr.\n");
+    text.push_str(
+        "Parameters: in pipeline.yaml under `parameters:`, or as -p NAME=VALUE of nerf-sr.\n",
+    );
     text.push_str(&format!("All about them: docs/reference/{}.md\n", description.name));
     for section in &sections {
         if let Some(variant) = &section.variant {
@@ -44,7 +49,10 @@ pub(crate) fn help_of(description: &Description) -> String {
 }
 
 fn parameter_entry(parameter: &ParameterText) -> String {
-    entry(&parameter.name, &format!("{} [{}; default: {}]", parameter.text, parameter.allowed, parameter.default))
+    entry(
+        &parameter.name,
+        &format!("{} [{}; default: {}]", parameter.text, parameter.allowed, parameter.default),
+    )
 }
 
 fn entry(name: &str, text: &str) -> String {
@@ -67,19 +75,24 @@ mod tests {
 
     #[test]
     fn help_is_grouped_and_wrapped() {
-        let long = "What an LR pixel is compared with, said at such length that no line of a terminal could ever hold all of it.";
+        let long = "What an LR pixel is compared with, said at such length that no line of a \
+            terminal could ever hold all of it.";
         let description = Description {
             name: "x".to_owned(),
             version: String::new(),
             code: String::new(),
             summary: String::new(),
             parameters: json!({"properties": {
-                "supervision": {"description": long, "enum": ["average", "kernel"], "default": null, "x-default": "by scene", "x-group": "loss"},
-                "exposure": {"description": "Finds exposures.", "type": "boolean", "default": false, "x-group": "data"},
+                "supervision": {"description": long, "enum": ["average", "kernel"],
+                "default": null, "x-default": "by scene", "x-group": "loss"},
+                "exposure": {"description": "Finds \
+                exposures.", "type": "boolean", "default": false, "x-group": "data"},
                 "rays": {"description": "Rays.", "type": "integer", "minimum": 1, "default": 5},
-                "rate": {"description": "Rate.", "type": ["number", "null"], "minimum": 0.0, "maximum": 0.5, "default": null}
+                "rate": {"description": "Rate.", "type": ["number", "null"], "minimum": 0.0,
+                "maximum": 0.5, "default": null}
             }}),
-            inputs: [("scene".to_owned(), Input::optional(&["scene/train", "views"], "images"))].into(),
+            inputs: [("scene".to_owned(), Input::optional(&["scene/train", "views"], "images"))]
+                .into(),
             output: Output::kind("x"),
             environment: Vec::new(),
             sink: false,

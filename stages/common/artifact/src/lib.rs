@@ -1,8 +1,10 @@
-//! The stage contract: what makes an executable a stage of the pipeline, and where its results are kept.
+//! The stage contract: what makes an executable a stage of the pipeline, and where its results are
+//! kept.
 //!
-//! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked parameters, `describe`, progress,
-//!   exit codes, interruption and an atomic output for free.
-//! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and blake3); its hash is the artifact's identity.
+//! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
+//!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
+//! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and
+//!   blake3); its hash is the artifact's identity.
 //! * [`Store`]: objects by content, actions by key, one OS lock a key; what runs and pins need.
 //! * [`RunRecord`]: what a sink (the report) is told of a run.
 //! * [`canonical`]: the one JSON form that is ever hashed.
@@ -76,7 +78,9 @@ pub use documented::{GROUPS, ParameterSection, ParameterText, by_group};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
-pub use manifest::{Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path};
+pub use manifest::{
+    Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path,
+};
 pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
 pub use nearest::{known_names, nearest};
 pub use panics::install_panic_hook;
@@ -90,7 +94,8 @@ pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
 pub use store::{
-    Attempt, Checked, FORMAT as STORE_FORMAT, KEY_VERSION, KEY_VERSION_PART, Record, Store, StoreError, Unfinished, label,
+    Attempt, Checked, FORMAT as STORE_FORMAT, KEY_VERSION, KEY_VERSION_PART, Record, Store,
+    StoreError, Unfinished, label,
 };
 pub use warnings::{WARNING, warnings_of, with_warnings};
 

@@ -15,8 +15,8 @@ pub struct KeyLock {
 }
 
 impl KeyLock {
-    /// The lock's file, to be handed to the stage as its standard input, which reads as empty. So the lock outlives a runner
-    /// that is killed while its stage still writes.
+    /// The lock's file, to be handed to the stage as its standard input, which reads as empty. So
+    /// the lock outlives a runner that is killed while its stage still writes.
     pub fn share(&self) -> io::Result<File> {
         self.file.try_clone()
     }
@@ -54,32 +54,38 @@ pub enum Locked<T> {
     By(Option<Holder>),
 }
 
-/// The store is entered: no garbage is collected while this lives. A runner enters for the moments in which it looks for an
-/// artifact and writes down that it needs it, or takes an artifact in.
+/// The store is entered: no garbage is collected while this lives. A runner enters for the moments
+/// in which it looks for an artifact and writes down that it needs it, or takes an artifact in.
 #[derive(Debug)]
 pub struct Entered {
     /// None in a store that can't be written: nobody collects garbage there.
     _file: Option<File>,
 }
 
-/// The store is closed: nobody enters while this lives, so that garbage can be told from what a run has just made.
+/// The store is closed: nobody enters while this lives, so that garbage can be told from what a run
+/// has just made.
 #[derive(Debug)]
 pub struct Closed {
     _file: File,
 }
 
 impl Store {
-    /// Takes the lock of a key unless somebody holds it. Take it, look for the record again, then act.
+    /// Takes the lock of a key unless somebody holds it. Take it, look for the record again, then
+    /// act.
     pub fn try_lock(&self, key: &str) -> Result<Locked<KeyLock>, StoreError> {
         let path = self.lock_path(key);
         loop {
-            let mut file = at(&path, File::options().create(true).read(true).append(true).open(&path))?;
+            let mut file =
+                at(&path, File::options().create(true).read(true).append(true).open(&path))?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Ok(Locked::By(holder_in(&path))),
-                Err(TryLockError::Error(error)) => return Err(StoreError::Io { path, source: error }),
+                Err(TryLockError::Error(error)) => {
+                    return Err(StoreError::Io { path, source: error });
+                }
             }
-            // Garbage collection may have removed the file between opening and locking: then the lock is another file's.
+            // Garbage collection may have removed the file between opening and locking: then the
+            // lock is another file's.
             if is_at(&file, &path) {
                 let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
                 // Who holds it is for people; the lock is held either way.
@@ -129,7 +135,9 @@ impl Store {
     pub fn try_enter(&self) -> Result<Locked<Entered>, StoreError> {
         let path = self.gate_path();
         let file = match self.gate() {
-            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::ReadOnlyFilesystem => {
+            Err(StoreError::Io { source, .. })
+                if source.kind() == io::ErrorKind::ReadOnlyFilesystem =>
+            {
                 return Ok(Locked::Held(Entered { _file: None }));
             }
             file => file?,
@@ -160,7 +168,8 @@ impl Store {
 
 /// Whether somebody holds the lock of a file.
 pub(crate) fn is_locked(path: &Path) -> bool {
-    File::open(path).is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
+    File::open(path)
+        .is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
 fn holder_in(path: &Path) -> Option<Holder> {
@@ -170,7 +179,10 @@ fn holder_in(path: &Path) -> Option<Holder> {
 /// Whether an open file is the one that its path names now.
 fn is_at(file: &File, path: &Path) -> bool {
     let identity = |meta: fs::Metadata| (meta.dev(), meta.ino());
-    file.metadata().map(identity).ok().is_some_and(|open| fs::metadata(path).map(identity).is_ok_and(|named| named == open))
+    file.metadata()
+        .map(identity)
+        .ok()
+        .is_some_and(|open| fs::metadata(path).map(identity).is_ok_and(|named| named == open))
 }
 
 #[cfg(test)]
@@ -198,7 +210,10 @@ mod tests {
         let Locked::By(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
         assert_eq!((holder.pid, holder.host), (std::process::id(), host_name()));
         drop(lock);
-        assert!(matches!(store.try_lock("k").unwrap(), Locked::By(Some(_))), "the stage still holds it");
+        assert!(
+            matches!(store.try_lock("k").unwrap(), Locked::By(Some(_))),
+            "the stage still holds it"
+        );
         drop(shared);
         held(store.try_lock("k").unwrap());
     }

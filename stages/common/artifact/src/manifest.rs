@@ -14,7 +14,8 @@ pub const MANIFEST_FILE: &str = "artifact.json";
 /// Version of the manifest's own form.
 const SCHEMA: u32 = 1;
 
-/// `artifact.json`: what an artifact is made of. Who made it, when and from what is not here: two actions may end in one object.
+/// `artifact.json`: what an artifact is made of. Who made it, when and from what is not here: two
+/// actions may end in one object.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Manifest {
@@ -51,7 +52,8 @@ pub enum Damage {
     },
     /// The size differs.
     #[error(
-        "{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: `nerf-sr verify --remove`, then run again"
+        "{path}: {found} bytes where the manifest says {expected}; the artifact is damaged: \
+        `nerf-sr verify --remove`, then run again"
     )]
     Size {
         /// The file.
@@ -63,7 +65,8 @@ pub enum Damage {
     },
     /// The content differs.
     #[error(
-        "{path}: the content is not what was written (blake3 differs); the artifact is damaged: `nerf-sr verify --remove`, then run again"
+        "{path}: the content is not what was written (blake3 differs); the artifact is damaged: \
+        `nerf-sr verify --remove`, then run again"
     )]
     Content {
         /// The file.
@@ -82,8 +85,12 @@ pub enum Damage {
 impl Manifest {
     /// Hashes every file below `folder` (but its manifest).
     pub fn of_folder(kind: &str, folder: &Path) -> io::Result<Self> {
-        let files = list_files(folder)?.into_iter().filter(|(relative, _)| relative != Path::new(MANIFEST_FILE));
-        let named = files.map(|(relative, file)| Ok((manifest_path(&relative)?, file))).collect::<io::Result<_>>()?;
+        let files = list_files(folder)?
+            .into_iter()
+            .filter(|(relative, _)| relative != Path::new(MANIFEST_FILE));
+        let named = files
+            .map(|(relative, file)| Ok((manifest_path(&relative)?, file)))
+            .collect::<io::Result<_>>()?;
         let files = hash_files(named)?;
         Ok(Self { kind: kind.to_owned(), schema: SCHEMA, files })
     }
@@ -91,7 +98,8 @@ impl Manifest {
     /// Reads `folder/artifact.json`, refusing paths that would leave the folder.
     pub fn read(folder: &Path) -> Result<Self, Damage> {
         let path = folder.join(MANIFEST_FILE);
-        let bytes = fs::read(&path).map_err(|source| Damage::Unreadable { path: path.clone(), source })?;
+        let bytes =
+            fs::read(&path).map_err(|source| Damage::Unreadable { path: path.clone(), source })?;
         let invalid = |reason: String| Damage::Manifest { path: path.clone(), reason };
         let manifest: Self = serde_json::from_slice(&bytes).map_err(|e| invalid(e.to_string()))?;
         if manifest.schema != SCHEMA {
@@ -114,7 +122,11 @@ impl Manifest {
     /// The manifest of a folder inside the artifact, its kind `KIND/FOLDER`.
     pub fn subtree(&self, folder: &str) -> Self {
         let prefix = format!("{folder}/");
-        let inside = |f: &FileEntry| f.path.strip_prefix(&prefix).map(|path| FileEntry { path: path.to_owned(), ..f.clone() });
+        let inside = |f: &FileEntry| {
+            f.path
+                .strip_prefix(&prefix)
+                .map(|path| FileEntry { path: path.to_owned(), ..f.clone() })
+        };
         Self {
             kind: format!("{}/{folder}", self.kind),
             schema: self.schema,
@@ -133,7 +145,9 @@ impl Manifest {
             let path = folder.join(&file.path);
             match fs::metadata(&path) {
                 Ok(meta) if meta.len() == file.size => {}
-                Ok(meta) => return Err(Damage::Size { path, expected: file.size, found: meta.len() }),
+                Ok(meta) => {
+                    return Err(Damage::Size { path, expected: file.size, found: meta.len() });
+                }
                 Err(source) => return Err(Damage::Unreadable { path, source }),
             }
         }
@@ -159,17 +173,20 @@ impl Manifest {
     }
 }
 
-/// Every file below a folder with its path inside it, in the order of names. Symbolic links are followed; one that leads back up is
-/// an error that names it.
+/// Every file below a folder with its path inside it, in the order of names. Symbolic links are
+/// followed; one that leads back up is an error that names it.
 pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
     let mut found = Vec::new();
     for entry in walkdir::WalkDir::new(folder).follow_links(true).sort_by_file_name() {
         let entry = entry.map_err(|error| match (error.path(), error.loop_ancestor()) {
-            (Some(link), Some(up)) => io::Error::other(format!("{link:?} is a link that leads back to {up:?}; remove the link")),
+            (Some(link), Some(up)) => io::Error::other(format!(
+                "{link:?} is a link that leads back to {up:?}; remove the link"
+            )),
             _ => io::Error::from(error),
         })?;
         if entry.file_type().is_file() {
-            let relative = entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
+            let relative =
+                entry.path().strip_prefix(folder).map_err(io::Error::other)?.to_path_buf();
             found.push((relative, entry.into_path()));
         }
     }
@@ -181,15 +198,19 @@ pub fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
     let entry = |(path, file): (String, PathBuf)| -> io::Result<FileEntry> {
         Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? })
     };
-    let mut entries: Vec<FileEntry> = files.into_par_iter().map(entry).collect::<io::Result<_>>()?;
+    let mut entries: Vec<FileEntry> =
+        files.into_par_iter().map(entry).collect::<io::Result<_>>()?;
     entries.sort();
     Ok(entries)
 }
 
 /// A path inside an artifact as its manifest has it: parts with `/` between them, all UTF-8.
 fn manifest_path(relative: &Path) -> io::Result<String> {
-    let parts: Option<Vec<&str>> = relative.components().map(|part| part.as_os_str().to_str()).collect();
-    parts.map(|parts| parts.join("/")).ok_or_else(|| io::Error::other(format!("{relative:?}: a file name that isn't UTF-8")))
+    let parts: Option<Vec<&str>> =
+        relative.components().map(|part| part.as_os_str().to_str()).collect();
+    parts
+        .map(|parts| parts.join("/"))
+        .ok_or_else(|| io::Error::other(format!("{relative:?}: a file name that isn't UTF-8")))
 }
 
 fn hash_file(path: &Path) -> io::Result<String> {
@@ -201,7 +222,8 @@ fn hash_file(path: &Path) -> io::Result<String> {
 /// A path from a file that may be hostile: relative, `/`-separated, never upwards.
 pub fn relative_path(text: &str) -> Result<PathBuf, String> {
     let path = Path::new(text);
-    let plain = path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
+    let plain =
+        path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if text.is_empty() || !plain || text.contains('\0') {
         return Err(format!("{text:?} is not a path inside the folder"));
     }
@@ -246,7 +268,10 @@ mod tests {
         fs::write(dir.path().join("train/a.txt"), "alphb").unwrap();
         manifest.check_sizes(dir.path()).unwrap();
         let damage = manifest.check_contents(dir.path()).unwrap_err();
-        assert!(matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")), "{damage}");
+        assert!(
+            matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")),
+            "{damage}"
+        );
     }
 
     #[test]
@@ -256,7 +281,10 @@ mod tests {
         let name = std::ffi::OsStr::from_bytes(b"r_\xff\x1b.png");
         fs::write(dir.path().join(name), "").unwrap();
         let message = Manifest::of_folder("scene", dir.path()).unwrap_err().to_string();
-        assert!(message.contains(r"r_\xFF\u{1b}.png") && message.contains("isn't UTF-8"), "{message}");
+        assert!(
+            message.contains(r"r_\xFF\u{1b}.png") && message.contains("isn't UTF-8"),
+            "{message}"
+        );
     }
 
     #[test]

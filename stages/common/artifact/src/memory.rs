@@ -4,9 +4,11 @@ use crate::Failure;
 use crate::amounts::sized;
 
 /// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
-const MARKS: [&str; 4] = ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
+const MARKS: [&str; 4] =
+    ["memory allocation of ", "tried to allocate ", "Tried to allocate ", "Unable to allocate "];
 
-/// What an allocator's last words mean, with the amount that was asked for and what to do; nothing for other words.
+/// What an allocator's last words mean, with the amount that was asked for and what to do; nothing
+/// for other words.
 ///
 /// ```
 /// let said = artifact::out_of_memory("memory allocation of 99532800 bytes failed").unwrap();
@@ -18,7 +20,8 @@ pub fn out_of_memory(text: &str) -> Option<String> {
     Some(format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}"))
 }
 
-/// Memory of this machine in bytes, or of its container where that has less; none where the system doesn't tell.
+/// Memory of this machine in bytes, or of its container where that has less; none where the system
+/// doesn't tell.
 pub fn machine_memory() -> Option<u64> {
     let mut system = System::new().ok()?;
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
@@ -28,28 +31,32 @@ pub fn machine_memory() -> Option<u64> {
 /// The variable that says how many bytes of memory a stage may take.
 pub const MEMORY_VARIABLE: &str = "NERF_SR_MEMORY";
 
-/// Bytes of memory that a stage may take: those that are free on this machine and in its container, no more than
-/// [`MEMORY_VARIABLE`] says; none where neither is known.
+/// Bytes of memory that a stage may take: those that are free on this machine and in its container,
+/// no more than [`MEMORY_VARIABLE`] says; none where neither is known.
 pub fn available_memory() -> Result<Option<u64>, Failure> {
     let most = std::env::var(MEMORY_VARIABLE).ok().map(|text| in_bytes(&text)).transpose()?;
     Ok(free_memory().into_iter().chain(most).min())
 }
 
 fn in_bytes(text: &str) -> Result<u64, Failure> {
-    text.parse()
-        .map_err(|_| Failure::Usage(format!("{MEMORY_VARIABLE}: {text:?} is no number of bytes; for 4 GB write 4000000000")))
+    text.parse().map_err(|_| {
+        Failure::Usage(format!(
+            "{MEMORY_VARIABLE}: {text:?} is no number of bytes; for 4 GB write 4000000000"
+        ))
+    })
 }
 
 fn free_memory() -> Option<u64> {
     let mut system = System::new().ok()?;
     system.refresh_memory_specifics(MemoryRefreshKind::nothing().with_ram());
-    let container = system.cgroup_limits().map(|limits| limits.total_memory.saturating_sub(limits.rss));
+    let container =
+        system.cgroup_limits().map(|limits| limits.total_memory.saturating_sub(limits.rss));
     Some(container.map_or(system.available_memory(), |left| left.min(system.available_memory())))
 }
 
 /// What helps where memory is short.
-pub const MEMORY_REMEDY: &str =
-    "end other programs, run one stage at a time (`nerf-sr run --jobs 1`), or give it fewer or smaller images";
+pub const MEMORY_REMEDY: &str = "end other programs, run one stage at a time (`nerf-sr run --jobs \
+    1`), or give it fewer or smaller images";
 
 /// `99532800 bytes` or `2.00 GiB` at the beginning of a text.
 fn amount(text: &str) -> Option<String> {
@@ -68,7 +75,11 @@ mod tests {
 
     #[test]
     fn a_machine_has_some_memory() {
-        assert!(machine_memory().is_some_and(|bytes| (1 << 28..1 << 50).contains(&bytes)), "{:?}", machine_memory());
+        assert!(
+            machine_memory().is_some_and(|bytes| (1 << 28..1 << 50).contains(&bytes)),
+            "{:?}",
+            machine_memory()
+        );
     }
 
     #[test]
@@ -77,22 +88,38 @@ mod tests {
         assert!(free > 1 << 26 && free <= machine_memory().unwrap(), "{free}");
         assert_eq!(in_bytes("4000000000").unwrap(), 4_000_000_000);
         let said = in_bytes("4GB").unwrap_err().to_string();
-        assert_eq!(said, "NERF_SR_MEMORY: \"4GB\" is no number of bytes; for 4 GB write 4000000000");
+        assert_eq!(
+            said,
+            "NERF_SR_MEMORY: \"4GB\" is no number of bytes; for 4 GB write 4000000000"
+        );
     }
 
     #[test]
     fn allocators_are_understood() {
         for (said, amount) in [
             ("memory allocation of 99532800 bytes failed", Some("99.5 MB")),
-            ("DefaultCPUAllocator: can't allocate memory: you tried to allocate 4000000000 bytes. Error code 12", Some("4.0 GB")),
-            ("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity", Some("2.00 GiB")),
-            ("numpy._core._exceptions._ArrayMemoryError: Unable to allocate 74.5 GiB for an array", Some("74.5 GiB")),
+            (
+                "DefaultCPUAllocator: can't allocate memory: you tried to allocate 4000000000 \
+                bytes. Error code 12",
+                Some("4.0 GB"),
+            ),
+            (
+                "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity",
+                Some("2.00 GiB"),
+            ),
+            (
+                "numpy._core._exceptions._ArrayMemoryError: Unable to allocate 74.5 GiB for an \
+                array",
+                Some("74.5 GiB"),
+            ),
             ("memory allocation of many bytes failed", None),
             ("memory allocation of ", None),
             ("r_0.png: No such file", None),
         ] {
             let found = out_of_memory(said);
-            let expected = amount.map(|amount| format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}"));
+            let expected = amount.map(|amount| {
+                format!("out of memory: {amount} more were asked for; {MEMORY_REMEDY}")
+            });
             assert_eq!(found, expected, "{said}");
         }
     }

@@ -1,13 +1,16 @@
 /// Names longer than this are no slips of the pen.
 const LONGEST: usize = 64;
 
-/// The known name that an unknown one is a misspelling of: at most one letter in three wrong, left out, added or swapped with the next.
+/// The known name that an unknown one is a misspelling of: at most one letter in three wrong, left
+/// out, added or swapped with the next.
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     if name.len() > LONGEST {
         return None;
     }
     let lower = name.to_lowercase();
-    let distances = known.into_iter().map(|candidate| (strsim::osa_distance(&lower, &candidate.to_lowercase()), candidate));
+    let distances = known
+        .into_iter()
+        .map(|candidate| (strsim::osa_distance(&lower, &candidate.to_lowercase()), candidate));
     let closest = distances.min()?;
     let letters = name.chars().count().max(closest.1.chars().count());
     (closest.0 <= (letters / 3).max(1) && letters > 1).then_some(closest.1)
@@ -20,7 +23,9 @@ pub fn known_names<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> 
     if known.is_empty() {
         return "there are none".to_owned();
     }
-    let meant = nearest(name, known.iter().copied()).map(|name| format!("did you mean {name}? ")).unwrap_or_default();
+    let meant = nearest(name, known.iter().copied())
+        .map(|name| format!("did you mean {name}? "))
+        .unwrap_or_default();
     format!("{meant}known: {}", known.join(", "))
 }
 

@@ -12,8 +12,9 @@ use crate::progress::failed_event;
 /// Exit code of a panic: a fault of the program, not of what it was given.
 const INTERNAL_ERROR: i32 = 70;
 
-/// From now on a panic in any thread ends the process with one line, and exit code 70. Memory that isn't to be had ends it with
-/// exit code 1: some libraries panic then. A backtrace comes before the line where `RUST_BACKTRACE` asks for it.
+/// From now on a panic in any thread ends the process with one line, and exit code 70. Memory that
+/// isn't to be had ends it with exit code 1: some libraries panic then. A backtrace comes before
+/// the line where `RUST_BACKTRACE` asks for it.
 pub fn install_panic_hook(name: &'static str) {
     std::panic::set_hook(Box::new(move |panic| end(name, panic)));
 }
@@ -45,7 +46,8 @@ fn told(panic: &PanicHookInfo<'_>) -> (String, i32) {
         return (message, 1);
     }
     let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
-    let place = panic.location().map(|at| format!(" ({}:{})", at.file(), at.line())).unwrap_or_default();
+    let place =
+        panic.location().map(|at| format!(" ({}:{})", at.file(), at.line())).unwrap_or_default();
     (format!("internal error: {}{place}; please report it", printable(&said)), INTERNAL_ERROR)
 }
 
@@ -116,8 +118,18 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut command = Command::new(std::env::current_exe().unwrap());
         command.env(OUTPUT, folder.path().join("output"));
-        command.args(["panics::tests::a_process_that_panics", "--exact", "--ignored", "--nocapture"]);
-        command.env(WHERE, place).env("RUST_BACKTRACE", backtrace).env_remove("RUST_LIB_BACKTRACE").output().unwrap()
+        command.args([
+            "panics::tests::a_process_that_panics",
+            "--exact",
+            "--ignored",
+            "--nocapture",
+        ]);
+        command
+            .env(WHERE, place)
+            .env("RUST_BACKTRACE", backtrace)
+            .env_remove("RUST_LIB_BACKTRACE")
+            .output()
+            .unwrap()
     }
 
     #[test]
@@ -131,7 +143,11 @@ mod tests {
         ] {
             let output = ended(place, "0");
             let stderr = String::from_utf8(output.stderr).unwrap();
-            assert_eq!((output.status.code(), stderr.lines().count()), (Some(code), 1), "{place}: {stderr}");
+            assert_eq!(
+                (output.status.code(), stderr.lines().count()),
+                (Some(code), 1),
+                "{place}: {stderr}"
+            );
             assert!(stderr.starts_with(said), "{place}: {stderr}");
             assert!(code == 1 || stderr.ends_with("); please report it\n"), "{place}: {stderr}");
         }
@@ -140,12 +156,15 @@ mod tests {
     #[test]
     fn a_stage_that_panics_tells_its_runner() {
         let output = ended("stage", "0");
-        let (stdout, stderr) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
+        let (stdout, stderr) =
+            (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
         assert_eq!(output.status.code(), Some(70), "{stderr}");
-        let said = stderr.strip_prefix("before\ngreet: ").unwrap_or_else(|| panic!("{stderr}")).trim_end();
+        let said =
+            stderr.strip_prefix("before\ngreet: ").unwrap_or_else(|| panic!("{stderr}")).trim_end();
         assert!(said.starts_with("internal error: in a stage ("), "{stderr}");
         // The test harness has printed there, too.
-        let events: Vec<Event> = stdout.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+        let events: Vec<Event> =
+            stdout.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
         assert_eq!(events, [Event::Failed { message: said.to_owned() }], "{stdout}");
     }
 
@@ -154,6 +173,9 @@ mod tests {
         let output = ended("main", "1");
         let stderr = String::from_utf8(output.stderr).unwrap();
         assert!(stderr.lines().count() > 5, "{stderr}");
-        assert!(stderr.lines().last().unwrap().starts_with("greet: internal error: two lines ("), "{stderr}");
+        assert!(
+            stderr.lines().last().unwrap().starts_with("greet: internal error: two lines ("),
+            "{stderr}"
+        );
     }
 }

@@ -5,10 +5,12 @@ use crate::renames::{Named, renamed};
 use crate::tagged::Tag;
 use crate::values::Reader;
 
-/// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and in the stage alike.
+/// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and
+/// in the stage alike.
 ///
-/// Parameters are given and hashed by name, on one level. One of them may select a variant of the type ([`Tag`]): then its value is the
-/// variant's name, and the variant's own parameters stand beside it. A name means one parameter of a variant at most.
+/// Parameters are given and hashed by name, on one level. One of them may select a variant of the
+/// type ([`Tag`]): then its value is the variant's name, and the variant's own parameters stand
+/// beside it. A name means one parameter of a variant at most.
 #[derive(Debug)]
 pub struct Schema {
     program: String,
@@ -53,29 +55,33 @@ impl Schema {
         names
     }
 
-    /// A parameter's value in the form that is hashed: numbers as the schema's type has them, so that 2, 2.0 and 2e0 are one value, and what
-    /// equals the default as the default is written.
+    /// A parameter's value in the form that is hashed: numbers as the schema's type has them, so
+    /// that 2, 2.0 and 2e0 are one value, and what equals the default as the default is written.
     pub fn canonical_value(&self, name: &str, value: &Value) -> Value {
         let form = self.forms.iter().find(|form| form.property(name).is_some());
         form.map_or_else(|| value.clone(), |form| form.canonical_value(name, value))
     }
 
-    /// Parameters on one level, whichever way they are written: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
+    /// Parameters on one level, whichever way they are written: `field: {grid: {n_levels: 4}}` is
+    /// `field: grid` and `n_levels: 4`.
     pub fn flattened(&self, given: &Map<String, Value>) -> Map<String, Value> {
         self.tag.as_ref().map_or_else(|| given.clone(), |tag| tag.flattened(given))
     }
 
-    /// Lays later parameters over earlier ones. Where the later ones select a variant, earlier ones that it doesn't have go.
+    /// Lays later parameters over earlier ones. Where the later ones select a variant, earlier ones
+    /// that it doesn't have go.
     pub fn lay_over(&self, given: &mut Map<String, Value>, later: &Map<String, Value>) {
         let later = self.flattened(later);
         if self.tag.as_ref().is_some_and(|tag| later.contains_key(tag.name())) {
             let (form, known) = (self.form(&later), self.names());
-            given.retain(|name, _| form.property(name).is_some() || !known.contains(&name.as_str()));
+            given
+                .retain(|name, _| form.property(name).is_some() || !known.contains(&name.as_str()));
         }
         given.extend(later);
     }
 
-    /// Every parameter with its value: the given one, else the default. The result is what is hashed and passed to the stage.
+    /// Every parameter with its value: the given one, else the default. The result is what is
+    /// hashed and passed to the stage.
     pub fn resolve(&self, given: &Map<String, Value>) -> Result<Value, Vec<ParameterProblem>> {
         let given = self.flattened(given);
         let form = self.form(&given);
@@ -109,7 +115,8 @@ impl Schema {
         form.names().filter(is_open).collect()
     }
 
-    /// The form that parameters select; the default's where they select none, or none that there is.
+    /// The form that parameters select; the default's where they select none, or none that there
+    /// is.
     fn form(&self, flat: &Map<String, Value>) -> &Form {
         let selected = self.tag.as_ref().and_then(|tag| tag.selected(flat));
         &self.forms[selected.unwrap_or(0)]
@@ -137,7 +144,8 @@ impl Form {
     fn new(schema: Value) -> Result<Self, String> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
-        let validator = jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
+        let validator =
+            jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
         Ok(Self { schema, validator })
     }
 
@@ -154,7 +162,9 @@ impl Form {
     }
 
     fn defaults(&self) -> Map<String, Value> {
-        let default = |(name, property): (&String, &Value)| Some((name.clone(), property.get("default")?.clone()));
+        let default = |(name, property): (&String, &Value)| {
+            Some((name.clone(), property.get("default")?.clone()))
+        };
         self.properties().into_iter().flatten().filter_map(default).collect()
     }
 
@@ -176,12 +186,16 @@ impl Form {
                 Some(choices) => not_one_of(error.instance(), &choices),
                 None => error.to_string(),
             };
-            ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
+            ParameterProblem {
+                name: if name.is_empty() { "(all)".to_owned() } else { name },
+                problem,
+            }
         };
         self.validator.iter_errors(resolved).map(problem).collect()
     }
 
-    /// The words a parameter may be, where it is a choice: the validator itself only says that no alternative fits.
+    /// The words a parameter may be, where it is a choice: the validator itself only says that no
+    /// alternative fits.
     fn choices(&self, name: &str) -> Option<Vec<String>> {
         let words = Reader::new(&self.schema).choices(self.property(name)?)?;
         Some(words.into_iter().map(|(word, _)| word.to_string()).collect())
@@ -194,8 +208,8 @@ fn not_one_of(value: &Value, choices: &[String]) -> String {
     format!("{value} is not one of {}{meant}", choices.join(", "))
 }
 
-/// Gives integers of a size (`format`: `uint32`, …) the bounds of that size, where the schema states none: what a stage can't hold is refused
-/// before it is started.
+/// Gives integers of a size (`format`: `uint32`, …) the bounds of that size, where the schema
+/// states none: what a stage can't hold is refused before it is started.
 fn bound_formats(schema: &mut Value) {
     match schema {
         Value::Object(entries) => {
@@ -210,11 +224,16 @@ fn bound_formats(schema: &mut Value) {
                 Some("int64" | "int") => Some((json!(i64::MIN), json!(i64::MAX))),
                 _ => None,
             };
-            for (name, bound) in bounds.into_iter().flat_map(|(least, most)| [("minimum", least), ("maximum", most)]) {
+            for (name, bound) in
+                bounds.into_iter().flat_map(|(least, most)| [("minimum", least), ("maximum", most)])
+            {
                 entries.entry(name).or_insert(bound);
             }
             let data = ["default", "const", "enum", "examples"];
-            entries.iter_mut().filter(|(name, _)| !data.contains(&name.as_str())).for_each(|(_, inside)| bound_formats(inside));
+            entries
+                .iter_mut()
+                .filter(|(name, _)| !data.contains(&name.as_str()))
+                .for_each(|(_, inside)| bound_formats(inside));
         }
         Value::Array(items) => items.iter_mut().for_each(bound_formats),
         _ => {}
@@ -239,9 +258,11 @@ mod tests {
                     "width": {"type": ["integer", "null"], "default": null},
                     "place": {"type": "array", "items": {"type": "number"}, "default": [1, 0.5]},
                     "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
-                    "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}], "default": null}
+                    "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}],
+                    "default": null}
                 },
-                "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"}, {"const": "lanczos", "type": "string"}]}}
+                "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"},
+                {"const": "lanczos", "type": "string"}]}}
             }),
         )
         .unwrap()
@@ -254,7 +275,8 @@ mod tests {
     #[test]
     fn defaults_are_filled_in() {
         let all = json!({
-            "assumed": null, "kernel": "lanczos", "peak": 255, "place": [1, 0.5], "rate": 2.0, "scale": 4, "width": null
+            "assumed": null, "kernel": "lanczos", "peak": 255, "place": [1, 0.5], "rate": 2.0,
+            "scale": 4, "width": null
         });
         assert_eq!(resolve(&json!({"scale": 4})).unwrap(), all);
     }
@@ -273,7 +295,11 @@ mod tests {
             json!({"assumed": null}),
             json!({"place": [1.0, 0.5]}),
         ] {
-            assert_eq!(crate::canonical(&resolve(&said).unwrap()), crate::canonical(&unsaid), "{said}");
+            assert_eq!(
+                crate::canonical(&resolve(&said).unwrap()),
+                crate::canonical(&unsaid),
+                "{said}"
+            );
         }
         for (one, other) in [
             (json!({"scale": 6e4}), json!({"scale": 60000})),
@@ -281,18 +307,27 @@ mod tests {
             (json!({"width": 7.0}), json!({"width": 7})),
             (json!({"place": [2, 3.0]}), json!({"place": [2.0, 3]})),
         ] {
-            let [one, other] = [one, other].map(|given| crate::canonical(&resolve(&given).unwrap()));
+            let [one, other] =
+                [one, other].map(|given| crate::canonical(&resolve(&given).unwrap()));
             assert_eq!(one, other);
             assert_ne!(one, crate::canonical(&unsaid));
         }
         let problems = resolve(&json!({"rate": null})).unwrap_err();
-        assert!(problems[0].to_string().contains("parameter rate: null is not of type"), "{}", problems[0]);
+        assert!(
+            problems[0].to_string().contains("parameter rate: null is not of type"),
+            "{}",
+            problems[0]
+        );
     }
 
     #[test]
     fn unknown_names_types_and_ranges_are_refused() {
         for (given, name, word) in [
-            (json!({"kernal": "box"}), "kernal", "did you mean kernel? known: assumed, kernel, peak, place, rate, scale, width"),
+            (
+                json!({"kernal": "box"}),
+                "kernal",
+                "did you mean kernel? known: assumed, kernel, peak, place, rate, scale, width",
+            ),
             (json!({"kernel": "lancsoz"}), "kernel", r#"did you mean "lanczos"?"#),
             (json!({"scale": 5_000_000_000u64}), "scale", "maximum of 4294967295"),
             (json!({"scale": 1e30}), "scale", "maximum of 4294967295"),

@@ -10,14 +10,16 @@ use crate::fsio::{sync_folder, temporary, write_json};
 use crate::manifest::{MANIFEST_FILE, Manifest};
 use crate::stage::Context;
 
-/// In `--work`: finished parts of outputs, by what they were made from and by name. Each is a folder with a manifest, so that one cut short is seen.
+/// In `--work`: finished parts of outputs, by what they were made from and by name. Each is a
+/// folder with a manifest, so that one cut short is seen.
 const PARTS: &str = "parts";
 /// In a part's folder: what making it returned.
 const VALUE: &str = "value.json";
 
 impl Context {
-    /// Makes a part of the output, `files`, unless an earlier run of the same code on the same inputs and parameters did and kept it in `--work`. What `make` returns
-    /// is kept with it. Nothing is where an input has no manifest: it may have changed since.
+    /// Makes a part of the output, `files`, unless an earlier run of the same code on the same
+    /// inputs and parameters did and kept it in `--work`. What `make` returns is kept with it.
+    /// Nothing is where an input has no manifest: it may have changed since.
     ///
     /// ```no_run
     /// # fn of(context: &artifact::Context) -> anyhow::Result<()> {
@@ -37,7 +39,9 @@ impl Context {
         files: &[&str],
         make: impl FnOnce() -> anyhow::Result<T>,
     ) -> anyhow::Result<T> {
-        let Some((work, identity)) = self.work().zip(self.identity.as_deref()) else { return make() };
+        let Some((work, identity)) = self.work().zip(self.identity.as_deref()) else {
+            return make();
+        };
         let folder = work.join(PARTS).join(identity).join(name);
         if let Some(value) = self.restored(&folder, files) {
             if !self.goes_on.swap(true, Ordering::Relaxed) {
@@ -46,7 +50,8 @@ impl Context {
             return Ok(value);
         }
         let value = make()?;
-        self.keep(&folder, files, &value).with_context(|| format!("cannot keep {}", folder.display()))?;
+        self.keep(&folder, files, &value)
+            .with_context(|| format!("cannot keep {}", folder.display()))?;
         Ok(value)
     }
 
@@ -54,7 +59,10 @@ impl Context {
     fn restored<T: DeserializeOwned>(&self, folder: &Path, files: &[&str]) -> Option<T> {
         Manifest::read(folder).ok()?.check_contents(folder).ok()?;
         let value = serde_json::from_slice(&fs::read(folder.join(VALUE)).ok()?).ok()?;
-        files.iter().try_for_each(|file| copy(&folder.join(file), &self.output_path(file)?)).ok()?;
+        files
+            .iter()
+            .try_for_each(|file| copy(&folder.join(file), &self.output_path(file)?))
+            .ok()?;
         Some(value)
     }
 

@@ -2,8 +2,8 @@ use std::borrow::Cow;
 
 /// Text that is safe to print: control characters are spelled out, as in `\n` and `\u{1b}`.
 ///
-/// Names from files may hold what moves a terminal's cursor, sets its title or forges a line of a log. Escaping twice changes
-/// nothing, and text without control characters stays as it is.
+/// Names from files may hold what moves a terminal's cursor, sets its title or forges a line of a
+/// log. Escaping twice changes nothing, and text without control characters stays as it is.
 ///
 /// ```
 /// assert_eq!(artifact::printable("r_0"), "r_0");
@@ -34,7 +34,10 @@ mod tests {
             ("Bäume/写真 🌲 \\ \"r_0\"", "Bäume/写真 🌲 \\ \"r_0\""),
             ("\u{1b}]0;PWN\u{7}\u{1b}[31mred", "\\u{1b}]0;PWN\\u{7}\\u{1b}[31mred"),
             ("two\nlines\r\n\tand a tab", "two\\nlines\\r\\n\\tand a tab"),
-            ("C1: \u{9b}31m \u{85}, delete: \u{7f}, null: \0", "C1: \\u{9b}31m \\u{85}, delete: \\u{7f}, null: \\u{0}"),
+            (
+                "C1: \u{9b}31m \u{85}, delete: \u{7f}, null: \0",
+                "C1: \\u{9b}31m \\u{85}, delete: \\u{7f}, null: \\u{0}",
+            ),
         ] {
             assert_eq!(printable(text), shown);
             assert_eq!(printable(shown), shown);

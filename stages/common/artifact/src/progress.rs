@@ -65,7 +65,8 @@ pub(crate) fn failed_event(message: &str) -> Option<String> {
     EMITS_EVENTS.load(Ordering::SeqCst).then(event)
 }
 
-/// Environment variable of the tests: a stage whose progress comes to this count is stopped then, as if by a signal.
+/// Environment variable of the tests: a stage whose progress comes to this count is stopped then,
+/// as if by a signal.
 pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
 
 /// Progress of one piece of long work. Cheap to call often: at most ten updates a second leave it.
@@ -105,11 +106,21 @@ impl Progress {
     /// Starts at 0 of `total`.
     pub fn new(label: &str, total: u64, mode: ProgressMode) -> Self {
         let bar = (mode == ProgressMode::Plain && std::io::stderr().is_terminal()).then(|| {
-            let style = indicatif::ProgressStyle::with_template("{prefix:>14} [{bar:30}] {percent:>3}% {msg} left")
-                .expect("the template is constant");
-            indicatif::ProgressBar::new(total).with_style(style.progress_chars("=> ")).with_prefix(label.to_owned())
+            let style = indicatif::ProgressStyle::with_template(
+                "{prefix:>14} [{bar:30}] {percent:>3}% {msg} left",
+            )
+            .expect("the template is constant");
+            indicatif::ProgressBar::new(total)
+                .with_style(style.progress_chars("=> "))
+                .with_prefix(label.to_owned())
         });
-        let state = ProgressState { done: 0, note: String::new(), pace: Pace::default(), shown: Instant::now(), is_shown: false };
+        let state = ProgressState {
+            done: 0,
+            note: String::new(),
+            pace: Pace::default(),
+            shown: Instant::now(),
+            is_shown: false,
+        };
         Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state), stop: None }
     }
 
@@ -139,9 +150,11 @@ impl Progress {
             stop.interrupted.store(true, Ordering::Relaxed);
         }
         state.pace.begin(done);
-        let interval = if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
+        let interval =
+            if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
         let due = state.shown.elapsed() >= Duration::from_millis(interval);
-        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.is_shown)) {
+        if self.mode == ProgressMode::None || !(due || (state.done >= self.total && state.is_shown))
+        {
             return;
         }
         (state.shown, state.is_shown) = (Instant::now(), true);
@@ -150,7 +163,13 @@ impl Progress {
             bar.set_position(state.done);
             bar.set_message(format!("{} · {left}", state.note));
         } else if self.mode == ProgressMode::Json {
-            Event::Progress { label: self.label.clone(), done, total: self.total, note: state.note.clone() }.emit();
+            Event::Progress {
+                label: self.label.clone(),
+                done,
+                total: self.total,
+                note: state.note.clone(),
+            }
+            .emit();
         } else {
             report_line!("{}: {done} of {} {} · {left} left", self.label, self.total, state.note);
         }
@@ -165,14 +184,16 @@ impl Drop for Progress {
     }
 }
 
-/// How fast work gets on, from when it is first heard of: what an interrupted run did before says nothing of that.
+/// How fast work gets on, from when it is first heard of: what an interrupted run did before says
+/// nothing of that.
 #[derive(Debug, Default)]
 pub struct Pace {
     first: Option<(Instant, u64)>,
 }
 
 impl Pace {
-    /// Is told when work is first heard of, and how much was done by then. Later calls change nothing.
+    /// Is told when work is first heard of, and how much was done by then. Later calls change
+    /// nothing.
     pub fn begin(&mut self, done: u64) -> (Instant, u64) {
         *self.first.get_or_insert_with(|| (Instant::now(), done))
     }
@@ -202,6 +223,9 @@ mod tests {
         assert_eq!(pace.left(900, 1000), "?");
         let (since, _) = pace.first.unwrap();
         pace.first = Some((since.checked_sub(Duration::from_secs(60)).unwrap(), 900));
-        assert_eq!((pace.left(920, 1000).as_str(), pace.left(901, 1000).as_str()), ("4.0 min", "99.0 min"));
+        assert_eq!(
+            (pace.left(920, 1000).as_str(), pace.left(901, 1000).as_str()),
+            ("4.0 min", "99.0 min")
+        );
     }
 }

@@ -33,7 +33,8 @@ impl Rename {
     pub fn problem(&self, value: Option<&Value>) -> String {
         let given = value.and_then(Value::as_str);
         let write = self.values.iter().find(|(old, _)| given == Some(old));
-        let hint = write.map(|(old, write)| format!("; for {old} write {write}")).unwrap_or_default();
+        let hint =
+            write.map(|(old, write)| format!("; for {old} write {write}")).unwrap_or_default();
         format!("is called {} now{hint}", self.new)
     }
 }
@@ -121,12 +122,20 @@ mod tests {
     #[test]
     fn every_old_name_is_refused_with_the_new_one() {
         for rename in RENAMES.iter().filter(|rename| rename.kind == Named::Parameter) {
-            let schema = Schema::new(rename.program, &json!({"properties": {rename.new: {}}})).unwrap();
+            let schema =
+                Schema::new(rename.program, &json!({"properties": {rename.new: {}}})).unwrap();
             let given = |value: &str| Map::from_iter([(rename.old.to_owned(), json!(value))]);
             let says = |value: &str| schema.resolve(&given(value)).unwrap_err()[0].to_string();
-            assert_eq!(says("1"), format!("parameter {}: is called {} now", rename.old, rename.new));
+            assert_eq!(
+                says("1"),
+                format!("parameter {}: is called {} now", rename.old, rename.new)
+            );
             for (old, write) in rename.values {
-                assert!(says(old).ends_with(&format!("; for {old} write {write}")), "{}", says(old));
+                assert!(
+                    says(old).ends_with(&format!("; for {old} write {write}")),
+                    "{}",
+                    says(old)
+                );
             }
         }
     }
@@ -135,7 +144,9 @@ mod tests {
     fn a_name_is_old_for_its_own_program_only() {
         assert!(renamed(Named::Parameter, "train-refine", "rate").is_none());
         assert!(renamed(Named::Parameter, "train-ss", "field").is_none());
-        let says = |programs: &[&str], old: &str| renamed_in(Named::Parameter, programs.iter().copied(), old, None);
+        let says = |programs: &[&str], old: &str| {
+            renamed_in(Named::Parameter, programs.iter().copied(), old, None)
+        };
         assert_eq!(says(&["eval"], "samples"), None);
         let both = says(&["demo-scene", "train-ss"], "samples").unwrap();
         assert_eq!(both, "is called samples_per_axis now, or is called samples_per_step now");

@@ -6,12 +6,14 @@ use serde_json::Value;
 
 use crate::describe::{Description, Input};
 
-/// What parameters and inputs must be together, beyond what each may be alone. The runner checks it in the plan, the stage when it starts.
+/// What parameters and inputs must be together, beyond what each may be alone. The runner checks it
+/// in the plan, the stage when it starts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Rule {
-    /// When it applies: parameters, each with a JSON Schema that its value fits then. `INPUT.PARAMETER` is a parameter of the stage that the
-    /// input comes from; where that isn't known, the rule doesn't apply.
+    /// When it applies: parameters, each with a JSON Schema that its value fits then.
+    /// `INPUT.PARAMETER` is a parameter of the stage that the input comes from; where that isn't
+    /// known, the rule doesn't apply.
     pub when: BTreeMap<String, Value>,
     /// Inputs that must be given then.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -23,13 +25,19 @@ pub struct Rule {
     pub message: String,
 }
 
-/// The inputs that are given, each with the parameters of the stage that it comes from, where those are known.
+/// The inputs that are given, each with the parameters of the stage that it comes from, where those
+/// are known.
 pub type GivenInputs = BTreeMap<String, Option<Value>>;
 
 impl Rule {
     /// A rule that always applies and asks for nothing yet.
     pub fn new(message: &str) -> Self {
-        Self { when: BTreeMap::new(), needs: Vec::new(), must: BTreeMap::new(), message: message.to_owned() }
+        Self {
+            when: BTreeMap::new(),
+            needs: Vec::new(),
+            must: BTreeMap::new(),
+            message: message.to_owned(),
+        }
     }
 
     /// Applies it only where a parameter fits a JSON Schema.
@@ -54,7 +62,11 @@ impl Rule {
     }
 
     /// Says what is wrong with the rule itself.
-    pub(crate) fn check(&self, parameters: &[&str], inputs: &BTreeMap<String, Input>) -> Result<(), String> {
+    pub(crate) fn check(
+        &self,
+        parameters: &[&str],
+        inputs: &BTreeMap<String, Input>,
+    ) -> Result<(), String> {
         if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
             return Err(format!("there is no input {input:?}"));
         }
@@ -66,7 +78,8 @@ impl Rule {
             if !is_known {
                 return Err(format!("there is no parameter {name:?}"));
             }
-            jsonschema::validator_for(schema).map_err(|e| format!("{name}: not a JSON Schema: {e}"))?;
+            jsonschema::validator_for(schema)
+                .map_err(|e| format!("{name}: not a JSON Schema: {e}"))?;
         }
         Ok(())
     }
@@ -74,7 +87,9 @@ impl Rule {
     fn is_kept(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
         let fits = |(name, schema): (&String, &Value)| {
             let value = match name.split_once('.') {
-                Some((input, inner)) => inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner)),
+                Some((input, inner)) => {
+                    inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner))
+                }
                 None => parameters.get(name),
             };
             Some(jsonschema::validator_for(schema).ok()?.is_valid(value?))
@@ -88,7 +103,10 @@ impl Rule {
 impl Description {
     /// What the first rule that isn't kept says.
     pub fn broken_rule(&self, parameters: &Value, inputs: &GivenInputs) -> Option<String> {
-        self.rules.iter().find(|rule| !rule.is_kept(parameters, inputs)).map(|rule| rule.message.clone())
+        self.rules
+            .iter()
+            .find(|rule| !rule.is_kept(parameters, inputs))
+            .map(|rule| rule.message.clone())
     }
 }
 
@@ -106,7 +124,9 @@ mod tests {
             code: String::new(),
             summary: String::new(),
             parameters: json!({"properties": {"method": {}, "scale": {}, "kernel": {}}}),
-            inputs: ["scene", "weights"].map(|name| (name.to_owned(), Input::optional(&["any"], ""))).into(),
+            inputs: ["scene", "weights"]
+                .map(|name| (name.to_owned(), Input::optional(&["any"], "")))
+                .into(),
             output: Output::kind("x"),
             environment: Vec::new(),
             sink: false,
@@ -141,8 +161,15 @@ mod tests {
             (json!({"method": "b"}), vec![("scene", Some(json!({})))], None),
             (json!({"method": "b"}), vec![("scene", None)], None),
         ] {
-            let given = inputs.iter().map(|(name, made_by)| ((*name).to_owned(), made_by.clone())).collect();
-            assert_eq!(description().broken_rule(&parameters, &given).as_deref(), expected, "{parameters} {inputs:?}");
+            let given = inputs
+                .iter()
+                .map(|(name, made_by)| ((*name).to_owned(), made_by.clone()))
+                .collect();
+            assert_eq!(
+                description().broken_rule(&parameters, &given).as_deref(),
+                expected,
+                "{parameters} {inputs:?}"
+            );
         }
     }
 
@@ -154,12 +181,18 @@ mod tests {
         for (broken, words) in [
             (with(Rule::new("").needs("nothing")), "rule 1: there is no input \"nothing\""),
             (with(Rule::new("").when("nothing", json!({}))), "there is no parameter \"nothing\""),
-            (with(Rule::new("").must("nothing.x", json!({}))), "there is no parameter \"nothing.x\""),
+            (
+                with(Rule::new("").must("nothing.x", json!({}))),
+                "there is no parameter \"nothing.x\"",
+            ),
             (with(Rule::new("").must("scale", no_schema.clone())), "scale: not a JSON Schema"),
             (Description { parameters: no_schema, ..description() }, "parameter schema"),
             (Description { name: String::new(), ..description() }, "no name"),
             (
-                Description { output: Output::kind("x").with_subtree("../x", "x"), ..description() },
+                Description {
+                    output: Output::kind("x").with_subtree("../x", "x"),
+                    ..description()
+                },
                 "not a path inside the folder",
             ),
         ] {

@@ -100,8 +100,13 @@ impl RunRecord {
     /// Says what is wrong with a list whose inputs don't name earlier nodes.
     pub fn check(&self) -> Result<(), String> {
         for (index, node) in self.nodes.iter().enumerate() {
-            if let Some((name, _)) = node.inputs.iter().find(|(_, input)| input.node.is_some_and(|n| n >= index)) {
-                return Err(format!("{}: input {name} names a node that doesn't come before it", node.stage));
+            if let Some((name, _)) =
+                node.inputs.iter().find(|(_, input)| input.node.is_some_and(|n| n >= index))
+            {
+                return Err(format!(
+                    "{}: input {name} names a node that doesn't come before it",
+                    node.stage
+                ));
             }
         }
         Ok(())
@@ -122,7 +127,11 @@ impl RunRecord {
         wanted[of] = true;
         for i in (0..self.nodes.len()).rev() {
             if wanted[i] {
-                self.nodes[i].inputs.values().filter_map(|input| input.node).for_each(|p| wanted[p] = true);
+                self.nodes[i]
+                    .inputs
+                    .values()
+                    .filter_map(|input| input.node)
+                    .for_each(|p| wanted[p] = true);
             }
         }
         (0..self.nodes.len()).filter(|&i| wanted[i]).collect()

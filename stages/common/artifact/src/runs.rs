@@ -24,7 +24,8 @@ enum RunLine {
     Ended { unix: u64 },
 }
 
-/// A node that can't have a key yet. Any record of its stage with its parameters may turn out to be its own.
+/// A node that can't have a key yet. Any record of its stage with its parameters may turn out to be
+/// its own.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Waiting {
     /// Name of the program, as in the key's part `stage`.
@@ -36,7 +37,10 @@ pub struct Waiting {
 impl Waiting {
     /// Whether a record may be the node's.
     pub fn may_be(&self, record: &Record) -> bool {
-        let named = record.key_parts.iter().filter_map(|(name, value)| Some((name.strip_prefix("parameter ")?, value)));
+        let named = record
+            .key_parts
+            .iter()
+            .filter_map(|(name, value)| Some((name.strip_prefix("parameter ")?, value)));
         record.key_parts.get("stage").and_then(Value::as_str) == Some(&self.program)
             && named.clone().count() == self.parameters.len()
             && named.into_iter().all(|(name, value)| self.parameters.get(name) == Some(value))
@@ -83,7 +87,9 @@ impl Run {
         // A line that a kill cut short says nothing.
         for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
             match line {
-                RunLine::Run { holder, command } => (run.holder, run.command) = (Some(holder), command),
+                RunLine::Run { holder, command } => {
+                    (run.holder, run.command) = (Some(holder), command)
+                }
                 RunLine::Action { key, .. } => {
                     run.keys.insert(key);
                 }
@@ -95,8 +101,8 @@ impl Run {
     }
 }
 
-/// A run in progress, which writes down what it needs. Garbage collection keeps that as long as this lives, and as long
-/// afterwards as it is told to.
+/// A run in progress, which writes down what it needs. Garbage collection keeps that as long as
+/// this lives, and as long afterwards as it is told to.
 #[derive(Debug)]
 pub struct RunFile {
     id: String,
@@ -110,7 +116,8 @@ impl RunFile {
         &self.id
     }
 
-    /// The run needs this action. Whoever says so has entered the store, so that the action can't go in between.
+    /// The run needs this action. Whoever says so has entered the store, so that the action can't
+    /// go in between.
     pub fn needs(&self, _: &Entered, stage: &str, key: &str) -> Result<(), StoreError> {
         self.write(&RunLine::Action { stage: stage.to_owned(), key: key.to_owned() })
     }
@@ -127,7 +134,8 @@ impl RunFile {
 
     fn write(&self, line: &RunLine) -> Result<(), StoreError> {
         let Some(mut file) = self.file.as_ref() else { return Ok(()) };
-        let text = serde_json::to_string(line).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
+        let text =
+            serde_json::to_string(line).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
         // One write a line: threads of a run share the file.
         at(Path::new(&self.id), file.write_all(format!("{text}\n").as_bytes()))
     }
@@ -140,7 +148,8 @@ impl Store {
         let folder = self.root().join("runs");
         let id = format!("{}-{}-{}", holder.since_unix, holder.pid, unique());
         let path = folder.join(format!("{id}.jsonl"));
-        let opened = fs::create_dir_all(&folder).and_then(|()| File::options().create_new(true).append(true).open(&path));
+        let opened = fs::create_dir_all(&folder)
+            .and_then(|()| File::options().create_new(true).append(true).open(&path));
         let file = match opened {
             Ok(file) => Some(file),
             Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => None,
@@ -171,9 +180,19 @@ impl Store {
     }
 
     /// Pins actions under a name: garbage collection keeps them until [`Store::unpin`].
-    pub fn pin(&self, _: &Entered, name: &str, command: Vec<String>, actions: &[(String, String)]) -> Result<(), StoreError> {
+    pub fn pin(
+        &self,
+        _: &Entered,
+        name: &str,
+        command: Vec<String>,
+        actions: &[(String, String)],
+    ) -> Result<(), StoreError> {
         let mut lines = vec![RunLine::Run { holder: Holder::this_process(), command }];
-        lines.extend(actions.iter().map(|(stage, key)| RunLine::Action { stage: stage.clone(), key: key.clone() }));
+        lines.extend(
+            actions
+                .iter()
+                .map(|(stage, key)| RunLine::Action { stage: stage.clone(), key: key.clone() }),
+        );
         let texts = lines.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>();
         let text = texts.map_err(|e| StoreError::NoArtifact(e.to_string()))?.join("\n") + "\n";
         let path = self.pin_path(name);
@@ -195,7 +214,8 @@ impl Store {
 
     /// Removes a run's file, what its sinks left, and what it submitted to a cluster.
     pub fn remove_run(&self, id: &str) -> Result<(), StoreError> {
-        let (path, scratch) = (self.root().join("runs").join(format!("{id}.jsonl")), self.scratch(id));
+        let (path, scratch) =
+            (self.root().join("runs").join(format!("{id}.jsonl")), self.scratch(id));
         // A sink's leftovers have no value.
         fs::remove_dir_all(&scratch).ok();
         fs::remove_dir_all(self.root().join("slurm").join(id)).ok();
@@ -227,7 +247,10 @@ mod tests {
         let store = Store::open(dir.path()).unwrap();
         let file = store.begin_run(&entered(&store), vec!["nerf-sr".into(), "run".into()]).unwrap();
         file.needs(&entered(&store), "prep", "k1").unwrap();
-        let waiting = Waiting { program: "train-ss".into(), parameters: json!({"rays": 3}).as_object().unwrap().clone() };
+        let waiting = Waiting {
+            program: "train-ss".into(),
+            parameters: json!({"rays": 3}).as_object().unwrap().clone(),
+        };
         file.waits(&entered(&store), waiting.clone()).unwrap();
         let run = store.runs().unwrap().remove(0);
         assert!(run.in_progress && run.ended_unix.is_none());
@@ -246,17 +269,32 @@ mod tests {
 
     #[test]
     fn a_waiting_node_may_be_any_record_of_its_stage_and_parameters() {
-        let waiting =
-            Waiting { program: "prep".into(), parameters: json!({"lr": 2, "kernel": null}).as_object().unwrap().clone() };
+        let waiting = Waiting {
+            program: "prep".into(),
+            parameters: json!({"lr": 2, "kernel": null}).as_object().unwrap().clone(),
+        };
         for (parts, expected) in [
-            (json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input a": "x"}), true),
-            (json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input a": "y", "code": "z"}), true),
+            (
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input \
+                    a": "x"}),
+                true,
+            ),
+            (
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input \
+                    a": "y", "code": "z"}),
+                true,
+            ),
             (json!({"stage": "prep", "parameter lr": 3, "parameter kernel": null}), false),
             (json!({"stage": "prep", "parameter lr": 2}), false),
-            (json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "parameter more": 1}), false),
+            (
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "parameter \
+                    more": 1}),
+                false,
+            ),
             (json!({"stage": "eval", "parameter lr": 2, "parameter kernel": null}), false),
         ] {
-            let record = Record { key_parts: parts.as_object().unwrap().clone(), ..Record::default() };
+            let record =
+                Record { key_parts: parts.as_object().unwrap().clone(), ..Record::default() };
             assert_eq!(waiting.may_be(&record), expected, "{parts}");
         }
     }

@@ -25,7 +25,8 @@ pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
 /// Whether a process ignores a signal, by the kernel's text on it.
 fn ignores(status: &str, signal: i32) -> bool {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).map(str::trim);
-    mask.and_then(|mask| u64::from_str_radix(mask, 16).ok()).is_some_and(|mask| (mask >> (signal - 1)) & 1 == 1)
+    mask.and_then(|mask| u64::from_str_radix(mask, 16).ok())
+        .is_some_and(|mask| (mask >> (signal - 1)) & 1 == 1)
 }
 
 #[cfg(test)]
@@ -34,7 +35,11 @@ mod tests {
 
     #[test]
     fn what_nohup_leaves_behind_is_seen() {
-        let status = |mask: &str| format!("Name:\tprep\nSigBlk:\tffffffffffffffff\nSigIgn:\t{mask}\nSigCgt:\tffffffffffffffff\n");
+        let status = |mask: &str| {
+            format!(
+                "Name:\tprep\nSigBlk:\tffffffffffffffff\nSigIgn:\t{mask}\nSigCgt:\tffffffffffffffff\n"
+            )
+        };
         assert!(ignores(&status("0000000000001001"), SIGHUP));
         assert!(!ignores(&status("0000000000001000"), SIGHUP));
         assert!(!ignores("", SIGHUP));

@@ -30,13 +30,15 @@ use crate::report_line;
 use crate::rules::Rule;
 use crate::signals::stop_on_signals;
 
-/// A file that a stage may leave in its output: a few words on the result, which the runner prints at the end.
+/// A file that a stage may leave in its output: a few words on the result, which the runner prints
+/// at the end.
 pub const SUMMARY_FILE: &str = "summary.txt";
 
 /// A stage of the pipeline: inputs and parameters in, one artifact out.
 pub trait Stage {
-    /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default, deny_unknown_fields)]` is expected. One of them may be
-    /// an externally tagged `enum` of structs: it selects a variant, whose parameters are given beside it.
+    /// Parameters. Defaults, ranges and documentation come from the type; `#[serde(default,
+    /// deny_unknown_fields)]` is expected. One of them may be an externally tagged `enum` of
+    /// structs: it selects a variant, whose parameters are given beside it.
     type Params: Serialize + DeserializeOwned + JsonSchema + Default;
     /// Name of stage and binary.
     const NAME: &'static str;
@@ -73,7 +75,10 @@ pub trait Stage {
             code: code.to_owned(),
             summary: Self::SUMMARY.to_owned(),
             parameters: schemars::schema_for!(Self::Params).to_value(),
-            inputs: Self::inputs().into_iter().map(|(name, input)| (name.to_owned(), input)).collect(),
+            inputs: Self::inputs()
+                .into_iter()
+                .map(|(name, input)| (name.to_owned(), input))
+                .collect(),
             output: Self::output(),
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
@@ -122,7 +127,8 @@ enum Command {
     },
 }
 
-/// Environment variable in which a runner tells its stages its process id, so that they see when it is gone.
+/// Environment variable in which a runner tells its stages its process id, so that they see when it
+/// is gone.
 pub const RUNNER_VARIABLE: &str = "NERF_SR_RUNNER";
 
 /// What a running stage has at hand.
@@ -136,7 +142,8 @@ pub struct Context {
     work: Option<PathBuf>,
     progress: ProgressMode,
     interrupted: Arc<AtomicBool>,
-    /// Hash of the parameters, of what the inputs are, of the stage's code and of where it computes; none where an input has no manifest.
+    /// Hash of the parameters, of what the inputs are, of the stage's code and of where it
+    /// computes; none where an input has no manifest.
     pub(crate) identity: Option<String>,
     /// Whether it was said that something is there already.
     pub(crate) goes_on: AtomicBool,
@@ -152,15 +159,22 @@ pub struct GivenInput {
 }
 
 impl GivenInput {
-    /// A folder under an input's name. With a manifest in it or above it (a subtree), its files are checked first.
+    /// A folder under an input's name. With a manifest in it or above it (a subtree), its files are
+    /// checked first.
     pub fn open(name: &str, folder: &Path) -> anyhow::Result<Self> {
         if !folder.exists() {
-            return Err(Failure::BadInput(format!("input {name}: {}: no such folder", folder.display())).into());
+            return Err(Failure::BadInput(format!(
+                "input {name}: {}: no such folder",
+                folder.display()
+            ))
+            .into());
         }
-        let absolute = folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
+        let absolute =
+            folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
         let manifest = if absolute.join(MANIFEST_FILE).is_file() {
             Some(Manifest::read(&absolute))
-        } else if let (Some(parent), Some(subtree)) = (absolute.parent(), absolute.file_name().and_then(|n| n.to_str()))
+        } else if let (Some(parent), Some(subtree)) =
+            (absolute.parent(), absolute.file_name().and_then(|n| n.to_str()))
             && parent.join(MANIFEST_FILE).is_file()
         {
             Some(Manifest::read(parent).map(|manifest| manifest.subtree(subtree)))
@@ -190,15 +204,17 @@ impl GivenInput {
         let path = self.path(file);
         let place = format!("input {}: {}", self.name, path.display());
         let bytes = fs::read(&path).bad_input(&place)?;
-        serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_slice(&bytes)).bad_input(&place)
+        serde_path_to_error::deserialize(&mut serde_json::Deserializer::from_slice(&bytes))
+            .bad_input(&place)
     }
 }
 
 impl Context {
     /// An input that must be there.
     pub fn input(&self, name: &str) -> anyhow::Result<&GivenInput> {
-        self.optional_input(name)
-            .ok_or_else(|| Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into())
+        self.optional_input(name).ok_or_else(|| {
+            Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into()
+        })
     }
 
     /// An input that may be left out.
@@ -210,7 +226,8 @@ impl Context {
     pub fn output_path(&self, file: &str) -> anyhow::Result<PathBuf> {
         let path = self.output.join(file);
         if let Some(folder) = path.parent() {
-            fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
+            fs::create_dir_all(folder)
+                .with_context(|| format!("cannot make {}", folder.display()))?;
         }
         Ok(path)
     }
@@ -224,7 +241,8 @@ impl Context {
     /// Leaves a few words on the result, which the runner prints at the end.
     pub fn write_summary(&self, text: &str) -> anyhow::Result<()> {
         let path = self.output_path(SUMMARY_FILE)?;
-        fs::write(&path, format!("{}\n", text.trim_end())).with_context(|| format!("cannot write {}", path.display()))
+        fs::write(&path, format!("{}\n", text.trim_end()))
+            .with_context(|| format!("cannot write {}", path.display()))
     }
 
     /// The folder for checkpoints, where one was given.
@@ -234,7 +252,8 @@ impl Context {
 
     /// Starts a progress display.
     pub fn progress(&self, label: &str, total: u64) -> Progress {
-        Progress::new(label, total, self.progress).stopping(StopAfter::from_environment(&self.interrupted))
+        Progress::new(label, total, self.progress)
+            .stopping(StopAfter::from_environment(&self.interrupted))
     }
 
     /// Says something to the person watching, on one line; it also lands in the action's log.
@@ -255,8 +274,9 @@ impl Context {
     }
 }
 
-/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors and panics to an exit code. The reason of a
-/// failure is one line on stderr, and with `--progress json` an event on stdout.
+/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors and panics to an
+/// exit code. The reason of a failure is one line on stderr, and with `--progress json` an event on
+/// stdout.
 pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
     run_stage_with::<S>(version, code, std::env::args_os())
 }
@@ -286,7 +306,8 @@ fn parse_and_run<S: Stage>(
     arguments: impl IntoIterator<Item = OsString>,
 ) -> anyhow::Result<()> {
     let description = S::describe(version, code);
-    let mut command = Arguments::command().name(S::NAME).about(S::SUMMARY).after_help(help_of(&description));
+    let mut command =
+        Arguments::command().name(S::NAME).about(S::SUMMARY).after_help(help_of(&description));
     if !version.is_empty() {
         command = command.version(version);
     }
@@ -340,11 +361,15 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     let output = arguments.output.expect("clap requires --output");
     let staging = Staging::new(&output)?;
     if let Some(work) = &arguments.work {
-        fs::create_dir_all(work).with_context(|| format!("--work {}: cannot be made", work.display()))?;
+        fs::create_dir_all(work)
+            .with_context(|| format!("--work {}: cannot be made", work.display()))?;
     }
-    let made_from: Option<BTreeMap<&str, &str>> =
-        inputs.iter().map(|(name, input)| Some((name.as_str(), input.identity.as_deref()?))).collect();
-    let identity = made_from.map(|inputs| hash_json(&(&params, inputs, &description.code, &arguments.device)));
+    let made_from: Option<BTreeMap<&str, &str>> = inputs
+        .iter()
+        .map(|(name, input)| Some((name.as_str(), input.identity.as_deref()?)))
+        .collect();
+    let identity =
+        made_from.map(|inputs| hash_json(&(&params, inputs, &description.code, &arguments.device)));
     let context = Context {
         threads,
         device: arguments.device,
@@ -362,14 +387,22 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
 }
 
 /// The inputs' names and folders: each one known, none missing.
-fn input_folders<'a>(given: &'a [String], description: &Description) -> anyhow::Result<Vec<(&'a str, &'a Path)>> {
+fn input_folders<'a>(
+    given: &'a [String],
+    description: &Description,
+) -> anyhow::Result<Vec<(&'a str, &'a Path)>> {
     let mut folders = Vec::new();
     for text in given {
-        let (name, folder) = text.split_once('=').ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
+        let (name, folder) = text
+            .split_once('=')
+            .ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
         if !description.inputs.contains_key(name) {
             let problem = match renamed(Named::Input, &description.name, name) {
                 Some(rename) => rename.problem(None),
-                None => format!("no such input; {}", known_names(name, description.inputs.keys().map(String::as_str))),
+                None => format!(
+                    "no such input; {}",
+                    known_names(name, description.inputs.keys().map(String::as_str))
+                ),
             };
             return Err(Failure::Usage(format!("--input {name}: {problem}")).into());
         }
@@ -377,13 +410,18 @@ fn input_folders<'a>(given: &'a [String], description: &Description) -> anyhow::
     }
     for (name, input) in &description.inputs {
         if !input.optional && !folders.iter().any(|(given, _)| given == name) {
-            return Err(Failure::Usage(format!("input {name} is missing; give --input {name}=DIR ({})", input.summary)).into());
+            return Err(Failure::Usage(format!(
+                "input {name} is missing; give --input {name}=DIR ({})",
+                input.summary
+            ))
+            .into());
         }
     }
     Ok(folders)
 }
 
-/// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than work on unseen.
+/// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than
+/// work on unseen.
 fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
     rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
     // It may have been killed before that, while this process was being loaded.
@@ -395,23 +433,29 @@ fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The parameters from the file, checked against the schema, or the defaults: as JSON and as the stage's own type.
-fn read_params<P: DeserializeOwned>(file: Option<&Path>, description: &Description) -> anyhow::Result<(Value, P)> {
+/// The parameters from the file, checked against the schema, or the defaults: as JSON and as the
+/// stage's own type.
+fn read_params<P: DeserializeOwned>(
+    file: Option<&Path>,
+    description: &Description,
+) -> anyhow::Result<(Value, P)> {
     let place = file.map(|f| f.display().to_string()).unwrap_or_default();
     let given = match file {
         None => serde_json::Map::new(),
         Some(path) => {
             let bytes = fs::read(path).usage(format!("--params {place}"))?;
-            serde_json::from_slice(&bytes).usage(format!("--params {place}: expected a JSON object"))?
+            serde_json::from_slice(&bytes)
+                .usage(format!("--params {place}: expected a JSON object"))?
         }
     };
-    let schema =
-        Schema::new(&description.name, &description.parameters).map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
+    let schema = Schema::new(&description.name, &description.parameters)
+        .map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
     let resolved = schema.resolve(&given).map_err(|problems| {
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
         Failure::Usage(format!("--params {place}: {}", lines.join("; ")))
     })?;
-    let params = serde_path_to_error::deserialize(schema.nested(&resolved)).usage(format!("--params {place}"))?;
+    let params = serde_path_to_error::deserialize(schema.nested(&resolved))
+        .usage(format!("--params {place}"))?;
     Ok((resolved, params))
 }
 
@@ -423,15 +467,22 @@ struct Staging {
 impl Staging {
     fn new(output: &Path) -> anyhow::Result<Self> {
         if output.exists() {
-            return Err(Failure::Usage(format!("--output {}: exists already; name a new folder", output.display())).into());
+            return Err(Failure::Usage(format!(
+                "--output {}: exists already; name a new folder",
+                output.display()
+            ))
+            .into());
         }
-        let name =
-            output.file_name().ok_or_else(|| Failure::Usage(format!("--output {}: not a folder name", output.display())))?;
+        let name = output.file_name().ok_or_else(|| {
+            Failure::Usage(format!("--output {}: not a folder name", output.display()))
+        })?;
         let folder = output.with_file_name(format!(".{}.partial", name.to_string_lossy()));
         if folder.exists() {
-            fs::remove_dir_all(&folder).with_context(|| format!("cannot clear {}", folder.display()))?;
+            fs::remove_dir_all(&folder)
+                .with_context(|| format!("cannot clear {}", folder.display()))?;
         }
-        fs::create_dir_all(&folder).with_context(|| format!("--output {}: cannot write there", output.display()))?;
+        fs::create_dir_all(&folder)
+            .with_context(|| format!("--output {}: cannot write there", output.display()))?;
         Ok(Self { folder })
     }
 

@@ -25,7 +25,8 @@ use crate::{unique, unix_time};
 /// format                version of all this
 /// ```
 ///
-/// An object is made in `partial/`, checked, hashed, fsynced and renamed; the record goes last. So what is recorded is whole.
+/// An object is made in `partial/`, checked, hashed, fsynced and renamed; the record goes last. So
+/// what is recorded is whole.
 #[derive(Debug, Clone)]
 pub struct Store {
     root: PathBuf,
@@ -33,7 +34,8 @@ pub struct Store {
     format: u32,
 }
 
-/// `actions/KEY.json`: the whole key and what came of it. A field of a later version is passed over.
+/// `actions/KEY.json`: the whole key and what came of it. A field of a later version is passed
+/// over.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Record {
     /// Name of the stage's block in pipeline.yaml.
@@ -61,7 +63,8 @@ pub struct Record {
     pub processor_seconds: Option<f64>,
     /// Where it ran.
     pub host: String,
-    /// What its `summary.txt` says, so that nothing of an artifact is read to show it; records of earlier versions have none.
+    /// What its `summary.txt` says, so that nothing of an artifact is read to show it; records of
+    /// earlier versions have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub summary: Option<String>,
 }
@@ -77,7 +80,8 @@ pub fn label(stage: &str, point: &str) -> String {
 }
 
 impl Record {
-    /// Whether its key is of an older version: no plan comes to it any more, though what it names may still be wanted.
+    /// Whether its key is of an older version: no plan comes to it any more, though what it names
+    /// may still be wanted.
     pub fn has_old_key(&self) -> bool {
         self.key_parts.get(KEY_VERSION_PART).and_then(Value::as_u64) != Some(KEY_VERSION)
     }
@@ -123,7 +127,8 @@ pub enum StoreError {
     NoArtifact(String),
     /// A newer program made the store.
     #[error(
-        "{path}: the store has format {found}, this nerf-sr knows format {known}; use the newer nerf-sr, or another folder with --store"
+        "{path}: the store has format {found}, this nerf-sr knows format {known}; use the newer \
+        nerf-sr, or another folder with --store"
     )]
     Newer {
         /// The store.
@@ -166,8 +171,9 @@ pub(crate) fn at<T>(path: &Path, result: io::Result<T>) -> Result<T, StoreError>
 }
 
 impl Store {
-    /// Opens the store in a folder, making it where it isn't there. One of an older format gets this one's mark: from then on older
-    /// runners leave it alone, those that are at work with it among them.
+    /// Opens the store in a folder, making it where it isn't there. One of an older format gets
+    /// this one's mark: from then on older runners leave it alone, those that are at work with it
+    /// among them.
     pub fn open(root: &Path) -> Result<Self, StoreError> {
         Self::open_as(root, FORMAT)
     }
@@ -179,7 +185,9 @@ impl Store {
         if store.check_format()?.is_none_or(|found| found < format) {
             store.mark_format()?;
         }
-        for folder in ["objects", "actions", "partial", "locks", "cache", "runs", "pins", "sinks", "trash"] {
+        for folder in
+            ["objects", "actions", "partial", "locks", "cache", "runs", "pins", "sinks", "trash"]
+        {
             let path = root.join(folder);
             match fs::create_dir_all(&path) {
                 // An old store that can't be written still shows what it has.
@@ -206,11 +214,15 @@ impl Store {
         }
     }
 
-    /// Marks the store as of this program's format. It is closed meanwhile: who enters before is done with it, who enters later sees
-    /// the mark.
+    /// Marks the store as of this program's format. It is closed meanwhile: who enters before is
+    /// done with it, who enters later sees the mark.
     fn mark_format(&self) -> Result<(), StoreError> {
         let gate = match self.gate() {
-            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::ReadOnlyFilesystem => return Ok(()),
+            Err(StoreError::Io { source, .. })
+                if source.kind() == io::ErrorKind::ReadOnlyFilesystem =>
+            {
+                return Ok(());
+            }
             gate => gate?,
         };
         at(&self.root, gate.lock())?;
@@ -225,19 +237,21 @@ impl Store {
         &self.root
     }
 
-    /// The record of a key, if the action was done and its object is whole (sizes only; see [`Store::verify`]).
+    /// The record of a key, if the action was done and its object is whole (sizes only; see
+    /// [`Store::verify`]).
     pub fn hit(&self, key: &str) -> Option<Record> {
         self.record(key).filter(|record| self.is_whole(&record.output))
     }
 
     /// Whether an object has its own manifest and files of the right sizes; no content is read.
     pub fn is_whole(&self, identity: &str) -> bool {
-        let manifest = self.manifest(identity).ok().filter(|manifest| manifest.identity() == identity);
+        let manifest =
+            self.manifest(identity).ok().filter(|manifest| manifest.identity() == identity);
         manifest.is_some_and(|manifest| manifest.check_sizes(&self.object(identity)).is_ok())
     }
 
-    /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut short or another's, that is
-    /// written again. `kind` is what the stage makes.
+    /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut
+    /// short or another's, that is written again. `kind` is what the stage makes.
     pub fn hit_or_repair(&self, _: &Entered, key: &str, kind: &str) -> Option<Record> {
         if let Some(record) = self.hit(key) {
             return Some(record);
@@ -266,10 +280,12 @@ impl Store {
         Ok(keys.iter().filter_map(|name| self.record(name.strip_suffix(".json")?)).collect())
     }
 
-    /// Keys that have any file among the actions, sorted: records that can't be read are among them.
+    /// Keys that have any file among the actions, sorted: records that can't be read are among
+    /// them.
     pub fn action_files(&self) -> Result<Vec<String>, StoreError> {
         let names = self.names("actions")?;
-        let mut keys: Vec<String> = names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned())).collect();
+        let mut keys: Vec<String> =
+            names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned())).collect();
         keys.dedup();
         Ok(keys)
     }
@@ -292,8 +308,10 @@ impl Store {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             entries => at(&folder, entries)?,
         };
-        let mut names: Vec<String> =
-            entries.filter_map(|e| e.ok()?.file_name().into_string().ok()).filter(|n| !n.starts_with('.')).collect();
+        let mut names: Vec<String> = entries
+            .filter_map(|e| e.ok()?.file_name().into_string().ok())
+            .filter(|n| !n.starts_with('.'))
+            .collect();
         names.sort_unstable();
         Ok(names)
     }
@@ -329,8 +347,14 @@ impl Store {
         files.into_iter().any(|entry| entry.file_type().is_file())
     }
 
-    /// Begins an action, with its key locked. Leftovers of a killed attempt are cleared, its checkpoints kept.
-    pub fn begin(&self, _: &Entered, action: &Unfinished, params: &Value) -> Result<Attempt, StoreError> {
+    /// Begins an action, with its key locked. Leftovers of a killed attempt are cleared, its
+    /// checkpoints kept.
+    pub fn begin(
+        &self,
+        _: &Entered,
+        action: &Unfinished,
+        params: &Value,
+    ) -> Result<Attempt, StoreError> {
         let folder = self.partial(&hash_json(&action.key_parts));
         let attempt = Attempt {
             output: folder.join("output"),
@@ -351,8 +375,8 @@ impl Store {
         Ok(attempt)
     }
 
-    /// Looks at what an attempt made: checks the manifest against the files and makes both durable. This takes its time; taking
-    /// it in ([`Store::publish`]) doesn't.
+    /// Looks at what an attempt made: checks the manifest against the files and makes both durable.
+    /// This takes its time; taking it in ([`Store::publish`]) doesn't.
     pub fn check(&self, attempt: Attempt, kind: &str) -> Result<Checked, StoreError> {
         let output = &attempt.output;
         if !output.is_dir() {
@@ -380,9 +404,14 @@ impl Store {
         Ok(Checked { attempt, identity, is_there })
     }
 
-    /// Takes in what an attempt made: moves the object, writes the record last. The record's `output` is set to the object's
-    /// identity.
-    pub fn publish(&self, _: &Entered, checked: Checked, mut record: Record) -> Result<Record, StoreError> {
+    /// Takes in what an attempt made: moves the object, writes the record last. The record's
+    /// `output` is set to the object's identity.
+    pub fn publish(
+        &self,
+        _: &Entered,
+        checked: Checked,
+        mut record: Record,
+    ) -> Result<Record, StoreError> {
         let Checked { attempt, identity, is_there } = checked;
         record.output = identity;
         self.place(&attempt.output, &record.output, is_there)?;
@@ -395,9 +424,15 @@ impl Store {
         Ok(record)
     }
 
-    /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions may make one object at once: it is moved
-    /// where there is nothing, and what is there then stays if it is whole.
-    pub(crate) fn place(&self, folder: &Path, identity: &str, is_there: bool) -> Result<(), StoreError> {
+    /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions
+    /// may make one object at once: it is moved where there is nothing, and what is there then
+    /// stays if it is whole.
+    pub(crate) fn place(
+        &self,
+        folder: &Path,
+        identity: &str,
+        is_there: bool,
+    ) -> Result<(), StoreError> {
         use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty, NotADirectory};
         let object = self.object(identity);
         if is_there && object.exists() {
@@ -406,7 +441,11 @@ impl Store {
         loop {
             match fs::rename(folder, &object) {
                 Ok(()) => return at(&object, sync_folder(&self.root.join("objects"))),
-                Err(error) if matches!(error.kind(), AlreadyExists | DirectoryNotEmpty | NotADirectory) => {}
+                Err(error)
+                    if matches!(
+                        error.kind(),
+                        AlreadyExists | DirectoryNotEmpty | NotADirectory
+                    ) => {}
                 Err(source) => return Err(StoreError::Io { path: object, source }),
             }
             if self.verify(identity).is_ok() {
@@ -422,7 +461,8 @@ impl Store {
 
     pub(crate) fn write_record(&self, record: &Record) -> Result<(), StoreError> {
         let path = self.action(&record.key(), "json");
-        let mut text = serde_json::to_string_pretty(record).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
+        let mut text = serde_json::to_string_pretty(record)
+            .map_err(|e| StoreError::NoArtifact(e.to_string()))?;
         text.push('\n');
         at(&path, write_atomically(&path, text.as_bytes()))
     }
@@ -469,7 +509,8 @@ impl Store {
     pub fn empty_trash(&self) -> Result<(), StoreError> {
         for name in self.names("trash")? {
             let path = self.root.join("trash").join(name);
-            let removed = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+            let removed =
+                if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
             match removed {
                 // Somebody else empties it, too.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
@@ -523,7 +564,13 @@ mod tests {
     fn make(store: &Store, name: &str, content: &str) -> Record {
         let checked = store.check(begin(store, name, Some(content)), "text").unwrap();
         let Unfinished { stage, key_parts, .. } = unfinished(name);
-        store.publish(&entered(store), checked, Record { stage, key_parts, threads: 1, ..Record::default() }).unwrap()
+        store
+            .publish(
+                &entered(store),
+                checked,
+                Record { stage, key_parts, threads: 1, ..Record::default() },
+            )
+            .unwrap()
     }
 
     #[test]
@@ -553,13 +600,15 @@ mod tests {
         store.verify(&done.output).unwrap();
     }
 
-    /// Whatever became of a manifest, it is written again; whatever stands in an object's place, it gives way to the object.
+    /// Whatever became of a manifest, it is written again; whatever stands in an object's place, it
+    /// gives way to the object.
     #[test]
     fn manifests_are_repaired_and_objects_replaced() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let (done, other) = (make(&store, "a", "1234"), make(&store, "b", "other"));
-        let (object, manifest) = (store.object(&done.output), store.object(&done.output).join(MANIFEST_FILE));
+        let (object, manifest) =
+            (store.object(&done.output), store.object(&done.output).join(MANIFEST_FILE));
         let foreign = fs::read(store.object(&other.output).join(MANIFEST_FILE)).unwrap();
         for damage in [None, Some(&b""[..]), Some(&b"{}"[..]), Some(&foreign[..])] {
             fs::remove_file(&manifest).unwrap();
@@ -567,7 +616,10 @@ mod tests {
                 fs::write(&manifest, bytes).unwrap();
             }
             assert_eq!(store.hit(&done.key()), None);
-            assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").as_ref(), Some(&done));
+            assert_eq!(
+                store.hit_or_repair(&entered(&store), &done.key(), "text").as_ref(),
+                Some(&done)
+            );
             store.verify(&done.output).unwrap();
         }
         fs::remove_dir_all(&object).unwrap();
@@ -585,9 +637,13 @@ mod tests {
     fn success_without_an_artifact_is_a_failure() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        assert!(matches!(store.check(begin(&store, "k", None), "text"), Err(StoreError::NoArtifact(_))));
+        assert!(matches!(
+            store.check(begin(&store, "k", None), "text"),
+            Err(StoreError::NoArtifact(_))
+        ));
         let attempt = begin(&store, "k", Some("1"));
-        fs::write(attempt.output.join(MANIFEST_FILE), r#"{"kind":"text","schema":1,"files":[]}"#).unwrap();
+        fs::write(attempt.output.join(MANIFEST_FILE), r#"{"kind":"text","schema":1,"files":[]}"#)
+            .unwrap();
         assert!(matches!(store.check(attempt, "text"), Err(StoreError::NoArtifact(_))));
         assert!(store.objects().unwrap().is_empty());
     }
@@ -601,11 +657,15 @@ mod tests {
         for text in ["2\n", "99", "", "new"] {
             fs::write(dir.path().join("format"), text).unwrap();
             let message = Store::open(dir.path()).unwrap_err().to_string();
-            assert!(message.contains("use the newer nerf-sr") && !message.contains('\n'), "{message}");
+            assert!(
+                message.contains("use the newer nerf-sr") && !message.contains('\n'),
+                "{message}"
+            );
         }
     }
 
-    /// A newer program marks the store as its own when it opens it. An older one that is at work there changes nothing from then on.
+    /// A newer program marks the store as its own when it opens it. An older one that is at work
+    /// there changes nothing from then on.
     #[test]
     fn an_older_program_at_work_stops_when_a_newer_one_comes() {
         let dir = tempfile::tempdir().unwrap();
@@ -614,17 +674,23 @@ mod tests {
         let checked = older.check(begin(&older, "b", Some("5678")), "text").unwrap();
         let newer = Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
-        for refused in [older.try_enter().err(), older.try_close().err(), Store::open_as(dir.path(), 1).err()] {
+        for refused in
+            [older.try_enter().err(), older.try_close().err(), Store::open_as(dir.path(), 1).err()]
+        {
             assert_eq!(
                 refused.unwrap().to_string(),
                 format!(
-                    "{}: the store has format 2, this nerf-sr knows format 1; use the newer nerf-sr, or another folder with --store",
+                    "{}: the store has format 2, this nerf-sr knows format 1; use the newer \
+                    nerf-sr, or another folder with --store",
                     dir.path().display()
                 )
             );
         }
         drop(checked);
-        assert_eq!((newer.objects().unwrap(), newer.hit(&done.key())), (vec![done.output.clone()], Some(done)));
+        assert_eq!(
+            (newer.objects().unwrap(), newer.hit(&done.key())),
+            (vec![done.output.clone()], Some(done))
+        );
         // It makes what the older one left half made.
         let made = make(&newer, "b", "5678");
         assert_eq!(newer.hit(&made.key()), Some(made));
@@ -643,14 +709,20 @@ mod tests {
             std::thread::scope(|scope| {
                 for action in 0..3 {
                     let store = &store;
-                    scope.spawn(move || assert_eq!(make(store, &format!("{round} {action}"), "1234").output.len(), 64));
+                    scope.spawn(move || {
+                        assert_eq!(
+                            make(store, &format!("{round} {action}"), "1234").output.len(),
+                            64
+                        )
+                    });
                 }
             });
             store.verify(&output).unwrap();
         }
     }
 
-    /// Who is inside when a newer program comes is waited for. Of several newer ones the newest has the store.
+    /// Who is inside when a newer program comes is waited for. Of several newer ones the newest has
+    /// the store.
     #[test]
     fn a_newer_program_waits_for_who_is_inside() {
         let dir = tempfile::tempdir().unwrap();
@@ -659,9 +731,14 @@ mod tests {
         let formats = [2, 4, 3];
         let opened = std::thread::scope(|scope| {
             let root = dir.path();
-            let openings = formats.map(|format| scope.spawn(move || Store::open_as(root, format).is_ok()));
+            let openings =
+                formats.map(|format| scope.spawn(move || Store::open_as(root, format).is_ok()));
             std::thread::sleep(std::time::Duration::from_millis(100));
-            assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "1\n", "not while somebody is inside");
+            assert_eq!(
+                fs::read_to_string(dir.path().join("format")).unwrap(),
+                "1\n",
+                "not while somebody is inside"
+            );
             drop(inside);
             openings.map(|opening| opening.join().unwrap())
         });

@@ -1,4 +1,5 @@
-//! A parameter that selects a variant with parameters of its own, as an externally tagged `enum` of structs has them.
+//! A parameter that selects a variant with parameters of its own, as an externally tagged `enum` of
+//! structs has them.
 
 use serde_json::{Map, Value, json};
 
@@ -19,17 +20,31 @@ struct Variant {
 }
 
 impl Tag {
-    /// The one that a schema has, if any. Fails where there are two, or where a name would mean two parameters of one variant.
+    /// The one that a schema has, if any. Fails where there are two, or where a name would mean two
+    /// parameters of one variant.
     pub(crate) fn find(schema: &Value) -> Result<Option<Self>, String> {
-        let Some(properties) = schema.get("properties").and_then(Value::as_object) else { return Ok(None) };
-        let mut tags: Vec<Self> = properties.iter().filter_map(|(name, property)| Self::read(schema, name, property)).collect();
+        let Some(properties) = schema.get("properties").and_then(Value::as_object) else {
+            return Ok(None);
+        };
+        let mut tags: Vec<Self> = properties
+            .iter()
+            .filter_map(|(name, property)| Self::read(schema, name, property))
+            .collect();
         if tags.len() > 1 {
-            return Err(format!("one where {} and {} both select a variant", tags[0].name, tags[1].name));
+            return Err(format!(
+                "one where {} and {} both select a variant",
+                tags[0].name, tags[1].name
+            ));
         }
         let Some(tag) = tags.pop() else { return Ok(None) };
         for variant in &tag.variants {
-            if let Some(name) = variant.properties.keys().find(|name| properties.contains_key(*name)) {
-                return Err(format!("one where {name} is a parameter beside {} and inside its {}", tag.name, variant.name));
+            if let Some(name) =
+                variant.properties.keys().find(|name| properties.contains_key(*name))
+            {
+                return Err(format!(
+                    "one where {name} is a parameter beside {} and inside its {}",
+                    tag.name, variant.name
+                ));
             }
         }
         Ok(Some(tag))
@@ -37,10 +52,16 @@ impl Tag {
 
     fn read(schema: &Value, name: &str, property: &Value) -> Option<Self> {
         let reader = Reader::new(schema);
-        let alternatives = reader.referred(property).unwrap_or(property).get("oneOf")?.as_array()?;
-        let mut variants: Vec<Variant> =
-            alternatives.iter().map(|alternative| Variant::read(reader, alternative)).collect::<Option<_>>()?;
-        let default = property.get("default").and_then(Value::as_object).and_then(|default| default.keys().next());
+        let alternatives =
+            reader.referred(property).unwrap_or(property).get("oneOf")?.as_array()?;
+        let mut variants: Vec<Variant> = alternatives
+            .iter()
+            .map(|alternative| Variant::read(reader, alternative))
+            .collect::<Option<_>>()?;
+        let default = property
+            .get("default")
+            .and_then(Value::as_object)
+            .and_then(|default| default.keys().next());
         if let Some(at) = variants.iter().position(|variant| Some(&variant.name) == default) {
             variants[..=at].rotate_right(1);
         }
@@ -64,8 +85,11 @@ impl Tag {
             let mut form = schema.clone();
             let tag = &mut form["properties"][&self.name];
             let mut own = json!({"enum": choices, "default": choices[0]});
-            for (keyword, value) in
-                tag.as_object().into_iter().flatten().filter(|(k, _)| !["$ref", "oneOf", "default"].contains(&k.as_str()))
+            for (keyword, value) in tag
+                .as_object()
+                .into_iter()
+                .flatten()
+                .filter(|(k, _)| !["$ref", "oneOf", "default"].contains(&k.as_str()))
             {
                 own[keyword] = value.clone();
             }
@@ -84,11 +108,17 @@ impl Tag {
         self.variants().position(|variant| variant == name)
     }
 
-    /// Parameters with those of a variant beside its name. What isn't a variant stays, for the validator to name.
+    /// Parameters with those of a variant beside its name. What isn't a variant stays, for the
+    /// validator to name.
     pub(crate) fn flattened(&self, given: &Map<String, Value>) -> Map<String, Value> {
-        let nested = given.get(&self.name).and_then(Value::as_object).filter(|nested| nested.len() == 1);
-        let inside = nested.and_then(|nested| nested.iter().next()).and_then(|(name, inner)| Some((name, inner.as_object()?)));
-        let Some((variant, inner)) = inside.filter(|(name, _)| self.variants().any(|variant| variant == *name)) else {
+        let nested =
+            given.get(&self.name).and_then(Value::as_object).filter(|nested| nested.len() == 1);
+        let inside = nested
+            .and_then(|nested| nested.iter().next())
+            .and_then(|(name, inner)| Some((name, inner.as_object()?)));
+        let Some((variant, inner)) =
+            inside.filter(|(name, _)| self.variants().any(|variant| variant == *name))
+        else {
             return given.clone();
         };
         // A name that is said outside, too, is as it is said there.
@@ -111,12 +141,16 @@ impl Tag {
 
     /// What to say of a parameter that only another variant has.
     pub(crate) fn foreign(&self, variant: usize) -> String {
-        format!("belongs to {0}: {1}; leave it out, or choose {0}: {1}", self.name, self.variants[variant].name)
+        format!(
+            "belongs to {0}: {1}; leave it out, or choose {0}: {1}",
+            self.name, self.variants[variant].name
+        )
     }
 }
 
 impl Variant {
-    /// The variant that an alternative of a tagged `enum` is: an object with one property, itself an object.
+    /// The variant that an alternative of a tagged `enum` is: an object with one property, itself
+    /// an object.
     fn read(reader: Reader<'_>, alternative: &Value) -> Option<Self> {
         let outer = alternative.get("properties")?.as_object()?;
         let (name, inner) = outer.iter().next().filter(|_| outer.len() == 1)?;
@@ -136,12 +170,15 @@ mod tests {
             "additionalProperties": false,
             "properties": {
                 "seed": {"type": "integer", "default": 0},
-                "field": {"$ref": "#/$defs/Field", "default": {"grid": {"rays": 30, "levels": 8}}, "description": "Which."}
+                "field": {"$ref": "#/$defs/Field", "default": {"grid": {"rays": 30, "levels": 8}},
+                "description": "Which."}
             },
             "$defs": {
                 "Field": {"oneOf": [
-                    {"type": "object", "properties": {"mlp": {"$ref": "#/$defs/Mlp"}}, "required": ["mlp"]},
-                    {"type": "object", "properties": {"grid": {"$ref": "#/$defs/Grid"}}, "required": ["grid"]}
+                    {"type": "object", "properties": {"mlp": {"$ref": "#/$defs/Mlp"}},
+                        "required": ["mlp"]},
+                    {"type": "object", "properties": {"grid": {"$ref": "#/$defs/Grid"}},
+                        "required": ["grid"]}
                 ]},
                 "Grid": {"properties": {
                     "rays": {"type": "integer", "default": 30},
@@ -193,12 +230,24 @@ mod tests {
     #[test]
     fn foreign_and_unknown_parameters_are_refused() {
         for (given, words) in [
-            (json!({"layers": 2}), "parameter layers: belongs to field: mlp; leave it out, or choose field: mlp"),
+            (
+                json!({"layers": 2}),
+                "parameter layers: belongs to field: mlp; leave it out, or choose field: mlp",
+            ),
             (json!({"field": "mlp", "levels": 2}), "parameter levels: belongs to field: grid"),
             (json!({"field": {"mlp": {"levels": 2}}}), "parameter levels: belongs to field: grid"),
-            (json!({"field": {"grid": {"levels": 17}}}), "parameter levels: 17 is greater than the maximum"),
-            (json!({"field": {"grid": {"levles": 2}}}), "parameter levles: unknown; did you mean levels?"),
-            (json!({"field": "voxels"}), r#"parameter field: "voxels" is not one of "grid", "mlp""#),
+            (
+                json!({"field": {"grid": {"levels": 17}}}),
+                "parameter levels: 17 is greater than the maximum",
+            ),
+            (
+                json!({"field": {"grid": {"levles": 2}}}),
+                "parameter levles: unknown; did you mean levels?",
+            ),
+            (
+                json!({"field": "voxels"}),
+                r#"parameter field: "voxels" is not one of "grid", "mlp""#,
+            ),
             (json!({"field": {"voxels": {}}}), "parameter field: {\"voxels\":{}} is not one of"),
             (json!({"field": {"grid": 3}}), "parameter field: {\"grid\":3} is not one of"),
             (json!({"field": {"grid": {}, "mlp": {}}}), "is not one of"),
@@ -213,15 +262,29 @@ mod tests {
     #[test]
     fn a_later_choice_drops_what_it_does_not_have() {
         for (earlier, later, expected) in [
-            (json!({"levels": 4, "rays": 9}), json!({"field": "mlp"}), json!({"field": "mlp", "rays": 9})),
-            (json!({"field": {"grid": {"levels": 4}}, "seed": 1}), json!({"field": "mlp"}), json!({"field": "mlp", "seed": 1})),
-            (json!({"field": {"grid": {"levels": 4}}}), json!({"levels": 5}), json!({"field": "grid", "levels": 5})),
+            (
+                json!({"levels": 4, "rays": 9}),
+                json!({"field": "mlp"}),
+                json!({"field": "mlp", "rays": 9}),
+            ),
+            (
+                json!({"field": {"grid": {"levels": 4}}, "seed": 1}),
+                json!({"field": "mlp"}),
+                json!({"field": "mlp", "seed": 1}),
+            ),
+            (
+                json!({"field": {"grid": {"levels": 4}}}),
+                json!({"levels": 5}),
+                json!({"field": "grid", "levels": 5}),
+            ),
             (json!({"levels": 4}), json!({"field": "grid"}), json!({"field": "grid", "levels": 4})),
             (json!({"levles": 4}), json!({"field": "mlp"}), json!({"field": "mlp", "levles": 4})),
             (json!({"levels": 4}), json!({"layers": 5}), json!({"levels": 4, "layers": 5})),
         ] {
             let mut given = Map::new();
-            [&earlier, &later].into_iter().for_each(|layer| schema().lay_over(&mut given, &map(layer)));
+            [&earlier, &later]
+                .into_iter()
+                .for_each(|layer| schema().lay_over(&mut given, &map(layer)));
             assert_eq!(Value::Object(given), expected, "{earlier}, then {later}");
         }
     }
@@ -229,7 +292,10 @@ mod tests {
     #[test]
     fn the_stage_gets_what_its_type_has() {
         let resolved = schema().resolve(&map(&json!({"field": "mlp"}))).unwrap();
-        assert_eq!(schema().nested(&resolved), json!({"field": {"mlp": {"rays": null, "layers": 8}}, "seed": 0}));
+        assert_eq!(
+            schema().nested(&resolved),
+            json!({"field": {"mlp": {"rays": null, "layers": 8}}, "seed": 0})
+        );
         assert_eq!(schema().by_scene(&resolved), ["rays"]);
         assert_eq!(schema().names(), ["field", "layers", "levels", "rays", "seed", "steps"]);
         assert_eq!(schema().canonical_value("layers", &json!(8.0)), json!(8));
@@ -239,7 +305,11 @@ mod tests {
     fn a_name_means_one_parameter() {
         let mut twice = described();
         twice["properties"]["layers"] = json!({"default": 1});
-        assert!(Schema::new("x", &twice).unwrap_err().contains("layers is a parameter beside field and inside its mlp"));
+        assert!(
+            Schema::new("x", &twice)
+                .unwrap_err()
+                .contains("layers is a parameter beside field and inside its mlp")
+        );
         let mut two = described();
         two["properties"]["other"] = two["properties"]["field"].clone();
         assert!(Schema::new("x", &two).unwrap_err().contains("both select a variant"));

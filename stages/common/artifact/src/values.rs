@@ -1,4 +1,5 @@
-//! Numbers in the form that a schema gives them: what is equal is written alike, and so hashed alike.
+//! Numbers in the form that a schema gives them: what is equal is written alike, and so hashed
+//! alike.
 
 use serde_json::{Map, Number, Value};
 
@@ -13,8 +14,9 @@ impl<'a> Reader<'a> {
         Self { root }
     }
 
-    /// A value as a schema reads it: where that has `number`, 2 becomes 2.0; elsewhere 2.0 becomes 2. Arrays and objects likewise inside.
-    /// What doesn't fit the schema stays, for the validator to name.
+    /// A value as a schema reads it: where that has `number`, 2 becomes 2.0; elsewhere 2.0 becomes 2.
+    /// Arrays and objects likewise inside. What doesn't fit the schema stays, for the validator to
+    /// name.
     pub(crate) fn read(&self, schema: &'a Value, value: &Value) -> Value {
         self.read_by(&self.alternatives(&[schema]), value)
     }
@@ -22,17 +24,23 @@ impl<'a> Reader<'a> {
     fn read_by(&self, schemas: &[&'a Value], value: &Value) -> Value {
         match value {
             Value::Number(number) if schemas.iter().any(|s| has_type(s, "number")) => {
-                let is_short = schemas.iter().any(|s| s.get("format").is_some_and(|format| format == "float"));
+                let is_short =
+                    schemas.iter().any(|s| s.get("format").is_some_and(|format| format == "float"));
                 as_float(number, is_short).unwrap_or_else(|| value.clone())
             }
             Value::Number(number) => as_integer(number).unwrap_or_else(|| value.clone()),
             Value::Array(items) => {
-                let read = |(index, item)| self.read_by(&self.inside(schemas, |s| item_schema(s, index)), item);
+                let read = |(index, item)| {
+                    self.read_by(&self.inside(schemas, |s| item_schema(s, index)), item)
+                };
                 items.iter().enumerate().map(read).collect()
             }
             Value::Object(entries) => {
                 let read = |(name, entry): (&String, &Value)| {
-                    (name.clone(), self.read_by(&self.inside(schemas, |s| property_schema(s, name)), entry))
+                    (
+                        name.clone(),
+                        self.read_by(&self.inside(schemas, |s| property_schema(s, name)), entry),
+                    )
                 };
                 Value::Object(entries.iter().map(read).collect::<Map<_, _>>())
             }
@@ -41,7 +49,11 @@ impl<'a> Reader<'a> {
     }
 
     /// The schemas of what is inside a value that has these.
-    fn inside(&self, schemas: &[&'a Value], find: impl Fn(&'a Value) -> Option<&'a Value>) -> Vec<&'a Value> {
+    fn inside(
+        &self,
+        schemas: &[&'a Value],
+        find: impl Fn(&'a Value) -> Option<&'a Value>,
+    ) -> Vec<&'a Value> {
         self.alternatives(&schemas.iter().filter_map(|s| find(s)).collect::<Vec<_>>())
     }
 
@@ -62,8 +74,8 @@ impl<'a> Reader<'a> {
         found
     }
 
-    /// The values that a choice may have, each with its description, where a schema is one. What may be left out is a choice between its kind and
-    /// null.
+    /// The values that a choice may have, each with its description, where a schema is one. What
+    /// may be left out is a choice between its kind and null.
     pub(crate) fn choices(&self, schema: &'a Value) -> Option<Vec<(&'a Value, &'a str)>> {
         let definition = self.present(schema);
         if let Some(words) = definition.get("enum").and_then(Value::as_array) {
@@ -76,10 +88,14 @@ impl<'a> Reader<'a> {
         definition.get("oneOf")?.as_array()?.iter().map(choice).collect()
     }
 
-    /// The schema of a value that is there: without the null that stands for none, and behind its reference.
+    /// The schema of a value that is there: without the null that stands for none, and behind its
+    /// reference.
     pub(crate) fn present(&self, schema: &'a Value) -> &'a Value {
         let is_null = |one: &&Value| one.get("type").is_some_and(|t| t == "null");
-        let inner = schema.get("anyOf").and_then(Value::as_array).and_then(|of| of.iter().find(|one| !is_null(one)));
+        let inner = schema
+            .get("anyOf")
+            .and_then(Value::as_array)
+            .and_then(|of| of.iter().find(|one| !is_null(one)));
         let schema = inner.unwrap_or(schema);
         self.referred(schema).unwrap_or(schema)
     }
@@ -155,22 +171,42 @@ mod tests {
             (json!({"type": "integer"}), json!(2.5), json!(2.5)),
             (json!({"type": "integer"}), json!(u64::MAX), json!(u64::MAX)),
             (json!({"$ref": "#/$defs/Size"}), json!(3.0), json!(3)),
-            (json!({"anyOf": [{"$ref": "#/$defs/Size"}, {"type": "string"}]}), json!(3.0), json!(3)),
+            (
+                json!({"anyOf": [{"$ref": "#/$defs/Size"}, {"type": "string"}]}),
+                json!(3.0),
+                json!(3),
+            ),
             (
                 json!({"type": "array", "items": {"type": "array", "items": {"type": "number"}}}),
                 json!([[1, 2.0]]),
                 json!([[1.0, 2.0]]),
             ),
-            (json!({"prefixItems": [{"type": "integer"}], "items": {"type": "number"}}), json!([1.0, 1]), json!([1, 1.0])),
-            (json!({"properties": {"a": {"type": "number"}}}), json!({"a": 1, "b": 1.0}), json!({"a": 1.0, "b": 1})),
-            (json!({"additionalProperties": {"type": "number"}}), json!({"a": 1}), json!({"a": 1.0})),
+            (
+                json!({"prefixItems": [{"type": "integer"}], "items": {"type": "number"}}),
+                json!([1.0, 1]),
+                json!([1, 1.0]),
+            ),
+            (
+                json!({"properties": {"a": {"type": "number"}}}),
+                json!({"a": 1, "b": 1.0}),
+                json!({"a": 1.0, "b": 1}),
+            ),
+            (
+                json!({"additionalProperties": {"type": "number"}}),
+                json!({"a": 1}),
+                json!({"a": 1.0}),
+            ),
             (json!({}), json!(2.0), json!(2)),
             (json!({"enum": [1, 2]}), json!(2.0), json!(2)),
             (json!({"type": "string"}), json!("2"), json!("2")),
             (json!({"$ref": "#/$defs/Deep"}), json!([[], [[]]]), json!([[], [[]]])),
             (json!(true), json!(2.0), json!(2)),
         ] {
-            assert_eq!(Reader::new(&root).read(&schema, &value), expected, "{schema} reads {value}");
+            assert_eq!(
+                Reader::new(&root).read(&schema, &value),
+                expected,
+                "{schema} reads {value}"
+            );
         }
     }
 }

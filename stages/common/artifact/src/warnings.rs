@@ -1,7 +1,8 @@
 /// How a line begins that warns: on stderr, in a log and in a summary.
 pub const WARNING: &str = "warning: ";
 
-/// A summary, and a line for each warning below it: the runner prints both at the end, and pages show the warnings.
+/// A summary, and a line for each warning below it: the runner prints both at the end, and pages
+/// show the warnings.
 pub fn with_warnings(summary: &str, warnings: &[String]) -> String {
     let lines = warnings.iter().map(|warning| format!("\n{WARNING}{warning}"));
     std::iter::once(summary.to_owned()).chain(lines).collect()

@@ -1,5 +1,5 @@
-//! Random numbers as a function of a seed, a purpose and a counter (Salmon et al. 2011), so that any thread may draw any of
-//! them at any time.
+//! Random numbers as a function of a seed, a purpose and a counter (Salmon et al. 2011), so that
+//! any thread may draw any of them at any time.
 //!
 //! ```
 //! use counter_rng::{CounterRng, uniform};

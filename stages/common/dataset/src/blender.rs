@@ -5,11 +5,13 @@ use artifact::counted;
 use crate::transforms::{self, Missing};
 use crate::{Dataset, DatasetError, Format, Split, is_file};
 
-/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic scenes. An image that isn't
-/// there is an error, and names may leave out `.png`. Without test views the folder doesn't say which views are for testing.
+/// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic
+/// scenes. An image that isn't there is an error, and names may leave out `.png`. Without test
+/// views the folder doesn't say which views are for testing.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("transforms_train.json");
-    let mut frames = transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;
+    let mut frames =
+        transforms::read_file(folder, &path, Missing::Refused)?.not_empty(&path)?.frames;
     let train = frames.len();
     let path = folder.join("transforms_test.json");
     if is_file(&path)? {
@@ -19,7 +21,11 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let notes = vec![if test.is_empty() {
         format!("Blender's form: {}; none is said to be for testing", counted(train.len(), "view"))
     } else {
-        format!("Blender's form: {}, {}", counted(train.len(), "training view"), counted(test.len(), "test view"))
+        format!(
+            "Blender's form: {}, {}",
+            counted(train.len(), "training view"),
+            counted(test.len(), "test view")
+        )
     }];
     let split = (!test.is_empty()).then(|| Split { train: train.collect(), test: test.collect() });
     Ok(Dataset { format: Format::Blender, frames, split, notes })
@@ -94,9 +100,17 @@ mod tests {
         let image = dir.path().join("train/r_0.png");
         std::fs::remove_file(&image).unwrap();
         let message = || Dataset::read(dir.path()).unwrap_err().to_string();
-        assert!(message().ends_with("r_0.png is not there; remove the frame or restore the file"), "{}", message());
+        assert!(
+            message().ends_with("r_0.png is not there; remove the frame or restore the file"),
+            "{}",
+            message()
+        );
         std::os::unix::fs::symlink("r_0.png", &image).unwrap();
-        assert!(message().contains("r_0.png is a symbolic link that leads nowhere"), "{}", message());
+        assert!(
+            message().contains("r_0.png is a symbolic link that leads nowhere"),
+            "{}",
+            message()
+        );
         std::fs::remove_file(&image).unwrap();
         std::fs::create_dir(&image).unwrap();
         assert!(message().contains("r_0.png is a folder, not an image"), "{}", message());
@@ -108,7 +122,11 @@ mod tests {
         let title = r"\u001b]0;PWN\u0007\n";
         let dir = folder(&with_pose("1").replace("r_0", title));
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
-        assert!(!message.contains(char::is_control) && message.contains(r"(./train/\u{1b}]0;PWN\u{7}\n)"), "{message}");
+        assert!(
+            !message.contains(char::is_control)
+                && message.contains(r"(./train/\u{1b}]0;PWN\u{7}\n)"),
+            "{message}"
+        );
         write_png(&dir.path().join("train/\u{1b}]0;PWN\u{7}\n.png"), 10, 6);
         assert_eq!(Dataset::read(dir.path()).unwrap().frames[0].name, "_]0;PWN__");
     }
@@ -116,11 +134,20 @@ mod tests {
     #[test]
     fn bad_ones_are_named() {
         for (json, words) in [
-            (with_pose("NaN"), "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is NaN"),
-            (with_pose("Infinity"), "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is infinite"),
+            (
+                with_pose("NaN"),
+                "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is NaN",
+            ),
+            (
+                with_pose("Infinity"),
+                "frame 0 (./train/r_0): transform_matrix: camera_to_world[0][0] is infinite",
+            ),
             (with_pose("-Infinity"), "camera_to_world[0][0] is infinite"),
             (with_pose("-1"), "transform_matrix: camera_to_world is a reflection"),
-            (with_pose("1").replace("1,4]", "1,1e30]"), "transform_matrix: the camera's centre (0e0, 0e0, 1e30)"),
+            (
+                with_pose("1").replace("1,4]", "1,1e30]"),
+                "transform_matrix: the camera's centre (0e0, 0e0, 1e30)",
+            ),
             (with_pose("1").replace("0.7", "NaN"), "camera_angle_x is NaN"),
             (format!("\u{feff}\u{feff}{}", with_pose("1")), "line 1"),
             (with_pose("2"), "no rigid motion"),

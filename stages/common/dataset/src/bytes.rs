@@ -2,7 +2,8 @@ use std::path::Path;
 
 use crate::DatasetError;
 
-/// Little-endian numbers from a binary file, with its place in every complaint. Nothing is allocated by what the file claims.
+/// Little-endian numbers from a binary file, with its place in every complaint. Nothing is
+/// allocated by what the file claims.
 pub(crate) struct Bytes<'a> {
     path: &'a Path,
     rest: &'a [u8],
@@ -20,7 +21,9 @@ impl<'a> Bytes<'a> {
 
     pub(crate) fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8], DatasetError> {
         let Some((taken, rest)) = self.rest.split_at_checked(count) else {
-            return Err(self.error(format!("the file ends within {what}; it is cut short, copy it again")));
+            return Err(
+                self.error(format!("the file ends within {what}; it is cut short, copy it again"))
+            );
         };
         self.rest = rest;
         self.at += count;
@@ -55,7 +58,10 @@ impl<'a> Bytes<'a> {
     pub(crate) fn count(&mut self, size: usize, what: &str) -> Result<usize, DatasetError> {
         let count = self.u64(what)?;
         if count > (self.rest.len() / size.max(1)) as u64 {
-            return Err(self.error(format!("{count} {what} can't be in the {} bytes that follow", self.rest.len())));
+            return Err(self.error(format!(
+                "{count} {what} can't be in the {} bytes that follow",
+                self.rest.len()
+            )));
         }
         Ok(count as usize)
     }
@@ -67,7 +73,10 @@ impl<'a> Bytes<'a> {
         };
         let bytes = &self.take(end + 1, what)?[..end];
         std::str::from_utf8(bytes).map_err(|_| {
-            self.error(format!("{what}, {}, is not UTF-8; rename the file, and make the model again", bytes.escape_ascii()))
+            self.error(format!(
+                "{what}, {}, is not UTF-8; rename the file, and make the model again",
+                bytes.escape_ascii()
+            ))
         })
     }
 

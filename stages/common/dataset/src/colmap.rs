@@ -37,7 +37,8 @@ pub(crate) fn models(folder: &Path) -> Option<Vec<PathBuf>> {
     (!found.is_empty()).then_some(found)
 }
 
-/// The camera of the first model below `sparse`, where that has one alone. What images the model has isn't looked at.
+/// The camera of the first model below `sparse`, where that has one alone. What images the model
+/// has isn't looked at.
 pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetError> {
     let mut model = Model::default();
     if let Some(first) = with_list(folder, "cameras").first() {
@@ -50,7 +51,8 @@ pub(crate) fn only_camera(folder: &Path) -> Result<Option<Intrinsics>, DatasetEr
 /// `sparse` and the folders in it that have a list of such things, binary or as text, in order.
 fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
     let sparse = folder.join("sparse");
-    let mut found: Vec<PathBuf> = std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
+    let mut found: Vec<PathBuf> =
+        std::fs::read_dir(&sparse).into_iter().flatten().flatten().map(|e| e.path()).collect();
     found.sort();
     found.insert(0, sparse);
     found.retain(|p| ["bin", "txt"].iter().any(|e| p.join(things).with_extension(e).is_file()));
@@ -63,13 +65,19 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
     let mut sizes = Vec::new();
     for path in models {
         let model = Model::read(path)?;
-        sizes.push(format!("{} has {}", path.strip_prefix(folder).unwrap_or(path).display(), model.images.len()));
+        sizes.push(format!(
+            "{} has {}",
+            path.strip_prefix(folder).unwrap_or(path).display(),
+            model.images.len()
+        ));
         if chosen.as_ref().is_none_or(|(_, best)| model.images.len() > best.images.len()) {
             chosen = Some((path, model));
         }
     }
-    let (path, mut model) = chosen.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
-    let list = path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
+    let (path, mut model) =
+        chosen.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
+    let list =
+        path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
     // By name: the order in which COLMAP happened to register them means nothing.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
     let mut notes = vec![format!(
@@ -78,12 +86,22 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
         path.strip_prefix(folder).unwrap_or(path).display()
     )];
     if models.len() > 1 {
-        notes.push(format!("of {} models the one with most images is taken: {}", models.len(), sizes.join(", ")));
+        notes.push(format!(
+            "of {} models the one with most images is taken: {}",
+            models.len(),
+            sizes.join(", ")
+        ));
     }
-    let root = if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
+    let root =
+        if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
     let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     for (index, image) in model.images.iter().enumerate() {
-        let of_frame = |reason: String| DatasetError::Frame { path: list.clone(), index, file: image.name.clone(), reason };
+        let of_frame = |reason: String| DatasetError::Frame {
+            path: list.clone(),
+            index,
+            file: image.name.clone(),
+            reason,
+        };
         let file = relative_path(&image.name).map_err(of_frame)?;
         match find(&root.join(&file), "an image") {
             Found::File => {}
@@ -91,20 +109,30 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
                 missing.push(&image.name);
                 continue;
             }
-            Found::Other(reason) => return Err(of_frame(format!("{reason}; put the photograph there"))),
+            Found::Other(reason) => {
+                return Err(of_frame(format!("{reason}; put the photograph there")));
+            }
         }
         frames.push(model.frame(image, root.join(&file)).map_err(of_frame)?);
         files.push(file);
     }
     if frames.is_empty() {
         let reason = match missing.first() {
-            Some(first) => format!("not one of its {} images is in {}, first {first}", missing.len(), shown(&root)),
+            Some(first) => format!(
+                "not one of its {} images is in {}, first {first}",
+                missing.len(),
+                shown(&root)
+            ),
             None => "it has no images; at least one is needed".to_owned(),
         };
         return Err(DatasetError::format(&list, reason));
     }
     if let Some(first) = missing.first() {
-        notes.push(format!("{} of {} images have no picture and are left out, first {first}", missing.len(), model.images.len()));
+        notes.push(format!(
+            "{} of {} images have no picture and are left out, first {first}",
+            missing.len(),
+            model.images.len()
+        ));
     }
     for (frame, name) in frames.iter_mut().zip(names(&list, &files)?) {
         frame.name = name;
@@ -118,7 +146,8 @@ fn bytes_of(folder: &Path, name: &str) -> Result<Option<(PathBuf, Vec<u8>)>, Dat
     if !path.is_file() {
         return Ok(None);
     }
-    let bytes = std::fs::read(&path).map_err(|source| DatasetError::Io { path: path.clone(), source })?;
+    let bytes =
+        std::fs::read(&path).map_err(|source| DatasetError::Io { path: path.clone(), source })?;
     Ok(Some((path, bytes)))
 }
 
@@ -151,11 +180,13 @@ impl Model {
             let model = bytes.u32("a camera")?;
             let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
             let Some((name, count)) = MODELS.get(model as usize) else {
-                return Err(bytes.error(format!("camera {id} has model {model}, which COLMAP doesn't have")));
+                return Err(bytes
+                    .error(format!("camera {id} has model {model}, which COLMAP doesn't have")));
             };
-            let parameters = (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
-            let intrinsics =
-                intrinsics(name, width, height, &parameters).map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
+            let parameters =
+                (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
+            let intrinsics = intrinsics(name, width, height, &parameters)
+                .map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
             self.cameras.insert(id, intrinsics);
         }
         end(bytes, "cameras")
@@ -167,13 +198,20 @@ impl Model {
             let (turn, translation) = (bytes.f64s::<4>("an image")?, bytes.f64s::<3>("an image")?);
             let camera = bytes.u32("an image")?;
             let name = bytes.text("an image's name")?.to_owned();
-            let rotation = rotation(turn).map_err(|reason| bytes.error(format!("image {id} ({name}): {reason}")))?;
+            let rotation = rotation(turn)
+                .map_err(|reason| bytes.error(format!("image {id} ({name}): {reason}")))?;
             let mut points = Vec::new();
             for _ in 0..bytes.count(24, "points of an image")? {
                 bytes.take(16, "a point of an image")?;
                 points.push(bytes.u64("a point of an image")?);
             }
-            self.images.push(Image { rotation, translation: translation.into(), camera, name, points });
+            self.images.push(Image {
+                rotation,
+                translation: translation.into(),
+                camera,
+                name,
+                points,
+            });
         }
         end(bytes, "images")
     }
@@ -194,8 +232,11 @@ impl Model {
             let id = line.number(0, "camera id")?;
             let name = line.words.get(1).copied().unwrap_or_default();
             let (width, height) = (line.number(2, "width")?, line.number(3, "height")?);
-            let parameters = (4..line.words.len()).map(|i| line.number(i, "parameter")).collect::<Result<Vec<f64>, _>>()?;
-            let intrinsics = intrinsics(name, width, height, &parameters).map_err(|reason| line.error(reason))?;
+            let parameters = (4..line.words.len())
+                .map(|i| line.number(i, "parameter"))
+                .collect::<Result<Vec<f64>, _>>()?;
+            let intrinsics = intrinsics(name, width, height, &parameters)
+                .map_err(|reason| line.error(reason))?;
             self.cameras.insert(id, intrinsics);
         }
         Ok(())
@@ -212,8 +253,11 @@ impl Model {
             let turn = [1, 2, 3, 4].map(|i| line.number(i, "rotation"));
             let [w, x, y, z] = turn;
             let rotation = rotation([w?, x?, y?, z?]).map_err(|reason| line.error(reason))?;
-            let translation =
-                DVec3::new(line.number(5, "translation")?, line.number(6, "translation")?, line.number(7, "translation")?);
+            let translation = DVec3::new(
+                line.number(5, "translation")?,
+                line.number(6, "translation")?,
+                line.number(7, "translation")?,
+            );
             let camera = line.number(8, "camera id")?;
             if line.words.len() < 10 {
                 return Err(line.error("an image's name is missing"));
@@ -242,9 +286,13 @@ impl Model {
     }
 
     fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, String> {
-        let camera = self.cameras.get(&image.camera).ok_or_else(|| format!("there is no camera {}", image.camera))?;
+        let camera = self
+            .cameras
+            .get(&image.camera)
+            .ok_or_else(|| format!("there is no camera {}", image.camera))?;
         let stored = look(&file).map_err(|e| e.to_string())?;
-        let (taken_with, turned) = fitted(*camera, stored).map_err(|reason| format!("{reason} (camera {})", image.camera))?;
+        let (taken_with, turned) = fitted(*camera, stored)
+            .map_err(|reason| format!("{reason} (camera {})", image.camera))?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let depths = depths(image, &self.points);
         let frame = Frame {
@@ -266,7 +314,8 @@ impl Model {
 fn depths(image: &Image, points: &BTreeMap<u64, DVec3>) -> Option<[f64; 2]> {
     let seen: BTreeSet<u64> = image.points.iter().copied().collect();
     let depth = |id: &u64| points.get(id).map(|p| (image.rotation * *p + image.translation).z);
-    let mut depths: Vec<f64> = seen.iter().filter_map(depth).filter(|d| d.is_finite() && *d > 0.0).collect();
+    let mut depths: Vec<f64> =
+        seen.iter().filter_map(depth).filter(|d| d.is_finite() && *d > 0.0).collect();
     depths.sort_unstable_by(f64::total_cmp);
     let last = depths.len().checked_sub(1)?;
     let share = |s: f64| depths[(s * last as f64).round() as usize];
@@ -289,23 +338,44 @@ const MODELS: [(&str, usize); 11] = [
     ("THIN_PRISM_FISHEYE", 12),
 ];
 
-fn intrinsics(model: &str, width: u64, height: u64, parameters: &[f64]) -> Result<Intrinsics, String> {
-    let size = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0).ok_or_else(|| format!("its size is {width}×{height}"));
-    let (columns, rows) = (size(width)?, size(height)?);
-    let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) = match (model, parameters) {
-        ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 3], [0.0; 2]),
-        ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], [0.0; 3], [0.0; 2]),
-        ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], [k, 0.0, 0.0], [0.0; 2]),
-        ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], [k1, k2, 0.0], [0.0; 2]),
-        ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => ([fx, fy], [cx, cy], [k1, k2, 0.0], [p1, p2]),
-        _ => match MODELS.iter().find(|(name, _)| *name == model) {
-            Some((_, count)) if *count != parameters.len() => {
-                return Err(format!("{model} has {count} parameters, not {}", parameters.len()));
-            }
-            Some(_) => return Err(format!("camera model {model} is not supported; undistort first (colmap image_undistorter)")),
-            None => return Err(format!("camera model {model:?} is none of COLMAP's")),
-        },
+fn intrinsics(
+    model: &str,
+    width: u64,
+    height: u64,
+    parameters: &[f64],
+) -> Result<Intrinsics, String> {
+    let size = |value: u64| {
+        u32::try_from(value)
+            .ok()
+            .filter(|v| *v > 0)
+            .ok_or_else(|| format!("its size is {width}×{height}"))
     };
+    let (columns, rows) = (size(width)?, size(height)?);
+    let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) =
+        match (model, parameters) {
+            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 3], [0.0; 2]),
+            ("PINHOLE", &[fx, fy, cx, cy]) => ([fx, fy], [cx, cy], [0.0; 3], [0.0; 2]),
+            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], [k, 0.0, 0.0], [0.0; 2]),
+            ("RADIAL", &[f, cx, cy, k1, k2]) => ([f, f], [cx, cy], [k1, k2, 0.0], [0.0; 2]),
+            ("OPENCV", &[fx, fy, cx, cy, k1, k2, p1, p2]) => {
+                ([fx, fy], [cx, cy], [k1, k2, 0.0], [p1, p2])
+            }
+            _ => match MODELS.iter().find(|(name, _)| *name == model) {
+                Some((_, count)) if *count != parameters.len() => {
+                    return Err(format!(
+                        "{model} has {count} parameters, not {}",
+                        parameters.len()
+                    ));
+                }
+                Some(_) => {
+                    return Err(format!(
+                        "camera model {model} is not supported; undistort first (colmap \
+                    image_undistorter)"
+                    ));
+                }
+                None => return Err(format!("camera model {model:?} is none of COLMAP's")),
+            },
+        };
     let ([fx, fy], [cx, cy], distortion) = (focal, centre, Distortion { radial, tangential });
     Ok(Intrinsics { width: columns, height: rows, fx, fy, cx, cy, distortion })
 }
@@ -338,7 +408,11 @@ struct Line<'a> {
 impl<'a> Line<'a> {
     fn all(path: &'a Path, text: &'a str) -> impl Iterator<Item = Self> {
         let lines = text.lines().enumerate().filter(|(_, line)| !line.starts_with('#'));
-        lines.map(move |(i, line)| Self { path, number: i + 1, words: line.split_whitespace().collect() })
+        lines.map(move |(i, line)| Self {
+            path,
+            number: i + 1,
+            words: line.split_whitespace().collect(),
+        })
     }
 
     fn error(&self, reason: impl std::fmt::Display) -> DatasetError {
@@ -346,8 +420,11 @@ impl<'a> Line<'a> {
     }
 
     fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> Result<T, DatasetError> {
-        let Some(word) = self.words.get(index) else { return Err(self.error(format!("{what} is missing"))) };
-        word.parse().map_err(|_| self.error(format!("{what}: {word:?} is not a number of its kind")))
+        let Some(word) = self.words.get(index) else {
+            return Err(self.error(format!("{what} is missing")));
+        };
+        word.parse()
+            .map_err(|_| self.error(format!("{what}: {word:?} is not a number of its kind")))
     }
 }
 
@@ -356,16 +433,18 @@ mod tests {
     use super::*;
     use crate::photograph::tests::write_png;
 
-    const CAMERAS: &str =
-        "# Camera list\n1 SIMPLE_RADIAL 80 60 70 40 30 -0.1\n2 OPENCV 80 60 70 71 41 29 0.1 0.01 0.001 -0.002\n";
-    const IMAGES: &str = "# Image list\n7 1 0 0 0 0 0 3 1 b 1.png\n10 10 5 20 20 6 30 30 -1\n3 0 0 0 2 1 2 3 2 a.png\n\n";
+    const CAMERAS: &str = "# Camera list\n1 SIMPLE_RADIAL 80 60 70 40 30 -0.1\n2 OPENCV 80 60 70 \
+        71 41 29 0.1 0.01 0.001 -0.002\n";
+    const IMAGES: &str = "# Image list\n7 1 0 0 0 0 0 3 1 b 1.png\n10 10 5 20 20 6 30 30 -1\n3 0 \
+        0 0 2 1 2 3 2 a.png\n\n";
     const POINTS: &str = "5 0 0 1 255 0 0 0.1 7 0\n6 0 0 2 255 0 0 0.1 7 1\n";
 
     fn binary() -> [Vec<u8>; 3] {
         let mut cameras = 2u64.to_le_bytes().to_vec();
-        for (id, model, parameters) in
-            [(1u32, 2u32, &[70., 40., 30., -0.1][..]), (2, 4, &[70., 71., 41., 29., 0.1, 0.01, 0.001, -0.002])]
-        {
+        for (id, model, parameters) in [
+            (1u32, 2u32, &[70., 40., 30., -0.1][..]),
+            (2, 4, &[70., 71., 41., 29., 0.1, 0.01, 0.001, -0.002]),
+        ] {
             cameras.extend([id.to_le_bytes(), model.to_le_bytes()].concat());
             cameras.extend([80u64.to_le_bytes(), 60u64.to_le_bytes()].concat());
             cameras.extend(parameters.iter().flat_map(|p: &f64| p.to_le_bytes()));
@@ -416,50 +495,94 @@ mod tests {
 
     const SIMPLE: Distortion = Distortion { radial: [-0.1, 0.0, 0.0], tangential: [0.0; 2] };
 
-    fn text<'a>(cameras: &'a str, images: &'a str, points: &'a str) -> [(&'static str, &'a [u8]); 3] {
-        [("cameras.txt", cameras.as_bytes()), ("images.txt", images.as_bytes()), ("points3D.txt", points.as_bytes())]
+    fn text<'a>(
+        cameras: &'a str,
+        images: &'a str,
+        points: &'a str,
+    ) -> [(&'static str, &'a [u8]); 3] {
+        [
+            ("cameras.txt", cameras.as_bytes()),
+            ("images.txt", images.as_bytes()),
+            ("points3D.txt", points.as_bytes()),
+        ]
     }
 
     #[test]
     fn binary_and_text_are_the_same() {
         let [cameras, images, points] = binary();
-        let binary = folder("sparse/0", &[("cameras.bin", &cameras), ("images.bin", &images), ("points3D.bin", &points)]);
+        let binary = folder(
+            "sparse/0",
+            &[("cameras.bin", &cameras), ("images.bin", &images), ("points3D.bin", &points)],
+        );
         let text = folder("sparse/0", &text(CAMERAS, IMAGES, POINTS));
-        let (one, other) = (Dataset::read(binary.path()).unwrap(), Dataset::read(text.path()).unwrap());
+        let (one, other) =
+            (Dataset::read(binary.path()).unwrap(), Dataset::read(text.path()).unwrap());
         assert_eq!(one.notes, other.notes);
-        assert!(one.notes.contains(&"2 photographs have lens distortion".to_owned()), "{:?}", one.notes);
+        assert!(
+            one.notes.contains(&"2 photographs have lens distortion".to_owned()),
+            "{:?}",
+            one.notes
+        );
         let relative = |set: &Dataset| -> Vec<Frame> {
-            set.frames.iter().map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() }).collect()
+            set.frames
+                .iter()
+                .map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() })
+                .collect()
         };
         assert_eq!(relative(&one), relative(&other));
         let [a, b] = &one.frames[..] else { panic!("two frames") };
         assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
-        // Images of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0, 1) at depth 1 + 3.
+        // Images of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0,
+        // 1) at depth 1 + 3.
         assert_eq!(
             b.taken_with,
-            Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0, distortion: SIMPLE }
+            Intrinsics {
+                width: 40,
+                height: 30,
+                fx: 35.0,
+                fy: 35.0,
+                cx: 20.0,
+                cy: 15.0,
+                distortion: SIMPLE
+            }
         );
         assert_eq!(b.depths, Some([4.0, 5.0]));
         assert_eq!(b.camera_to_world, [[1., 0., 0., 0.], [0., -1., 0., 0.], [0., 0., -1., -3.]]);
-        assert_eq!(a.taken_with.distortion, Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] });
+        assert_eq!(
+            a.taken_with.distortion,
+            Distortion { radial: [0.1, 0.01, 0.0], tangential: [0.001, -0.002] }
+        );
         assert_eq!(a.depths, None);
-        assert!((a.camera_to_world[0][3] - 1.0).abs() < 1e-12 && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12);
+        assert!(
+            (a.camera_to_world[0][3] - 1.0).abs() < 1e-12
+                && (a.camera_to_world[2][3] + 3.0).abs() < 1e-12
+        );
     }
 
     /// As an editor on Windows leaves them.
     #[test]
     fn text_may_have_a_mark_and_other_line_ends() {
-        let changed = [CAMERAS, IMAGES, POINTS].map(|text| format!("\u{feff}{}", text.replace('\n', "\r\n")));
+        let changed =
+            [CAMERAS, IMAGES, POINTS].map(|text| format!("\u{feff}{}", text.replace('\n', "\r\n")));
         let (plain, other) = (
             folder("sparse/0", &text(CAMERAS, IMAGES, POINTS)),
             folder("sparse/0", &text(&changed[0], &changed[1], &changed[2])),
         );
         let poses = |dir: &tempfile::TempDir| -> Vec<_> {
             let frames = Dataset::read(dir.path()).unwrap().frames;
-            frames.into_iter().map(|f| (f.name, f.taken_with, f.camera_to_world, f.depths)).collect()
+            frames
+                .into_iter()
+                .map(|f| (f.name, f.taken_with, f.camera_to_world, f.depths))
+                .collect()
         };
         assert_eq!(poses(&plain), poses(&other));
-        let latin = folder("sparse/0", &[("cameras.txt", CAMERAS.as_bytes()), ("images.txt", b"1 1 0 0 0 0 0 3 1 \xe4.png\n\n")]);
+        let latin = folder(
+            "sparse/0",
+            &[
+                ("cameras.txt", CAMERAS.as_bytes()),
+                ("images.txt", b"1 1 0 0 0 0 0 3 1 \xe4.png\n\n"),
+            ],
+        );
         let message = Dataset::read(latin.path()).unwrap_err().to_string();
         assert!(message.contains(r"images.txt: line 1: \xe4.png is not UTF-8"), "{message}");
     }
@@ -477,10 +600,16 @@ mod tests {
 
     #[test]
     fn mistakes_are_named() {
-        let reads = |cameras: &str, images: &str| Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path());
+        let reads = |cameras: &str, images: &str| {
+            Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path())
+        };
         for (from, to, words) in [
             ("SIMPLE_RADIAL", "FOV", "line 2: FOV has 5 parameters"),
-            ("SIMPLE_RADIAL 80 60 70 40 30 -0.1", "SIMPLE_RADIAL_FISHEYE 80 60 70 40 30 -0.1", "not supported"),
+            (
+                "SIMPLE_RADIAL 80 60 70 40 30 -0.1",
+                "SIMPLE_RADIAL_FISHEYE 80 60 70 40 30 -0.1",
+                "not supported",
+            ),
             ("SIMPLE_RADIAL", "ROUND", "none of COLMAP's"),
             ("1 SIMPLE_RADIAL", "9 SIMPLE_RADIAL", "frame 1 (b 1.png): there is no camera 1"),
             ("80 60 70 40", "0 60 70 40", "its size is 0×60"),
@@ -502,19 +631,29 @@ mod tests {
             assert!(message.contains(words), "{message}");
         }
         let gone = reads(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
-        assert!(gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"), "{:?}", gone.notes);
+        assert!(
+            gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"),
+            "{:?}",
+            gone.notes
+        );
         let forged = reads(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
         assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
         let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
         assert!(none.contains("not one of its 2 images"), "{none}");
-        assert!(reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images"));
+        assert!(
+            reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images")
+        );
     }
 
     #[test]
     fn binaries_cut_anywhere_or_with_other_bytes_are_errors_and_no_panic() {
         let whole = binary();
         let read = |files: &[Vec<u8>; 3]| {
-            let named = [("cameras.bin", &files[0][..]), ("images.bin", &files[1][..]), ("points3D.bin", &files[2][..])];
+            let named = [
+                ("cameras.bin", &files[0][..]),
+                ("images.bin", &files[1][..]),
+                ("points3D.bin", &files[2][..]),
+            ];
             Dataset::read(folder("sparse/0", &named).path())
         };
         assert!(read(&whole).is_ok());
@@ -532,7 +671,9 @@ mod tests {
             }
             let mut longer = whole.clone();
             longer[file].push(0);
-            assert!(read(&longer).unwrap_err().to_string().contains("there is more after the last"));
+            assert!(
+                read(&longer).unwrap_err().to_string().contains("there is more after the last")
+            );
         }
         let mut huge = whole.clone();
         huge[1][..8].copy_from_slice(&u64::MAX.to_le_bytes());

@@ -20,15 +20,26 @@ pub(crate) enum Found {
 pub(crate) fn find(path: &Path, wanted: &str) -> Found {
     match fs::metadata(path) {
         Ok(there) if there.is_file() => Found::File,
-        Ok(there) => Found::Other(format!("{} is {}, not {wanted}", shown(path), kind(there.file_type()))),
+        Ok(there) => {
+            Found::Other(format!("{} is {}, not {wanted}", shown(path), kind(there.file_type())))
+        }
         Err(error) => match (broken_link(path), error.kind()) {
             (Some(link), ErrorKind::NotFound) => {
                 let target = fs::read_link(link).unwrap_or_default();
-                let words = format!("{} is a symbolic link to {}, which is not there", shown(link), shown(&target));
+                let words = format!(
+                    "{} is a symbolic link to {}, which is not there",
+                    shown(link),
+                    shown(&target)
+                );
                 if link == path { Found::Nothing(words) } else { Found::Other(words) }
             }
-            (Some(link), _) => Found::Other(format!("{} is a symbolic link that leads nowhere: {error}", shown(link))),
-            (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => Found::Nothing(format!("{} is not there", shown(path))),
+            (Some(link), _) => Found::Other(format!(
+                "{} is a symbolic link that leads nowhere: {error}",
+                shown(link)
+            )),
+            (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
+                Found::Nothing(format!("{} is not there", shown(path)))
+            }
             (None, _) => Found::Other(format!("{} can't be looked at: {error}", shown(path))),
         },
     }
@@ -38,7 +49,9 @@ pub(crate) fn find(path: &Path, wanted: &str) -> Found {
 fn broken_link(path: &Path) -> Option<&Path> {
     let mut ways: Vec<&Path> = path.ancestors().filter(|way| !way.as_os_str().is_empty()).collect();
     ways.reverse();
-    ways.into_iter().find(|way| fs::symlink_metadata(way).is_ok_and(|m| m.is_symlink()) && fs::metadata(way).is_err())
+    ways.into_iter().find(|way| {
+        fs::symlink_metadata(way).is_ok_and(|m| m.is_symlink()) && fs::metadata(way).is_err()
+    })
 }
 
 fn kind(of: FileType) -> &'static str {

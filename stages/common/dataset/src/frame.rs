@@ -24,9 +24,11 @@ pub struct Frame {
     pub taken_with: Intrinsics,
     /// Where distortion is to be undone, the pinhole camera as whose image it is read.
     pub pinhole: Option<Intrinsics>,
-    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
+    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
+    /// space.
     pub camera_to_world: [[f64; 4]; 3],
-    /// Depth of the nearest and of the farthest point that it is known to see, along its axis, where the data says so.
+    /// Depth of the nearest and of the farthest point that it is known to see, along its axis,
+    /// where the data says so.
     pub depths: Option<[f64; 2]>,
 }
 
@@ -38,10 +40,15 @@ impl Frame {
 
     /// Its camera; [`Frame::photograph`] reads what that sees.
     pub fn camera(&self) -> Camera {
-        Camera { name: self.name.clone(), intrinsics: self.intrinsics(), camera_to_world: self.camera_to_world }
+        Camera {
+            name: self.name.clone(),
+            intrinsics: self.intrinsics(),
+            camera_to_world: self.camera_to_world,
+        }
     }
 
-    /// Refuses what no camera can be. Whether each place in a distorted image has its ray is asked where that matters.
+    /// Refuses what no camera can be. Whether each place in a distorted image has its ray is asked
+    /// where that matters.
     pub(crate) fn check(&self) -> Result<(), CameraError> {
         let distortion = self.taken_with.distortion;
         if !distortion.is_finite() {
@@ -58,22 +65,26 @@ pub(crate) fn pose([right, up, back]: [DVec3; 3], centre: DVec3) -> [[f64; 4]; 3
     [0, 1, 2].map(|k| [right[k], up[k], back[k], centre[k]])
 }
 
-/// The pose of a world-to-camera motion x' = R·x + t with axes right, down, forward (COLMAP, OpenCV).
+/// The pose of a world-to-camera motion x' = R·x + t with axes right, down, forward (COLMAP,
+/// OpenCV).
 pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> [[f64; 4]; 3] {
     let back = rotation.transpose();
     pose([back.x_axis, -back.y_axis, -back.z_axis], -(back * translation))
 }
 
-/// Names for images, by their paths inside the data set: the files' names alone where those differ, else with their folders.
+/// Names for images, by their paths inside the data set: the files' names alone where those differ,
+/// else with their folders.
 pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
     let text = |index: usize, part: Option<&std::ffi::OsStr>| {
         // Names become files' names and are printed everywhere: no control characters.
-        part.and_then(|p| p.to_str()).map(|name| name.replace(char::is_control, "_")).ok_or_else(|| DatasetError::Frame {
-            path: list.to_path_buf(),
-            index,
-            file: shown(&paths[index]),
-            reason: "its name is not UTF-8; rename the file".to_owned(),
-        })
+        part.and_then(|p| p.to_str()).map(|name| name.replace(char::is_control, "_")).ok_or_else(
+            || DatasetError::Frame {
+                path: list.to_path_buf(),
+                index,
+                file: shown(&paths[index]),
+                reason: "its name is not UTF-8; rename the file".to_owned(),
+            },
+        )
     };
     let stem = |(index, path): (usize, &PathBuf)| text(index, path.file_stem());
     let short = paths.iter().enumerate().map(stem).collect::<Result<Vec<_>, _>>()?;
@@ -82,7 +93,8 @@ pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, Datas
     }
     let joined = |(index, path): (usize, &PathBuf)| {
         let whole = path.with_extension("");
-        let parts = whole.iter().map(|part| text(index, Some(part))).collect::<Result<Vec<_>, _>>()?;
+        let parts =
+            whole.iter().map(|part| text(index, Some(part))).collect::<Result<Vec<_>, _>>()?;
         Ok(parts.join("_"))
     };
     let long = paths.iter().enumerate().map(joined).collect::<Result<Vec<_>, DatasetError>>()?;
@@ -109,15 +121,31 @@ mod tests {
 
     #[test]
     fn names_are_as_short_as_can_be() {
-        let of = |paths: &[&str]| names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>());
+        let of = |paths: &[&str]| {
+            names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
+        };
         assert_eq!(of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
         assert_eq!(of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
-        assert!(of(&["x/a.jpg", "x/a.png"]).unwrap_err().to_string().contains("frame 1 (x/a.png): a second view named \"a\""));
+        assert!(
+            of(&["x/a.jpg", "x/a.png"])
+                .unwrap_err()
+                .to_string()
+                .contains("frame 1 (x/a.png): a second view named \"a\"")
+        );
         assert_eq!(of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
-        assert!(of(&["a\n.png", "a\t.png"]).unwrap_err().to_string().contains("frame 1 (a\\t.png): a second view named \"a_\""));
-        let odd = <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
+        assert!(
+            of(&["a\n.png", "a\t.png"])
+                .unwrap_err()
+                .to_string()
+                .contains("frame 1 (a\\t.png): a second view named \"a_\"")
+        );
+        let odd =
+            <std::ffi::OsStr as std::os::unix::ffi::OsStrExt>::from_bytes(b"images/\xff\xfe.png");
         let message = names("list".as_ref(), &[PathBuf::from(odd)]).unwrap_err().to_string();
-        assert_eq!(message, "list: frame 0 (images/\\xFF\\xFE.png): its name is not UTF-8; rename the file");
+        assert_eq!(
+            message,
+            "list: frame 0 (images/\\xFF\\xFE.png): its name is not UTF-8; rename the file"
+        );
     }
 
     /// A point in front of an OpenCV camera is seen by ours at the same pixel.
@@ -127,9 +155,20 @@ mod tests {
         let translation = DVec3::new(0.2, -0.4, 3.0);
         let point = DVec3::new(0.3, 0.1, -0.2);
         let seen = rotation * point + translation;
-        let intrinsics =
-            scene::Intrinsics { width: 100, height: 80, fx: 90.0, fy: 95.0, cx: 48.0, cy: 41.0, distortion: Default::default() };
-        let camera = Camera { name: "c".into(), intrinsics, camera_to_world: pose_from_world_to_camera(rotation, translation) };
+        let intrinsics = scene::Intrinsics {
+            width: 100,
+            height: 80,
+            fx: 90.0,
+            fy: 95.0,
+            cx: 48.0,
+            cy: 41.0,
+            distortion: Default::default(),
+        };
+        let camera = Camera {
+            name: "c".into(),
+            intrinsics,
+            camera_to_world: pose_from_world_to_camera(rotation, translation),
+        };
         let (x, y, depth) = camera.project(point).unwrap();
         assert!((x - (48.0 + 90.0 * seen.x / seen.z)).abs() < 1e-9);
         assert!((y - (41.0 + 95.0 * seen.y / seen.z)).abs() < 1e-9);

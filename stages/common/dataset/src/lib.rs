@@ -1,16 +1,21 @@
 //! Posed photographs as folders have them. The form is found by looking: [`Dataset::read`] takes
 //!
-//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json`, `transforms_test.json` if there are test views, one angle for all, PNG;
-//! * **transforms** (instant-ngp, nerfstudio): `transforms.json`, intrinsics for all or for each, lens distortion, masks;
+//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json`, `transforms_test.json` if
+//!   there are test views, one angle for all, PNG;
+//! * **transforms** (instant-ngp, nerfstudio): `transforms.json`, intrinsics for all or for each,
+//!   lens distortion, masks;
 //! * **LLFF**: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …);
-//! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one with most images.
+//! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one
+//!   with most images.
 //!
-//! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left corner, scene units) and its
-//! lens's distortion; [`Frame::photograph`] reads its image, upright as its poses have it. [`Dataset::undistorted`] has images
-//! read as pinhole cameras would have taken them.
+//! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
+//! corner, scene units) and its lens's distortion; [`Frame::photograph`] reads its image, upright
+//! as its poses have it. [`Dataset::undistorted`] has images read as pinhole cameras would have
+//! taken them.
 //!
-//! Units: lengths are those of the poses; pixels count from the stored image's top left corner, whose first pixel has its centre
-//! at (0.5, 0.5). Everything a file says is checked: sizes before anything is allocated, paths before anything is opened.
+//! Units: lengths are those of the poses; pixels count from the stored image's top left corner,
+//! whose first pixel has its centre at (0.5, 0.5). Everything a file says is checked: sizes before
+//! anything is allocated, paths before anything is opened.
 //!
 //! ```no_run
 //! let set = dataset::Dataset::read("my-photographs".as_ref())?;
@@ -83,7 +88,8 @@ impl fmt::Display for Format {
 pub enum DatasetError {
     /// The folder has none of the forms.
     #[error(
-        "{}: no data set; expected transforms_train.json (Blender), transforms.json (instant-ngp, nerfstudio), poses_bounds.npy \
+        "{}: no data set; expected transforms_train.json (Blender), transforms.json (instant-ngp, \
+        nerfstudio), poses_bounds.npy \
          (LLFF), or sparse/0 (COLMAP)",
         shown(path)
     )]
@@ -165,12 +171,13 @@ impl Dataset {
         Ok(set)
     }
 
-    /// All frames together, whatever the folder itself says of their use. Blender's training and test views have the same names: then
-    /// the one for testing is called `test_NAME`.
+    /// All frames together, whatever the folder itself says of their use. Blender's training and
+    /// test views have the same names: then the one for testing is called `test_NAME`.
     #[must_use]
     pub fn merged(mut self) -> Self {
         let split = self.split.take().unwrap_or_default();
-        let mut taken: std::collections::BTreeSet<String> = split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
+        let mut taken: std::collections::BTreeSet<String> =
+            split.train.iter().map(|&i| self.frames[i].name.clone()).collect();
         for &i in &split.test {
             let name = &mut self.frames[i].name;
             while !taken.insert(name.clone()) {
@@ -180,8 +187,8 @@ impl Dataset {
         self
     }
 
-    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would have taken, of the same
-    /// size, with a border cut off where the lens saw no more.
+    /// Has images read with their lens's distortion undone: resampled to what pinhole cameras would
+    /// have taken, of the same size, with a border cut off where the lens saw no more.
     pub fn undistorted(mut self) -> Result<Self, DatasetError> {
         let mut undone = 0;
         for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
@@ -196,7 +203,8 @@ impl Dataset {
             frame.pinhole = Some(pinhole);
         }
         if undone > 0 {
-            self.notes.push(format!("lens distortion of {} is undone", counted(undone, "photograph")));
+            self.notes
+                .push(format!("lens distortion of {} is undone", counted(undone, "photograph")));
         }
         Ok(self)
     }
@@ -210,7 +218,8 @@ impl Dataset {
             ignored += 1;
         }
         if ignored > 0 {
-            self.notes.push(format!("lens distortion of {} is ignored", counted(ignored, "photograph")));
+            self.notes
+                .push(format!("lens distortion of {} is ignored", counted(ignored, "photograph")));
         }
         self
     }
@@ -218,7 +227,8 @@ impl Dataset {
     /// Says what is done to images that aren't all alike, upright and from a pinhole.
     fn note_what_is_special(&mut self) {
         let count = |is: &dyn Fn(&Frame) -> bool| self.frames.iter().filter(|f| is(f)).count();
-        let (distorted, turned) = (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turned));
+        let (distorted, turned) =
+            (count(&|f| !f.taken_with.distortion.is_none()), count(&|f| f.turned));
         let size = |f: &Frame| (f.taken_with.width, f.taken_with.height);
         let sizes: std::collections::BTreeSet<_> = self.frames.iter().map(size).collect();
         if distorted > 0 {
@@ -227,11 +237,19 @@ impl Dataset {
         }
         if turned > 0 {
             let are = if turned == 1 { "is" } else { "are" };
-            self.notes.push(format!("{} {are} turned upright, as EXIF data ask", counted(turned, "photograph")));
+            self.notes.push(format!(
+                "{} {are} turned upright, as EXIF data ask",
+                counted(turned, "photograph")
+            ));
         }
         if let (Some(first), Some(last), true) = (sizes.first(), sizes.last(), sizes.len() > 1) {
             let text = |(w, h): &(u32, u32)| format!("{w}×{h}");
-            self.notes.push(format!("photographs of {} sizes, from {} to {}", sizes.len(), text(first), text(last)));
+            self.notes.push(format!(
+                "photographs of {} sizes, from {} to {}",
+                sizes.len(),
+                text(first),
+                text(last)
+            ));
         }
     }
 }

@@ -10,39 +10,49 @@ use crate::frame::{names, pose};
 use crate::photograph::{Stored, fitted, is_image_name, look};
 use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
-/// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal length), near and far.
+/// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal
+/// length), near and far.
 const NUMBERS: usize = 17;
 
 /// Reads `poses_bounds.npy` (Mildenhall et al. 2019) and the images beside it, sorted by name.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("poses_bounds.npy");
     let rows = read_numbers(&path)?;
-    let (images, from) = images(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
-    let files: Vec<PathBuf> = images.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
+    let (images, from) =
+        images(folder, rows.len()).map_err(|reason| DatasetError::format(&path, reason))?;
+    let files: Vec<PathBuf> =
+        images.iter().filter_map(|p| p.strip_prefix(folder).ok().map(Path::to_path_buf)).collect();
     let names = names(&path, &files)?;
     let (distortion, note) = distortion(folder, &rows);
     let mut frames = Vec::with_capacity(rows.len());
     for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
         let file = name.clone();
-        let of_frame = |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
+        let of_frame =
+            |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
         let frame = look(&image)
             .map_err(|e| e.to_string())
             .and_then(|stored| frame(row, distortion, stored, name, image))
             .and_then(|frame| frame.check().map(|()| frame).map_err(|e| e.to_string()));
         frames.push(frame.map_err(of_frame)?);
     }
-    let mut notes = vec![format!("LLFF (poses_bounds.npy): {} from {from}", counted(frames.len(), "photograph"))];
+    let mut notes = vec![format!(
+        "LLFF (poses_bounds.npy): {} from {from}",
+        counted(frames.len(), "photograph")
+    )];
     notes.extend(note);
     Ok(Dataset { format: Format::Llff, frames, split: None, notes })
 }
 
-/// The lens's distortion, which the file doesn't have: the poses come from COLMAP, and hold for the lens that it found. Where its model lies
-/// beside them, with one camera of their focal length, that says it.
+/// The lens's distortion, which the file doesn't have: the poses come from COLMAP, and hold for the
+/// lens that it found. Where its model lies beside them, with one camera of their focal length,
+/// that says it.
 fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<String>) {
     let camera = match colmap::only_camera(folder) {
         Ok(Some(camera)) if !camera.distortion.is_none() => camera,
         Ok(_) => return (Distortion::default(), None),
-        Err(e) => return (Distortion::default(), Some(format!("lens distortion is not known: {e}"))),
+        Err(e) => {
+            return (Distortion::default(), Some(format!("lens distortion is not known: {e}")));
+        }
     };
     let is_theirs = |row: &[f64; NUMBERS]| {
         let (width, focal) = (row[9], row[14]);
@@ -52,23 +62,36 @@ fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<Str
         (camera.distortion, None)
     } else {
         let note = format!(
-            "lens distortion is not known: the model in sparse has another focal length ({} of {} pixels)",
+            "lens distortion is not known: the model in sparse has another focal length ({} of {} \
+            pixels)",
             camera.fx, camera.width
         );
         (Distortion::default(), Some(note))
     }
 }
 
-fn frame(row: &[f64; NUMBERS], distortion: Distortion, stored: Stored, name: String, image: PathBuf) -> Result<Frame, String> {
+fn frame(
+    row: &[f64; NUMBERS],
+    distortion: Distortion,
+    stored: Stored,
+    name: String,
+    image: PathBuf,
+) -> Result<Frame, String> {
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
-    let (down, right, back, centre, inside) = (column(0), column(1), column(2), column(3), column(4));
+    let (down, right, back, centre, inside) =
+        (column(0), column(1), column(2), column(3), column(4));
     let [height, width, focal] = inside.to_array();
     let whole = |value: f64, name: &str| {
-        if (1.0..=f64::from(u32::MAX)).contains(&value) { Ok(value.round() as u32) } else { Err(format!("{name} is {value}")) }
+        if (1.0..=f64::from(u32::MAX)).contains(&value) {
+            Ok(value.round() as u32)
+        } else {
+            Err(format!("{name} is {value}"))
+        }
     };
     let (width, height) = (whole(width, "width")?, whole(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-    let (taken_with, turned) = fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
+    let (taken_with, turned) =
+        fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
         return Err(format!("its bounds are {near} and {far}; 0 < near < far is expected"));
@@ -89,7 +112,8 @@ fn frame(row: &[f64; NUMBERS], distortion: Distortion, stored: Stored, name: Str
 
 /// Images of a folder by name, and what is named like one but can't be read, in words.
 fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
-    let named = std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_image_name(p));
+    let named =
+        std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_image_name(p));
     let mut named: Vec<PathBuf> = named.collect();
     named.sort();
     let mut odd = None;
@@ -103,7 +127,8 @@ fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
     Some((named, odd))
 }
 
-/// All images of `images`, or of the largest of `images_2`, `images_4` … that has one for every pose.
+/// All images of `images`, or of the largest of `images_2`, `images_4` … that has one for every
+/// pose.
 fn images(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
     let mut folders = vec!["images".to_owned()];
     folders.extend((2..=64).map(|n| format!("images_{n}")));
@@ -116,12 +141,14 @@ fn images(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String>
         let odd = odd.map(|reason| format!(" ({reason})")).unwrap_or_default();
         seen.push(format!("{name} has {}{odd}", files.len()));
     }
-    let seen = if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
+    let seen =
+        if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
     Err(format!("{count} poses, but {seen}; images and poses must be as many"))
 }
 
-/// Opening brackets in the header of an array of numbers, at most: a dictionary's and its shape's are two. The parser takes twice the time for each
-/// further one that is nested (found by fuzzing), and as much more of the stack.
+/// Opening brackets in the header of an array of numbers, at most: a dictionary's and its shape's
+/// are two. The parser takes twice the time for each further one that is nested (found by fuzzing),
+/// and as much more of the stack.
 const MOST_BRACKETS: usize = 4;
 
 /// Opening brackets in a NumPy file's header.
@@ -129,7 +156,9 @@ fn brackets(bytes: &[u8]) -> usize {
     // Magic bytes, version, and the header's length: two bytes, or four from version 2 on.
     let length = match *bytes {
         [_, _, _, _, _, _, 1, _, a, b, ..] => 10 + usize::from(u16::from_le_bytes([a, b])),
-        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => 12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize),
+        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => {
+            12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize)
+        }
         _ => 0,
     };
     bytes[..length.min(bytes.len())].iter().filter(|byte| b"{[(".contains(byte)).count()
@@ -140,7 +169,9 @@ fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let io = |source| DatasetError::Io { path: path.to_path_buf(), source };
     let mut bytes = Vec::new();
     std::fs::File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(io)?;
-    let bad = |reason: String| DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"));
+    let bad = |reason: String| {
+        DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"))
+    };
     if brackets(&bytes) > MOST_BRACKETS {
         return Err(bad("its header is nested".to_owned()));
     }
@@ -148,7 +179,9 @@ fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let shape = file.shape().to_vec();
     let rows = match shape[..] {
         // A claim of more numbers than there are bytes isn't believed.
-        [rows, columns] if columns == NUMBERS as u64 && rows > 0 && rows <= bytes.len() as u64 => rows as usize,
+        [rows, columns] if columns == NUMBERS as u64 && rows > 0 && rows <= bytes.len() as u64 => {
+            rows as usize
+        }
         _ => return Err(bad(format!("its shape is {shape:?}"))),
     };
     let by_columns = file.header().order() == npyz::Order::Fortran;
@@ -156,10 +189,13 @@ fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let numbers: Vec<f64> = if kind.contains("f8") {
         file.into_vec().map_err(|e| bad(e.to_string()))?
     } else {
-        let singles: Vec<f32> = file.into_vec().map_err(|e| bad(format!("{e}; it holds {kind}")))?;
+        let singles: Vec<f32> =
+            file.into_vec().map_err(|e| bad(format!("{e}; it holds {kind}")))?;
         singles.into_iter().map(f64::from).collect()
     };
-    let at = |row: usize, column: usize| if by_columns { column * rows + row } else { row * NUMBERS + column };
+    let at = |row: usize, column: usize| {
+        if by_columns { column * rows + row } else { row * NUMBERS + column }
+    };
     let number = |row, column| numbers.get(at(row, column)).copied().unwrap_or(f64::NAN);
     Ok((0..rows).map(|row| std::array::from_fn(|column| number(row, column))).collect())
 }
@@ -170,10 +206,14 @@ mod tests {
     use crate::photograph::tests::write_png;
 
     /// A camera at (1, 2, 3) with axes right = x, up = y, back = z.
-    const ROW: [f64; NUMBERS] = [0., 1., 0., 1., 60., -1., 0., 0., 2., 80., 0., 0., 1., 3., 70., 1.5, 9.];
+    const ROW: [f64; NUMBERS] =
+        [0., 1., 0., 1., 60., -1., 0., 0., 2., 80., 0., 0., 1., 3., 70., 1.5, 9.];
 
     fn npy(rows: &[[f64; NUMBERS]]) -> Vec<u8> {
-        let header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, {NUMBERS}), }}", rows.len());
+        let header = format!(
+            "{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, {NUMBERS}), }}",
+            rows.len()
+        );
         let padded = format!("{header:<117}\n");
         let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
         bytes.extend((padded.len() as u16).to_le_bytes());
@@ -205,7 +245,15 @@ mod tests {
         assert_eq!(frame.camera_to_world, [[1., 0., 0., 1.], [0., 1., 0., 2.], [0., 0., 1., 3.]]);
         assert_eq!(
             frame.taken_with,
-            Intrinsics { width: 40, height: 30, fx: 35.0, fy: 35.0, cx: 20.0, cy: 15.0, distortion: Default::default() }
+            Intrinsics {
+                width: 40,
+                height: 30,
+                fx: 35.0,
+                fy: 35.0,
+                cx: 20.0,
+                cy: 15.0,
+                distortion: Default::default()
+            }
         );
         assert_eq!(frame.depths, Some([1.5, 9.0]));
     }
@@ -220,12 +268,18 @@ mod tests {
         };
         assert_eq!(distortion().0, 0.0);
         std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
-        let cameras = |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
+        let cameras =
+            |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
         // Its images are twice as large.
         cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
         assert_eq!(
             distortion(),
-            (0.02, "LLFF (poses_bounds.npy): 1 photograph from images; 1 photograph has lens distortion".into())
+            (
+                0.02,
+                "LLFF (poses_bounds.npy): 1 photograph from images; 1 photograph has lens \
+                distortion"
+                    .into()
+            )
         );
         for (text, words) in [
             ("1 SIMPLE_RADIAL 160 120 150 80 60 0.02\n", "another focal length"),
@@ -255,31 +309,41 @@ mod tests {
             (npy(&[bad_range, ROW]), 2, "frame 0 (IMG_0): its bounds are 10 and 9"),
             (npy(&[bad_width, ROW]), 2, "width is -3"),
         ] {
-            let message = Dataset::read(folder(&bytes, &[("images", images)]).path()).unwrap_err().to_string();
+            let message = Dataset::read(folder(&bytes, &[("images", images)]).path())
+                .unwrap_err()
+                .to_string();
             assert!(message.contains(words) && message.contains("poses_bounds.npy"), "{message}");
         }
         let dir = folder(&npy(&[ROW, ROW]), &[("images", 1)]);
         std::fs::create_dir(dir.path().join("images/IMG_9.png")).unwrap();
         let message = Dataset::read(dir.path()).unwrap_err().to_string();
         assert!(
-            message.contains("2 poses, but images has 1 (") && message.contains("IMG_9.png is a folder, not an image)"),
+            message.contains("2 poses, but images has 1 (")
+                && message.contains("IMG_9.png is a folder, not an image)"),
             "{message}"
         );
         // A header that claims more than there is.
         let mut claimed = npy(&[ROW]);
         let place = claimed.windows(7).position(|w| w == b"(1, 17)").unwrap();
         claimed[place + 1] = b'9';
-        let message = Dataset::read(folder(&claimed, &[("images", 9)]).path()).unwrap_err().to_string();
+        let message =
+            Dataset::read(folder(&claimed, &[("images", 9)]).path()).unwrap_err().to_string();
         assert!(message.contains("not a NumPy array"), "{message}");
         // One nested so deep that reading it would take years, or all of the stack.
         for version in [1, 2] {
             let mut nested = b"\x93NUMPY".to_vec();
             nested.extend([version, 0]);
-            let header = [&b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, 17), "[..], &[b'{'; 30_000], b"}\n"].concat();
+            let header = [
+                &b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, 17), "[..],
+                &[b'{'; 30_000],
+                b"}\n",
+            ]
+            .concat();
             let length = (header.len() as u32).to_le_bytes();
             nested.extend(if version == 1 { &length[..2] } else { &length });
             nested.extend(header);
-            let message = Dataset::read(folder(&nested, &[("images", 3)]).path()).unwrap_err().to_string();
+            let message =
+                Dataset::read(folder(&nested, &[("images", 3)]).path()).unwrap_err().to_string();
             assert!(message.contains("its header is nested"), "{message}");
         }
     }
@@ -288,7 +352,10 @@ mod tests {
     fn any_bytes_are_an_error_and_no_panic() {
         let whole = npy(&[ROW]);
         for end in 0..whole.len() {
-            assert!(Dataset::read(folder(&whole[..end], &[("images", 1)]).path()).is_err(), "{end}");
+            assert!(
+                Dataset::read(folder(&whole[..end], &[("images", 1)]).path()).is_err(),
+                "{end}"
+            );
         }
     }
 }

@@ -4,7 +4,9 @@ use std::path::Path;
 
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
-use pixels::{MAX_PIXELS, Mask, PixelError, Rgba8, exr_size, read_exr, sample_cubic, srgb_from_linear, to_u8};
+use pixels::{
+    MAX_PIXELS, Mask, PixelError, Rgba8, exr_size, read_exr, sample_cubic, srgb_from_linear, to_u8,
+};
 use scene::Intrinsics;
 
 use crate::{DatasetError, Frame};
@@ -22,13 +24,17 @@ pub(crate) fn is_exr(path: &Path) -> bool {
 /// A PNG or JPEG whose header has been read, by what it is, whatever its name says.
 fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, PixelError> {
     let io = |source| PixelError::Io { path: path.to_path_buf(), source };
-    let mut reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(io)?;
+    let mut reader =
+        ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(io)?;
     let mut limits = Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
     match reader.format() {
         Some(ImageFormat::Png | ImageFormat::Jpeg) => Ok(reader),
-        _ => Err(PixelError::Format { path: path.to_path_buf(), reason: "neither PNG, JPEG nor EXR".to_owned() }),
+        _ => Err(PixelError::Format {
+            path: path.to_path_buf(),
+            reason: "neither PNG, JPEG nor EXR".to_owned(),
+        }),
     }
 }
 
@@ -65,13 +71,16 @@ fn is_sideways(turn: Orientation) -> bool {
     matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
-/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in shape; and whether the image
-/// has to be turned as its EXIF data ask. Poses are commonly found for images as they are stored, so it is turned only where
-/// its shape fits no other way.
+/// The intrinsics for the stored image, whose size may differ from what was said of it, but not in
+/// shape; and whether the image has to be turned as its EXIF data ask. Poses are commonly found for
+/// images as they are stored, so it is turned only where its shape fits no other way.
 pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let (width, height) = stored.size;
     let fits = |(width, height): (u32, u32)| {
-        let (across, down) = (f64::from(width) / f64::from(k.width.max(1)), f64::from(height) / f64::from(k.height.max(1)));
+        let (across, down) = (
+            f64::from(width) / f64::from(k.width.max(1)),
+            f64::from(height) / f64::from(k.height.max(1)),
+        );
         // A smaller copy's sides are rounded.
         (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
     };
@@ -82,7 +91,10 @@ pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool)
     } else if stored.is_sideways && fits((height, width)) {
         Ok((k.resized(height, width), true))
     } else {
-        Err(format!("the image has {width}×{height} pixels, its camera {}×{}: another shape", k.width, k.height))
+        Err(format!(
+            "the image has {width}×{height} pixels, its camera {}×{}: another shape",
+            k.width, k.height
+        ))
     }
 }
 
@@ -94,7 +106,8 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
     }
     let mut decoder = open(path)?.into_decoder().map_err(|e| format(e.to_string()))?;
     let turn = decoder.orientation().unwrap_or(Orientation::NoTransforms);
-    let mut image = DynamicImage::from_decoder(decoder).map_err(|e| format(format!("not a whole image ({e})")))?;
+    let mut image = DynamicImage::from_decoder(decoder)
+        .map_err(|e| format(format!("not a whole image ({e})")))?;
     if turned {
         image.apply_orientation(turn);
     }
@@ -105,21 +118,30 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
 /// An EXR's linear light, display-encoded.
 fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
     let image = read_exr(path)?;
-    let missing = |name: &str| PixelError::Format { path: path.to_path_buf(), reason: format!("no channel {name}") };
+    let missing = |name: &str| PixelError::Format {
+        path: path.to_path_buf(),
+        reason: format!("no channel {name}"),
+    };
     let [r, g, b] = ["R", "G", "B"].map(|name| image.channel(name).ok_or_else(|| missing(name)));
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
     let pixel = |i: usize| {
         let alpha = a.map_or(1.0, |a| a[i]);
         // EXR files keep premultiplied colours, ours straight ones.
-        let encode = |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
+        let encode =
+            |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
         let straight = |v: f32| if alpha > 0.0 { encode(v) } else { 0 };
         [straight(r[i]), straight(g[i]), straight(b[i]), to_u8(alpha)]
     };
-    Ok(Rgba8::new(image.width, image.height, (0..image.width * image.height).flat_map(pixel).collect()))
+    Ok(Rgba8::new(
+        image.width,
+        image.height,
+        (0..image.width * image.height).flat_map(pixel).collect(),
+    ))
 }
 
 impl Frame {
-    /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as sharp as it was.
+    /// The image that [`Frame::camera`] sees: as it was taken, or with its distortion undone, as
+    /// sharp as it was.
     pub fn photograph(&self) -> Result<Rgba8, DatasetError> {
         self.seen(&self.image)
     }
@@ -134,7 +156,10 @@ impl Frame {
         let image = read(path, self.turned)?;
         let k = self.taken_with;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
-            let reason = format!("{}×{} pixels where its photograph has {}×{}", image.width, image.height, k.width, k.height);
+            let reason = format!(
+                "{}×{} pixels where its photograph has {}×{}",
+                image.width, image.height, k.width, k.height
+            );
             return Err(PixelError::Format { path: path.to_path_buf(), reason }.into());
         }
         Ok(self.pinhole.map(|pinhole| undistorted(&image, &k, &pinhole)).unwrap_or(image))
@@ -151,7 +176,9 @@ fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> 
                 let at = 4 * (row * image.width + column);
                 [0, 1, 2, 3].map(|c| f64::from(image.data[at + c]))
             };
-            data.extend(sample_cubic((image.width, image.height), at, pixel).map(|v| (v + 0.5) as u8));
+            data.extend(
+                sample_cubic((image.width, image.height), at, pixel).map(|v| (v + 0.5) as u8),
+            );
         }
     }
     Rgba8::new(image.width, image.height, data)
@@ -164,7 +191,8 @@ pub(crate) mod tests {
 
     /// An image whose red says the column and whose green says the row.
     fn ramp(width: usize, height: usize) -> Rgba8 {
-        let pixel = |i: usize| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, 90, 255];
+        let pixel =
+            |i: usize| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, 90, 255];
         Rgba8::new(width, height, (0..width * height).flat_map(pixel).collect())
     }
 
@@ -194,15 +222,19 @@ pub(crate) mod tests {
         // What its header says is looked at before anything is allocated, and the limit is said.
         let mut huge = bytes.clone();
         let frame = huge.windows(2).position(|marker| marker == b"\xff\xc0").unwrap();
-        huge[frame + 5..frame + 9].copy_from_slice(&[20_000u16.to_be_bytes(), 20_000u16.to_be_bytes()].concat());
+        huge[frame + 5..frame + 9]
+            .copy_from_slice(&[20_000u16.to_be_bytes(), 20_000u16.to_be_bytes()].concat());
         std::fs::write(&path, &huge).unwrap();
         let message = look(&path).unwrap_err().to_string();
         assert!(
-            message
-                .ends_with("20000×20000 pixels; at most 268435456 are read (16384×16384, for example): make the image smaller"),
+            message.ends_with(
+                "20000×20000 pixels; at most 268435456 are read (16384×16384, for \
+                    example): make the image smaller"
+            ),
             "{message}"
         );
-        // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's shape says so, else left alone.
+        // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's
+        // shape says so, else left alone.
         let mut turned = bytes[..2].to_vec();
         turned.extend(b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0");
         turned.extend(&bytes[2..]);
@@ -216,7 +248,10 @@ pub(crate) mod tests {
         assert!(fitted(of(32, 32), stored).unwrap_err().contains("another shape"));
         let upright = super::read(&path, true).unwrap();
         assert_eq!((upright.width, upright.height), (16, 32));
-        assert!(upright.data[0] < 20 && upright.data[1] > 200, "its bottom left corner is now its top left one");
+        assert!(
+            upright.data[0] < 20 && upright.data[1] > 200,
+            "its bottom left corner is now its top left one"
+        );
         std::fs::write(&path, "no image").unwrap();
         assert!(look(&path).unwrap_err().to_string().contains("a.png"));
         let other = dir.path().join("a.tiff");
@@ -228,9 +263,24 @@ pub(crate) mod tests {
     #[test]
     fn distortion_is_undone() {
         let distortion = Distortion { radial: [-0.12, 0.02, 0.0], tangential: [0.002, -0.001] };
-        let intrinsics = Intrinsics { width: 120, height: 90, fx: 110.0, fy: 108.0, cx: 61.0, cy: 44.0, distortion };
+        let intrinsics = Intrinsics {
+            width: 120,
+            height: 90,
+            fx: 110.0,
+            fy: 108.0,
+            cx: 61.0,
+            cy: 44.0,
+            distortion,
+        };
         // Smooth in the direction of the ray, so that what each lens sees is known exactly.
-        let colour = |[u, v]: [f64; 2]| [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255];
+        let colour = |[u, v]: [f64; 2]| {
+            [
+                (128.0 + 90.0 * (6.0 * u).sin()) as u8,
+                (128.0 + 90.0 * (5.0 * v).cos()) as u8,
+                60,
+                255,
+            ]
+        };
         // Where a distorted position comes from, by fixed-point iteration.
         let ray = |x: f64, y: f64| {
             let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
@@ -247,9 +297,11 @@ pub(crate) mod tests {
         };
         let pinhole = intrinsics.pinhole().unwrap();
         assert!(pinhole.fx != intrinsics.fx);
-        let expected = image(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
+        let expected =
+            image(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
         let found = undistorted(&image(&ray), &intrinsics, &pinhole);
-        let worst = found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        let worst =
+            found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{worst}");
     }
 }

@@ -13,7 +13,8 @@ impl Split {
         Self { train: (0..count).collect(), test: (0..count).collect() }
     }
 
-    /// Every `every`-th frame, the first among them, is for testing and for nothing else: LLFF's way. One frame alone is both.
+    /// Every `every`-th frame, the first among them, is for testing and for nothing else: LLFF's
+    /// way. One frame alone is both.
     pub fn hold_out(count: usize, every: usize) -> Self {
         let (test, train): (Vec<_>, Vec<_>) = (0..count).partition(|i| i % every.max(1) == 0);
         if train.is_empty() { Self::all(count) } else { Self { train, test } }

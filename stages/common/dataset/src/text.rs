@@ -4,7 +4,8 @@ use crate::DatasetError;
 
 /// A whole text file: UTF-8, with or without a byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
-    let bytes = std::fs::read(path).map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
+    let bytes = std::fs::read(path)
+        .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
     decoded(bytes).map_err(|reason| DatasetError::format(path, reason))
 }
 
@@ -23,9 +24,14 @@ fn decoded(mut bytes: Vec<u8>) -> Result<String, String> {
         let line = 1 + bytes[..place].iter().filter(|b| **b == b'\n').count();
         let (before, after) = bytes.split_at(place);
         let start = before.iter().rposition(u8::is_ascii_whitespace).map_or(0, |space| space + 1);
-        let end = after.iter().position(u8::is_ascii_whitespace).map_or(bytes.len(), |space| place + space);
+        let end = after
+            .iter()
+            .position(u8::is_ascii_whitespace)
+            .map_or(bytes.len(), |space| place + space);
         let word = bytes[start..end].escape_ascii();
-        format!("line {line}: {word} is not UTF-8; save the file as UTF-8, and rename what it names so")
+        format!(
+            "line {line}: {word} is not UTF-8; save the file as UTF-8, and rename what it names so"
+        )
     })
 }
 
@@ -40,7 +46,9 @@ mod tests {
 
     #[test]
     fn marks_are_no_text_and_other_encodings_are_named() {
-        let utf16 = |text: &str, of: fn(u16) -> [u8; 2]| text.encode_utf16().flat_map(of).collect::<Vec<_>>();
+        let utf16 = |text: &str, of: fn(u16) -> [u8; 2]| {
+            text.encode_utf16().flat_map(of).collect::<Vec<_>>()
+        };
         assert_eq!(decoded(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
         assert_eq!(decoded("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
         assert_eq!(decoded(Vec::new()).unwrap(), "");
@@ -51,6 +59,9 @@ mod tests {
         }
         let latin = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
         let reason = decoded(latin).unwrap_err();
-        assert!(reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"), "{reason}");
+        assert!(
+            reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"),
+            "{reason}"
+        );
     }
 }

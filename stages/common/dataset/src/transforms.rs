@@ -74,15 +74,25 @@ pub(crate) struct Read {
 /// Reads `transforms.json`: instant-ngp's form and nerfstudio's.
 pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let path = folder.join("transforms.json");
-    let Read { frames, missing, split } = read_file(folder, &path, Missing::LeftOut)?.not_empty(&path)?;
-    let mut notes = vec![format!("transforms.json (instant-ngp, nerfstudio): {}", counted(frames.len(), "photograph"))];
+    let Read { frames, missing, split } =
+        read_file(folder, &path, Missing::LeftOut)?.not_empty(&path)?;
+    let mut notes = vec![format!(
+        "transforms.json (instant-ngp, nerfstudio): {}",
+        counted(frames.len(), "photograph")
+    )];
     if let (Some(first), count) = missing {
-        notes.push(format!("{count} of {} frames have no picture and are left out, first {first}", frames.len() + count));
+        notes.push(format!(
+            "{count} of {} frames have no picture and are left out, first {first}",
+            frames.len() + count
+        ));
     }
     let masked = frames.iter().filter(|f| f.mask.is_some()).count();
     if masked > 0 {
         let have = if masked == 1 { "has" } else { "have" };
-        notes.push(format!("{} {have} a mask: what is black there is neither trained on nor scored", counted(masked, "frame")));
+        notes.push(format!(
+            "{} {have} a mask: what is black there is neither trained on nor scored",
+            counted(masked, "frame")
+        ));
     }
     Ok(Dataset { format: Format::Transforms, frames, split, notes })
 }
@@ -91,20 +101,32 @@ impl Read {
     /// Refuses a file without frames.
     pub(crate) fn not_empty(self, path: &Path) -> Result<Self, DatasetError> {
         if self.frames.is_empty() {
-            return Err(DatasetError::format(path, "`frames` is empty; at least one view is needed"));
+            return Err(DatasetError::format(
+                path,
+                "`frames` is empty; at least one view is needed",
+            ));
         }
         Ok(self)
     }
 }
 
 /// Reads a file of frames; there may be none.
-pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Result<Read, DatasetError> {
-    let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e.to_string()))?;
+pub(crate) fn read_file(
+    folder: &Path,
+    path: &Path,
+    on_missing: Missing,
+) -> Result<Read, DatasetError> {
+    let transforms =
+        parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e.to_string()))?;
     let (mut frames, mut files) = (Vec::new(), Vec::new());
     let (mut first_missing, mut missing) = (None, 0);
     for (index, entry) in transforms.frames.iter().enumerate() {
-        let of_frame =
-            |reason: String| DatasetError::Frame { path: path.to_path_buf(), index, file: entry.file_path.clone(), reason };
+        let of_frame = |reason: String| DatasetError::Frame {
+            path: path.to_path_buf(),
+            index,
+            file: entry.file_path.clone(),
+            reason,
+        };
         let file = image_file(folder, &entry.file_path).map_err(of_frame)?;
         match find(&folder.join(&file), "an image") {
             Found::File => {}
@@ -116,13 +138,18 @@ pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Resu
                 missing += 1;
                 continue;
             }
-            Found::Other(reason) => return Err(of_frame(format!("{reason}; remove the frame or name its image"))),
+            Found::Other(reason) => {
+                return Err(of_frame(format!("{reason}; remove the frame or name its image")));
+            }
         }
         frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
         files.push(file);
     }
     if let Some(first) = first_missing.as_ref().filter(|_| frames.is_empty()) {
-        return Err(DatasetError::format(path, format!("not one of its {missing} images is there, first {first}")));
+        return Err(DatasetError::format(
+            path,
+            format!("not one of its {missing} images is there, first {first}"),
+        ));
     }
     for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
         frame.name = name;
@@ -131,7 +158,8 @@ pub(crate) fn read_file(folder: &Path, path: &Path, on_missing: Missing) -> Resu
     Ok(Read { frames, missing: (first_missing, missing), split })
 }
 
-/// The split by file names, where there is one for both. What is for validation is for testing where nothing else is.
+/// The split by file names, where there is one for both. What is for validation is for testing
+/// where nothing else is.
 fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
     let numbers = |names: &Vec<String>| -> Vec<usize> {
         let named: Vec<PathBuf> = names.iter().filter_map(|n| relative_path(n).ok()).collect();
@@ -142,7 +170,8 @@ fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
     (!train.is_empty() && !test.is_empty()).then_some(Split { train, test })
 }
 
-/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers, so that the frame can be named.
+/// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers,
+/// so that the frame can be named.
 fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
     serde_json::from_str(text).or_else(|error| match words_as_text(text) {
         Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
@@ -154,7 +183,10 @@ fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
 fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
     let mut file = relative_path(text)?;
     let known = ["png", "jpg", "jpeg", "exr"];
-    let has_one = file.extension().and_then(|e| e.to_str()).is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()));
+    let has_one = file
+        .extension()
+        .and_then(|e| e.to_str())
+        .is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()));
     if !has_one && !folder.join(&file).is_file() {
         // `set_extension` would cut a name like `r.0`.
         file.as_mut_os_string().push(".png");
@@ -162,7 +194,12 @@ fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
     Ok(file)
 }
 
-fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry) -> Result<Frame, String> {
+fn read_frame(
+    folder: &Path,
+    file: &Path,
+    entry: &FrameEntry,
+    shared: &LensEntry,
+) -> Result<Frame, String> {
     let mut camera_to_world = [[0.0; 4]; 3];
     let matrix = &entry.transform_matrix;
     if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
@@ -179,18 +216,34 @@ fn read_frame(folder: &Path, file: &Path, entry: &FrameEntry, shared: &LensEntry
         let path = folder.join(relative_path(text)?);
         match find(&path, "an image") {
             Found::File => Ok(Some(path)),
-            Found::Nothing(reason) | Found::Other(reason) => Err(format!("{reason}; remove the entry or restore the file")),
+            Found::Nothing(reason) | Found::Other(reason) => {
+                Err(format!("{reason}; remove the entry or restore the file"))
+            }
         }
     };
     let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
     // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
     let depth = depth.filter(|path| is_exr(path));
-    let (taken_with, turned) = intrinsics(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
-    let frame =
-        Frame { name: String::new(), image, turned, mask, depth, taken_with, pinhole: None, camera_to_world, depths: None };
+    let (taken_with, turned) =
+        intrinsics(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
+    let frame = Frame {
+        name: String::new(),
+        image,
+        turned,
+        mask,
+        depth,
+        taken_with,
+        pinhole: None,
+        camera_to_world,
+        depths: None,
+    };
     match frame.check() {
         Ok(()) => Ok(frame),
-        Err(e @ (CameraError::Intrinsics { .. } | CameraError::Distortion(_) | CameraError::Empty { .. })) => Err(e.to_string()),
+        Err(
+            e @ (CameraError::Intrinsics { .. }
+            | CameraError::Distortion(_)
+            | CameraError::Empty { .. }),
+        ) => Err(e.to_string()),
         Err(e) => Err(format!("transform_matrix: {e}")),
     }
 }
@@ -201,15 +254,37 @@ impl LensEntry {
         macro_rules! both {
             ($($name:ident),*) => { Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* } };
         }
-        both!(camera_model, camera_angle_x, camera_angle_y, fl_x, fl_y, cx, cy, w, h, k1, k2, k3, k4, p1, p2, is_fisheye)
+        both!(
+            camera_model,
+            camera_angle_x,
+            camera_angle_y,
+            fl_x,
+            fl_y,
+            cx,
+            cy,
+            w,
+            h,
+            k1,
+            k2,
+            k3,
+            k4,
+            p1,
+            p2,
+            is_fisheye
+        )
     }
 }
 
 /// What an image was taken with, and whether it has to be turned.
 fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
-    if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"].contains(&model) {
-        return Err(format!("camera_model {model:?} is not supported; undistort the images first (colmap image_undistorter)"));
+    if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
+        .contains(&model)
+    {
+        return Err(format!(
+            "camera_model {model:?} is not supported; undistort the images first (colmap \
+            image_undistorter)"
+        ));
     }
     if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k.0 != 0.0) {
         return Err("fisheye lenses are not supported; undistort the images first".to_owned());
@@ -220,15 +295,20 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
         Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
         Some(Number(v)) => Err(format!("{name} is {v}; an image has at least one pixel")),
     };
-    let (width, height) = (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
-    let focal = |length: Option<Number>, angle: Option<Number>, name: &str, size: u32| match (length, angle) {
+    let (width, height) =
+        (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
+    let focal = |length: Option<Number>, angle: Option<Number>, name: &str, size: u32| match (
+        length, angle,
+    ) {
         (Some(Number(length)), _) => Ok(Some(length)),
         (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
             Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
         }
         (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
-            Err(format!("{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"))
+            Err(format!(
+                "{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"
+            ))
         }
         (None, None) => Ok(None),
     };
@@ -272,18 +352,30 @@ mod tests {
 
     #[test]
     fn what_a_frame_says_goes_before_what_holds_for_all() {
-        let head =
-            r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1, "p2": 0.01, "camera_model": "OPENCV""#;
+        let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1, "p2": 0.01, "camera_model": "OPENCV""#;
         let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
         let of = |i: usize| set.frames[i].taken_with;
         let distortion = Distortion { radial: [0.0; 3], tangential: [0.0, 0.01] };
-        assert_eq!(of(0), Intrinsics { width: 40, height: 30, fx: 60.0, fy: 52.0, cx: 21.0, cy: 14.0, distortion });
+        assert_eq!(
+            of(0),
+            Intrinsics {
+                width: 40,
+                height: 30,
+                fx: 60.0,
+                fy: 52.0,
+                cx: 21.0,
+                cy: 14.0,
+                distortion
+            }
+        );
         assert_eq!(of(1).fx, 50.0);
         assert_eq!((of(0).distortion.radial[0], of(1).distortion.radial[0]), (0.0, 0.1));
         assert_eq!(of(1).distortion.tangential, [0.0, 0.01]);
         assert_eq!(set.frames.iter().map(|f| f.name.as_str()).collect::<Vec<_>>(), ["a", "b"]);
         assert!(
-            set.notes.iter().any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")),
+            set.notes
+                .iter()
+                .any(|n| n.contains("1 of 3 frames have no picture") && n.contains("gone.png")),
             "{:?}",
             set.notes
         );
@@ -292,17 +384,29 @@ mod tests {
     /// Numbers for the original hold for a smaller copy of it.
     #[test]
     fn smaller_copies_keep_their_angle() {
-        let set = set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
+        let set =
+            set(&frames(r#""fl_x": 200, "cx": 80, "cy": 60, "w": 160, "h": 120"#, "")).unwrap();
         assert_eq!(
             set.frames[0].taken_with,
-            Intrinsics { width: 40, height: 30, fx: 50.0, fy: 50.0, cx: 20.0, cy: 15.0, distortion: Default::default() }
+            Intrinsics {
+                width: 40,
+                height: 30,
+                fx: 50.0,
+                fy: 50.0,
+                cx: 20.0,
+                cy: 15.0,
+                distortion: Default::default()
+            }
         );
     }
 
     #[test]
     fn a_split_of_its_own_is_kept() {
         let head = r#""fl_x": 50, "train_filenames": ["images/b.png"], "test_filenames": ["./images/a.png"]"#;
-        assert_eq!(set(&frames(head, "")).unwrap().split, Some(Split { train: vec![1], test: vec![0] }));
+        assert_eq!(
+            set(&frames(head, "")).unwrap().split,
+            Some(Split { train: vec![1], test: vec![0] })
+        );
         assert_eq!(set(&frames(r#""fl_x": 50"#, "")).unwrap().split, None);
     }
 
@@ -320,7 +424,10 @@ mod tests {
             (r#""camera_angle_x": 7"#, "", "between 0 and π"),
         ] {
             let message = set(&frames(head, first)).unwrap_err().to_string();
-            assert!(message.contains(words) && message.contains("frame 0 (images/a.png)"), "{message}");
+            assert!(
+                message.contains(words) && message.contains("frame 0 (images/a.png)"),
+                "{message}"
+            );
         }
         let nothing = r#"{"fl_x": 50, "frames": [{"file_path": "x.png", "transform_matrix": []}]}"#;
         assert!(set(nothing).unwrap_err().to_string().contains("not one of its 1 images is there"));

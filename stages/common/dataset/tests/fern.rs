@@ -6,8 +6,10 @@ use dataset::{Dataset, Format};
 
 #[test]
 fn fern_is_read() {
-    let data = std::env::var("NERF_SR_DATA")
-        .map_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data"), PathBuf::from);
+    let data = std::env::var("NERF_SR_DATA").map_or_else(
+        |_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../../shared/data"),
+        PathBuf::from,
+    );
     let folder = data.join("nerf_llff_data/fern");
     if !folder.is_dir() {
         eprintln!("skipped: no data ({} is not there; set NERF_SR_DATA)", folder.display());
@@ -26,7 +28,11 @@ fn fern_is_read() {
         let camera = frame.camera();
         assert!(camera.forward().dot(first.forward()) > 0.9, "{}", frame.name);
         let [near, far] = frame.depths.unwrap();
-        assert!((camera.centre() - first.centre()).length() < near && near < far, "{} {near} {far}", frame.name);
+        assert!(
+            (camera.centre() - first.centre()).length() < near && near < far,
+            "{} {near} {far}",
+            frame.name
+        );
     }
     let image = frame.photograph().unwrap();
     assert_eq!((image.width, image.height), (4032, 3024));

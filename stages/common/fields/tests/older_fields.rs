@@ -1,5 +1,6 @@
-//! Fields that an older build trained render as they did then, or are refused. The files in `goldens/` are of the demo scene at 16 px: commit 5af0c3e
-//! made `mlp`, the first commit with format 2 `grid`.
+//! Fields that an older build trained render as they did then, or are refused. The files in
+//! `goldens/` are of the demo scene at 16 px: commit 5af0c3e made `mlp`, the first commit with
+//! format 2 `grid`.
 
 #![allow(missing_docs, reason = "a test")]
 
@@ -28,23 +29,34 @@ fn rays(camera: &Camera) -> Vec<Ray> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let ray = |i: u32| {
         let ray = camera.ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
-        Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+        Ray {
+            origin: ray.origin.as_vec3().to_array(),
+            direction: ray.direction.as_vec3().to_array(),
+            background: [1.0; 3],
+        }
     };
     (0..width * height).map(ray).collect()
 }
 
-/// Compares a render with the EXR file that the older build wrote, whose colours have half precision.
+/// Compares a render with the EXR file that the older build wrote, whose colours have half
+/// precision.
 fn renders_as_before(name: &str) {
     let folder = artifact(name);
     let members = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").unwrap();
-    let views: Views = serde_json::from_slice(&std::fs::read(goldens().join("views.json")).unwrap()).unwrap();
+    let views: Views =
+        serde_json::from_slice(&std::fs::read(goldens().join("views.json")).unwrap()).unwrap();
     let expected = pixels::read_exr(&goldens().join(format!("{name}.exr"))).unwrap();
     let channel = |name: &str| expected.channel(name).unwrap();
     let rendered = members.render(&rays(&views.views[0].camera)).unwrap();
     assert_eq!(rendered.len(), channel("A").len());
-    assert!(channel("A").iter().any(|a| *a > 0.5) && channel("A").iter().any(|a| *a < 0.99), "the view shows something");
+    assert!(
+        channel("A").iter().any(|a| *a > 0.5) && channel("A").iter().any(|a| *a < 0.99),
+        "the view shows something"
+    );
     for (i, pixel) in rendered.iter().enumerate() {
-        for (value, name) in pixel.premultiplied.into_iter().chain([pixel.opacity]).zip(["R", "G", "B", "A"]) {
+        for (value, name) in
+            pixel.premultiplied.into_iter().chain([pixel.opacity]).zip(["R", "G", "B", "A"])
+        {
             let before = channel(name)[i];
             assert!((value - before).abs() < 1e-3, "pixel {i} {name}: {value} was {before}");
         }
@@ -60,13 +72,21 @@ fn a_grid_renders_as_before() {
 fn a_grid_of_the_first_format_is_refused() {
     let folder = artifact("grid");
     let file = folder.path().join(FIELD_FILE);
-    let mut description: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let mut description: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     // Such files don't say their format.
     description.as_object_mut().unwrap().remove("format").unwrap();
     std::fs::write(&file, description.to_string()).unwrap();
-    let error = Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").err().unwrap();
+    let error =
+        Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu").err().unwrap();
     let line = format!("{error:#}");
-    assert!(line.ends_with("another build trained this field, in format 1; this build reads format 2: train it again"), "{line}");
+    assert!(
+        line.ends_with(
+            "another build trained this field, in format 1; this build reads \
+        format 2: train it again"
+        ),
+        "{line}"
+    );
 }
 
 #[cfg(feature = "torch")]

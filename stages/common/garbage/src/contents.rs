@@ -20,8 +20,16 @@ impl Contents {
         Ok(Self {
             records: store.records()?.into_iter().map(|record| (record.key(), record)).collect(),
             action_files: store.action_files()?,
-            objects: objects.map(|identity| (identity.clone(), store.manifest(&identity).map_or(0, |m| m.size()))).collect(),
-            unfinished: store.partials()?.into_iter().map(|key| (key.clone(), store.unfinished(&key))).collect(),
+            objects: objects
+                .map(|identity| {
+                    (identity.clone(), store.manifest(&identity).map_or(0, |m| m.size()))
+                })
+                .collect(),
+            unfinished: store
+                .partials()?
+                .into_iter()
+                .map(|key| (key.clone(), store.unfinished(&key)))
+                .collect(),
         })
     }
 }

@@ -1,6 +1,7 @@
 //! Garbage collection by reachability: what roots reach stays, everything else goes.
 //!
-//! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress and recent runs.
+//! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress
+//!   and recent runs.
 //! * Submissions with jobs are roots, too; where a cluster can't be asked, all of them are.
 //! * `contents`: what lies in the store.
 //! * `reach`: from the roots to what they name, and to what that was made of.
@@ -36,7 +37,9 @@ pub fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, Store
     let outstanding = roots::outstanding(store)?;
     let roots = roots::roots(store, &contents, plan, choice, &runs, &outstanding)?;
     let kept = reach::reach(&contents, &roots);
-    let is_kept = |run: &artifact::Run| run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix());
+    let is_kept = |run: &artifact::Run| {
+        run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix())
+    };
     let runs_to_go = runs.iter().filter(|run| !is_kept(run)).map(|run| run.id.clone()).collect();
     Ok(Verdict { contents, kept, runs_to_go })
 }
@@ -77,14 +80,18 @@ impl Verdict {
     /// Bytes that go, and bytes that stay.
     pub fn bytes(&self) -> (u64, u64) {
         let sum = |stays: bool| {
-            let objects = self.contents.objects.iter().filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
+            let objects = self
+                .contents
+                .objects
+                .iter()
+                .filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
             objects.map(|(_, bytes)| bytes).sum()
         };
         (sum(false), sum(true))
     }
 
-    /// Removes what goes: records first, so that none names an object that is gone. The store is closed meanwhile; deleting
-    /// ([`Store::empty_trash`]) can wait until it is open again.
+    /// Removes what goes: records first, so that none names an object that is gone. The store is
+    /// closed meanwhile; deleting ([`Store::empty_trash`]) can wait until it is open again.
     pub fn carry_out(&self, store: &Store, _: &Closed) -> Result<(), StoreError> {
         let goes = |kept: &BTreeMap<String, String>, key: &String| !kept.contains_key(key);
         for key in self.contents.action_files.iter().filter(|key| goes(&self.kept.records, key)) {

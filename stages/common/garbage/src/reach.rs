@@ -14,14 +14,21 @@ pub(crate) struct Kept {
     pub(crate) unfinished: BTreeMap<String, String>,
 }
 
-/// From the roots to the records and unfinished actions that they name and, where a root asks for it, on to the actions that those
-/// were made of.
+/// From the roots to the records and unfinished actions that they name and, where a root asks for
+/// it, on to the actions that those were made of.
 pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
     let mut kept = Kept::default();
     for root in roots {
-        let fitting = contents.records.iter().filter(|(_, record)| root.waiting.iter().any(|node| node.may_be(record)));
-        let mut open: Vec<(String, String)> =
-            root.keys.iter().chain(fitting.map(|(key, _)| key)).map(|key| (key.clone(), root.why.clone())).collect();
+        let fitting = contents
+            .records
+            .iter()
+            .filter(|(_, record)| root.waiting.iter().any(|node| node.may_be(record)));
+        let mut open: Vec<(String, String)> = root
+            .keys
+            .iter()
+            .chain(fitting.map(|(key, _)| key))
+            .map(|key| (key.clone(), root.why.clone()))
+            .collect();
         let mut seen = std::collections::BTreeSet::new();
         while let Some((key, why)) = open.pop() {
             if !seen.insert(key.clone()) {
@@ -45,7 +52,15 @@ pub(crate) fn reach(contents: &Contents, roots: &[Root]) -> Kept {
 /// The actions that an action was made of, and why they stay.
 fn made_of(contents: &Contents, key: &str) -> Vec<(String, String)> {
     let finished = contents.records.get(key).map(|record| (&record.stage, &record.made_of));
-    let unfinished = contents.unfinished.get(key).and_then(Option::as_ref).map(|action| (&action.stage, &action.made_of));
+    let unfinished = contents
+        .unfinished
+        .get(key)
+        .and_then(Option::as_ref)
+        .map(|action| (&action.stage, &action.made_of));
     let parents = [finished, unfinished].into_iter().flatten();
-    parents.flat_map(|(stage, keys)| keys.iter().map(move |key| (key.clone(), format!("{stage} was made of it")))).collect()
+    parents
+        .flat_map(|(stage, keys)| {
+            keys.iter().map(move |key| (key.clone(), format!("{stage} was made of it")))
+        })
+        .collect()
 }

@@ -14,7 +14,8 @@ pub struct Root {
     pub keys: BTreeSet<String>,
     /// Nodes that any fitting record may belong to.
     pub waiting: Vec<Waiting>,
-    /// Whether it needs the actions that those were made of, too. A plan or a run names them itself.
+    /// Whether it needs the actions that those were made of, too. A plan or a run names them
+    /// itself.
     pub with_inputs: bool,
 }
 
@@ -30,7 +31,8 @@ pub struct Choice {
 }
 
 impl Choice {
-    /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be kept for its age.
+    /// Whether a time lies within the days to keep. A time to come does, unless nothing is to be
+    /// kept for its age.
     pub(crate) fn is_recent(self, unix: u64) -> bool {
         unix_time().saturating_sub(unix) < self.keep_days.saturating_mul(86_400)
     }
@@ -57,31 +59,47 @@ pub(crate) fn roots(
             roots.push(of_run(format!("a run {} used it", ago(run.used_unix())), run));
         }
     }
-    let one =
-        |why: String, key: &String| Root { why, keys: BTreeSet::from([key.clone()]), waiting: Vec::new(), with_inputs: true };
-    roots.extend(store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)));
-    for (key, record) in contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix)) {
+    let one = |why: String, key: &String| Root {
+        why,
+        keys: BTreeSet::from([key.clone()]),
+        waiting: Vec::new(),
+        with_inputs: true,
+    };
+    roots.extend(
+        store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)),
+    );
+    for (key, record) in
+        contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix))
+    {
         roots.push(one(format!("made {}", ago(record.started_unix)), key));
     }
     if !choice.drop_old {
         let old = contents.records.iter().filter(|(_, record)| record.has_old_key());
-        roots.extend(old.map(|(key, _)| one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)));
+        roots.extend(old.map(|(key, _)| {
+            one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)
+        }));
     }
     if !choice.drop_unfinished {
         let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));
-        roots.extend(with_checkpoint.map(|key| one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)));
+        roots.extend(with_checkpoint.map(|key| {
+            one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)
+        }));
     }
     Ok(roots)
 }
 
-/// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every one.
+/// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every
+/// one.
 pub(crate) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
-    let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| ids.map(|id| (id.to_owned(), why.to_owned())).collect();
+    let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| {
+        ids.map(|id| (id.to_owned(), why.to_owned())).collect()
+    };
     match Queue::look(&Slurm::default(), store.root()) {
         Ok(queue) => Ok(all("a submitted job needs it", &mut queue.submissions().into_iter())),
         Err(error) => {
             let path = store.root().join("slurm");
-            let submissions = slurm::all(store.root()).map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
+            let submissions = slurm::all(store.root())
+                .map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
             let why = format!("a submitted job may need it, for {error}");
             Ok(all(&why, &mut submissions.iter().map(|(id, _)| id.as_str())))
         }

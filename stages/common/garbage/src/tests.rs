@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
 use artifact::{
-    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting, hash_json, unix_time,
+    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting,
+    hash_json, unix_time,
 };
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
@@ -55,21 +56,29 @@ fn cases() -> impl Strategy<Value = Case> {
         1 => Just(Finished::WithoutCheckpoint)
     ];
     let inputs = prop::collection::vec(any::<u8>(), 0..3);
-    let action =
-        (0..3u8, 0..2u8, inputs, 0..6u8, 0..20u64, state).prop_map(|(stage, parameter, inputs, content, days_old, state)| {
-            Action { stage, parameter, inputs, content, days_old, state }
-        });
+    let action = (0..3u8, 0..2u8, inputs, 0..6u8, 0..20u64, state).prop_map(
+        |(stage, parameter, inputs, content, days_old, state)| Action {
+            stage,
+            parameter,
+            inputs,
+            content,
+            days_old,
+            state,
+        },
+    );
     let some = || prop::collection::vec(any::<u8>(), 0..3);
     let waiting = || prop::collection::vec((0..3u8, 0..2u8), 0..2);
     let holder = prop_oneof![
         some().prop_map(Holder::Pin),
         any::<u8>().prop_map(Holder::Lock),
-        (some(), waiting(), 0..20u64, any::<bool>()).prop_map(|(keys, waiting, days_ago, in_progress)| Holder::Run {
-            keys,
-            waiting,
-            days_ago,
-            in_progress
-        }),
+        (some(), waiting(), 0..20u64, any::<bool>()).prop_map(
+            |(keys, waiting, days_ago, in_progress)| Holder::Run {
+                keys,
+                waiting,
+                days_ago,
+                in_progress
+            }
+        ),
     ];
     (
         prop::collection::vec(action, 1..12),
@@ -93,13 +102,15 @@ struct Made {
     store: Store,
     /// Each action's key.
     keys: Vec<String>,
-    /// Every finished action and every unfinished one, by key: its key's parts and what it is made of.
+    /// Every finished action and every unfinished one, by key: its key's parts and what it is made
+    /// of.
     parts: BTreeMap<String, (Map<String, Value>, Vec<String>)>,
     _locks: Vec<KeyLock>,
     _runs: Vec<RunFile>,
 }
 
-/// Attempts until it is held: other tests start programs, and a file that was open when one started stays locked until it is loaded.
+/// Attempts until it is held: other tests start programs, and a file that was open when one started
+/// stays locked until it is loaded.
 fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, artifact::StoreError>) -> T {
     loop {
         if let Locked::Held(held) = attempt().unwrap() {
@@ -121,7 +132,8 @@ fn waiting((stage, parameter): (u8, u8)) -> Waiting {
 fn make(case: &Case) -> Made {
     // In memory where there is such a place: objects are synced to disk.
     let memory = std::path::Path::new("/dev/shm");
-    let dir = if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
+    let dir =
+        if memory.is_dir() { tempfile::tempdir_in(memory) } else { tempfile::tempdir() }.unwrap();
     let store = Store::open(dir.path()).unwrap();
     let (mut keys, mut parts): (Vec<String>, _) = (Vec::new(), BTreeMap::new());
     for action in &case.actions {
@@ -130,7 +142,9 @@ fn make(case: &Case) -> Made {
         key_parts.insert("parameter p".into(), json!(action.parameter));
         let mut made_of = Vec::new();
         if !keys.is_empty() {
-            made_of.extend(action.inputs.iter().map(|earlier| keys[*earlier as usize % keys.len()].clone()));
+            made_of.extend(
+                action.inputs.iter().map(|earlier| keys[*earlier as usize % keys.len()].clone()),
+            );
         }
         // Actions with equal inputs and parameters are one.
         key_parts.insert("input".into(), json!(made_of));
@@ -144,7 +158,8 @@ fn make(case: &Case) -> Made {
         let entered = held(|| store.try_enter());
         match holder {
             Holder::Pin(numbers) => {
-                let actions: Vec<(String, String)> = numbers.iter().map(|n| ("s".to_owned(), key(n))).collect();
+                let actions: Vec<(String, String)> =
+                    numbers.iter().map(|n| ("s".to_owned(), key(n))).collect();
                 store.pin(&entered, &format!("pin-{i}"), Vec::new(), &actions).unwrap();
             }
             Holder::Lock(number) => {
@@ -161,7 +176,8 @@ fn make(case: &Case) -> Made {
                 } else {
                     let path = store.root().join(format!("runs/{}.jsonl", run.id()));
                     drop(run);
-                    let text = fs::read_to_string(&path).unwrap() + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
+                    let text = fs::read_to_string(&path).unwrap()
+                        + &format!("{{\"ended\":{{\"unix\":{}}}}}\n", days_ago(*days));
                     // A file that was never locked.
                     fs::remove_file(&path).unwrap();
                     fs::write(&path, text).unwrap();
@@ -173,14 +189,24 @@ fn make(case: &Case) -> Made {
 }
 
 /// Makes one action; gives its key.
-fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>, made_of: &[String]) -> String {
-    let (key, stage, made_of) = (hash_json(key_parts), format!("s{}", action.stage), made_of.to_vec());
+fn make_action(
+    store: &Store,
+    action: &Action,
+    key_parts: &Map<String, Value>,
+    made_of: &[String],
+) -> String {
+    let (key, stage, made_of) =
+        (hash_json(key_parts), format!("s{}", action.stage), made_of.to_vec());
     if store.record(&key).is_some() {
         return key;
     }
     let entered = held(|| store.try_enter());
-    let unfinished =
-        Unfinished { stage: stage.clone(), key_parts: key_parts.clone(), made_of: made_of.clone(), ..Default::default() };
+    let unfinished = Unfinished {
+        stage: stage.clone(),
+        key_parts: key_parts.clone(),
+        made_of: made_of.clone(),
+        ..Default::default()
+    };
     let attempt = store.begin(&entered, &unfinished, &json!({})).unwrap();
     if action.state != Finished::Yes {
         fs::create_dir_all(&attempt.work).unwrap();
@@ -193,7 +219,8 @@ fn make_action(store: &Store, action: &Action, key_parts: &Map<String, Value>, m
     fs::write(attempt.output.join("file"), format!("{}", action.content)).unwrap();
     let checked = store.check(attempt, "kind").unwrap();
     let started_unix = days_ago(action.days_old);
-    let record = Record { stage, key_parts: key_parts.clone(), made_of, started_unix, ..Record::default() };
+    let record =
+        Record { stage, key_parts: key_parts.clone(), made_of, started_unix, ..Record::default() };
     store.publish(&entered, checked, record).unwrap();
     key
 }
@@ -210,7 +237,9 @@ fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
         match holder {
             Holder::Pin(numbers) => named.extend(numbers.iter().map(key)),
             Holder::Lock(number) => whole.extend([key(number)]),
-            Holder::Run { keys, waiting, days_ago, in_progress } if *in_progress || recent(*days_ago) => {
+            Holder::Run { keys, waiting, days_ago, in_progress }
+                if *in_progress || recent(*days_ago) =>
+            {
                 named.extend(keys.iter().map(key));
                 nodes.extend(waiting);
             }
@@ -219,20 +248,23 @@ fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
     }
     for (number, (parts, _)) in &made.parts {
         let record = made.store.record(number);
-        let fits = nodes
-            .iter()
-            .any(|(stage, parameter)| parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter));
+        let fits = nodes.iter().any(|(stage, parameter)| {
+            parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter)
+        });
         if record.is_some() && fits {
             named.insert(number.clone());
         }
-        let is_recent = record.is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
-        let has_checkpoint = made.store.partial(number).join("work/checkpoint").exists() && !case.drop_unfinished;
+        let is_recent =
+            record.is_some_and(|r| unix_time() - r.started_unix < case.keep_days * 86_400);
+        let has_checkpoint =
+            made.store.partial(number).join("work/checkpoint").exists() && !case.drop_unfinished;
         if is_recent || has_checkpoint {
             whole.insert(number.clone());
         }
     }
     loop {
-        let more: BTreeSet<String> = whole.iter().flat_map(|key| made.parts[key].1.clone()).collect();
+        let more: BTreeSet<String> =
+            whole.iter().flat_map(|key| made.parts[key].1.clone()).collect();
         if more.is_subset(&whole) {
             return named.union(&whole).cloned().collect();
         }
@@ -259,10 +291,12 @@ proptest! {
             waiting: case.plan.1.iter().map(|node| waiting(*node)).collect(),
             with_inputs: false,
         };
-        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished, drop_old: true };
+        let choice = Choice { keep_days: case.keep_days, drop_unfinished: case.drop_unfinished,
+            drop_old: true };
 
         let verdict = judge(store, plan, choice).unwrap();
-        prop_assert_eq!(verdict.lines().len(), store.objects().unwrap().len() + store.partials().unwrap().len());
+        prop_assert_eq!(verdict.lines().len(),
+            store.objects().unwrap().len() + store.partials().unwrap().len());
         verdict.carry_out(store, &held(|| store.try_close())).unwrap();
         store.empty_trash().unwrap();
 
@@ -280,16 +314,29 @@ proptest! {
     }
 }
 
-/// An object that no record names goes, and so does a record that can't be read; the reason is said.
+/// An object that no record names goes, and so does a record that can't be read; the reason is
+/// said.
 #[test]
 fn orphans_go() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
-    let action = Action { stage: 0, parameter: 0, inputs: vec![], content: 1, days_old: 0, state: Finished::Yes };
+    let action = Action {
+        stage: 0,
+        parameter: 0,
+        inputs: vec![],
+        content: 1,
+        days_old: 0,
+        state: Finished::Yes,
+    };
     let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
     let key = make_action(&store, &action, &parts, &[]);
     fs::write(store.action(&key, "json"), "{").unwrap();
-    let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false, drop_old: true }).unwrap();
+    let verdict = judge(
+        &store,
+        Root::default(),
+        Choice { keep_days: 7, drop_unfinished: false, drop_old: true },
+    )
+    .unwrap();
     assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
     verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
@@ -300,15 +347,31 @@ fn orphans_go() {
 fn what_an_older_version_made_stays_until_it_is_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
-    let action = |content| Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes };
+    let action = |content| Action {
+        stage: 0,
+        parameter: 0,
+        inputs: vec![],
+        content,
+        days_old: 90,
+        state: Finished::Yes,
+    };
     let map = |parts: Value| parts.as_object().unwrap().clone();
-    let old = make_action(&store, &action(1), &map(json!({"key version": 1, "parameter lr": 100})), &[]);
+    let old =
+        make_action(&store, &action(1), &map(json!({"key version": 1, "parameter lr": 100})), &[]);
     let now = map(json!({KEY_VERSION_PART: KEY_VERSION, "parameter lr_width": 100}));
     make_action(&store, &action(2), &now, &[]);
     for (drop_old, expected) in [(false, vec![old]), (true, vec![])] {
-        let verdict = judge(&store, Root::default(), Choice { keep_days: 7, drop_unfinished: false, drop_old }).unwrap();
-        let reason =
-            verdict.lines().iter().filter(|line| line.ends_with("an older version of nerf-sr made it (--drop-old)")).count();
+        let verdict = judge(
+            &store,
+            Root::default(),
+            Choice { keep_days: 7, drop_unfinished: false, drop_old },
+        )
+        .unwrap();
+        let reason = verdict
+            .lines()
+            .iter()
+            .filter(|line| line.ends_with("an older version of nerf-sr made it (--drop-old)"))
+            .count();
         assert_eq!(reason, expected.len());
         verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
         assert_eq!(store.action_files().unwrap(), expected);

@@ -4,8 +4,8 @@ use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::{Weights, WeightsError};
 
-/// Adam as PyTorch has it (Kingma and Ba 2015): β 0.9 and 0.999, ε 1e-8. Gradients are given, not kept by the parameters, so that
-/// whoever makes them in parts can add them in an order of its own.
+/// Adam as PyTorch has it (Kingma and Ba 2015): β 0.9 and 0.999, ε 1e-8. Gradients are given, not
+/// kept by the parameters, so that whoever makes them in parts can add them in an order of its own.
 #[derive(Debug)]
 pub struct Adam {
     first: Vec<Tensor>,
@@ -16,7 +16,9 @@ pub struct Adam {
 impl Adam {
     /// For parameters that haven't been trained.
     pub fn new(parameters: impl Iterator<Item = Tensor>) -> Result<Self, TchError> {
-        let first = parameters.map(|p| p.f_zeros_like()?.f_detach()).collect::<Result<Vec<_>, TchError>>()?;
+        let first = parameters
+            .map(|p| p.f_zeros_like()?.f_detach())
+            .collect::<Result<Vec<_>, TchError>>()?;
         let second = first.iter().map(Tensor::f_zeros_like).collect::<Result<_, _>>()?;
         Ok(Self { first, second, updates: 0 })
     }
@@ -27,7 +29,12 @@ impl Adam {
     }
 
     /// Takes a step.
-    pub fn step(&mut self, parameters: impl Iterator<Item = Tensor>, gradients: &[Tensor], rate: f64) -> Result<(), TchError> {
+    pub fn step(
+        &mut self,
+        parameters: impl Iterator<Item = Tensor>,
+        gradients: &[Tensor],
+        rate: f64,
+    ) -> Result<(), TchError> {
         self.updates += 1;
         let t = i32::try_from(self.updates).unwrap_or(i32::MAX);
         let (one, two) = (1.0 - 0.9f64.powi(t), (1.0 - 0.999f64.powi(t)).sqrt());
@@ -43,35 +50,57 @@ impl Adam {
         })
     }
 
-    /// Writes all that a training needs to go on: a network's tensors by name, the moments of those that are learnt, and what the training
-    /// itself counts. The caller makes it atomic.
-    pub fn write_checkpoint(&self, path: &Path, network: Vec<(String, Tensor)>, counts: &[u64]) -> Result<(), WeightsError> {
+    /// Writes all that a training needs to go on: a network's tensors by name, the moments of those
+    /// that are learnt, and what the training itself counts. The caller makes it atomic.
+    pub fn write_checkpoint(
+        &self,
+        path: &Path,
+        network: Vec<(String, Tensor)>,
+        counts: &[u64],
+    ) -> Result<(), WeightsError> {
         let learnt = learnt(&network);
         let moments = |kind: &'static str, of: &[Tensor]| {
-            let named = learnt.iter().zip(of).map(move |((name, _), t)| (format!("{kind}.{name}"), t.shallow_clone()));
+            let named = learnt
+                .iter()
+                .zip(of)
+                .map(move |((name, _), t)| (format!("{kind}.{name}"), t.shallow_clone()));
             named.collect::<Vec<_>>()
         };
         let (first, second) = (moments("first", &self.first), moments("second", &self.second));
         let counts: Vec<i64> = counts.iter().chain([&self.updates]).map(|&c| c as i64).collect();
-        let all: Vec<_> =
-            network.into_iter().chain(first).chain(second).chain([(COUNTS.to_owned(), Tensor::from_slice(&counts))]).collect();
+        let all: Vec<_> = network
+            .into_iter()
+            .chain(first)
+            .chain(second)
+            .chain([(COUNTS.to_owned(), Tensor::from_slice(&counts))])
+            .collect();
         crate::write(path, &all)
     }
 
-    /// Goes on from such a checkpoint: the network's tensors get its values; returned are the optimiser and what was counted. Nothing
-    /// changes where one of them can't be had.
-    pub fn resume<const N: usize>(path: &Path, network: &[(String, Tensor)]) -> Result<(Self, [u64; N]), WeightsError> {
+    /// Goes on from such a checkpoint: the network's tensors get its values; returned are the
+    /// optimiser and what was counted. Nothing changes where one of them can't be had.
+    pub fn resume<const N: usize>(
+        path: &Path,
+        network: &[(String, Tensor)],
+    ) -> Result<(Self, [u64; N]), WeightsError> {
         let weights = Weights::read(path)?;
         let (counts, updates) = counts(&weights)?;
         let moments = |kind: &str| -> Result<Vec<Tensor>, WeightsError> {
             let read = |(name, like): &(String, Tensor)| {
-                Ok(weights.tensor(&format!("{kind}.{name}"), &like.size())?.to_device(like.device()))
+                Ok(weights
+                    .tensor(&format!("{kind}.{name}"), &like.size())?
+                    .to_device(like.device()))
             };
             learnt(network).iter().map(read).collect()
         };
         let adam = Self { first: moments("first")?, second: moments("second")?, updates };
-        let saved = network.iter().map(|(name, tensor)| weights.tensor(name, &tensor.size())).collect::<Result<Vec<_>, _>>()?;
-        no_grad(|| network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from)));
+        let saved = network
+            .iter()
+            .map(|(name, tensor)| weights.tensor(name, &tensor.size()))
+            .collect::<Result<Vec<_>, _>>()?;
+        no_grad(|| {
+            network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from))
+        });
         Ok((adam, counts))
     }
 

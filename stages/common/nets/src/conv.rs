@@ -2,8 +2,8 @@ use tch::{TchError, Tensor};
 
 use crate::{Weights, WeightsError};
 
-/// A convolution with zeros beyond the border, as PyTorch names and lays it out: `NAME.weight` (outputs × inputs × rows × columns) and
-/// `NAME.bias`.
+/// A convolution with zeros beyond the border, as PyTorch names and lays it out: `NAME.weight`
+/// (outputs × inputs × rows × columns) and `NAME.bias`.
 #[derive(Debug)]
 pub struct Conv {
     kernel: Tensor,

@@ -1,10 +1,13 @@
-//! libtorch glue that stages with networks share: determinism and weights. The networks themselves live where they are used.
+//! libtorch glue that stages with networks share: determinism and weights. The networks themselves
+//! live where they are used.
 //!
-//! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes don't depend on threads.
+//! * [`deterministic`]: one intra-op thread; stages work in parallel over images instead, so bytes
+//!   don't depend on threads.
 //! * [`device`]: the device that a stage was asked to use, or why it can't be.
 //! * [`tensor_of`], [`image_of`]: images as tensors.
 //! * [`Adam`]: the optimiser, on gradients that are given.
-//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must have; [`Conv`]: a layer of them.
+//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must
+//!   have; [`Conv`]: a layer of them.
 //!
 //! ```no_run,standalone_crate
 //! nets::deterministic();
@@ -33,7 +36,8 @@ pub fn deterministic() {
     tch::set_num_threads(1);
 }
 
-/// Environment variable that lets CUDA's products use TensorFloat-32, with ten bits behind the point: libtorch's own, off unless it is 1.
+/// Environment variable that lets CUDA's products use TensorFloat-32, with ten bits behind the
+/// point: libtorch's own, off unless it is 1.
 pub const TF32_VARIABLE: &str = "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE";
 
 /// A device that can't be used.
@@ -53,11 +57,14 @@ pub fn device(name: &str) -> Result<Device, DeviceError> {
         Some(index) => index.strip_prefix(':').and_then(|i| i.parse::<usize>().ok()),
         None => None,
     };
-    let Some(index) = index else { return refuse("no such device; cpu, cuda or cuda:N is expected".to_owned()) };
+    let Some(index) = index else {
+        return refuse("no such device; cpu, cuda or cuda:N is expected".to_owned());
+    };
     let found = Cuda::device_count();
     if !Cuda::is_available() || found == 0 {
         return refuse(
-            "no GPU can be used here; leave --device away, or build with LIBTORCH_USE_PYTORCH=1 beside a PyTorch that has CUDA, on a \
+            "no GPU can be used here; leave --device away, or build with LIBTORCH_USE_PYTORCH=1 \
+            beside a PyTorch that has CUDA, on a \
              machine with an NVIDIA driver"
                 .to_owned(),
         );
@@ -105,7 +112,8 @@ impl Weights {
     /// Reads a file of f32, f16, i64 or u8 tensors.
     pub fn read(path: &Path) -> Result<Self, WeightsError> {
         let format = |reason: String| WeightsError::Format { path: path.to_path_buf(), reason };
-        let bytes = std::fs::read(path).map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
+        let bytes = std::fs::read(path)
+            .map_err(|source| WeightsError::Io { path: path.to_path_buf(), source })?;
         let file = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
         let mut tensors = BTreeMap::new();
         for (name, view) in file.tensors() {
@@ -115,17 +123,28 @@ impl Weights {
                 Dtype::F16 => Kind::Half,
                 Dtype::I64 => Kind::Int64,
                 Dtype::U8 => Kind::Uint8,
-                other => return Err(format(format!("tensor {name} is {other:?}; f32, f16, i64 or u8 is expected"))),
+                other => {
+                    return Err(format(format!(
+                        "tensor {name} is {other:?}; f32, f16, i64 or u8 is expected"
+                    )));
+                }
             };
             let tensor = Tensor::from_data_size(view.data(), &shape, kind);
-            tensors.insert(name, if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor });
+            tensors.insert(
+                name,
+                if kind == Kind::Half { tensor.to_kind(Kind::Float) } else { tensor },
+            );
         }
         Ok(Self { path: path.to_path_buf(), tensors })
     }
 
     /// Whole numbers, of which there must be so many.
     pub fn integers(&self, name: &str, count: usize) -> Result<Vec<i64>, WeightsError> {
-        let integers = self.tensors.get(name).filter(|t| t.kind() == Kind::Int64).and_then(|t| Vec::<i64>::try_from(t).ok());
+        let integers = self
+            .tensors
+            .get(name)
+            .filter(|t| t.kind() == Kind::Int64)
+            .and_then(|t| Vec::<i64>::try_from(t).ok());
         integers.filter(|i| i.len() == count).ok_or_else(|| WeightsError::Format {
             path: self.path.clone(),
             reason: format!("no tensor {name} of {count} whole numbers"),
@@ -134,10 +153,12 @@ impl Weights {
 
     /// Bytes, of which there must be so many.
     pub fn bytes(&self, name: &str, count: i64) -> Result<Tensor, WeightsError> {
-        let bytes = self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
-        bytes
-            .map(Tensor::shallow_clone)
-            .ok_or_else(|| WeightsError::Format { path: self.path.clone(), reason: format!("no tensor {name} of {count} bytes") })
+        let bytes =
+            self.tensors.get(name).filter(|t| t.kind() == Kind::Uint8 && t.size() == [count]);
+        bytes.map(Tensor::shallow_clone).ok_or_else(|| WeightsError::Format {
+            path: self.path.clone(),
+            reason: format!("no tensor {name} of {count} bytes"),
+        })
     }
 
     /// Whether there is a tensor of that name.
@@ -145,11 +166,15 @@ impl Weights {
         self.tensors.contains_key(name)
     }
 
-    /// The shape of a tensor that must have so many dimensions: for networks whose size is what their file says.
+    /// The shape of a tensor that must have so many dimensions: for networks whose size is what
+    /// their file says.
     pub fn shape<const N: usize>(&self, name: &str) -> Result<[i64; N], WeightsError> {
         let format = |reason: String| WeightsError::Format { path: self.path.clone(), reason };
-        let size = self.tensors.get(name).ok_or_else(|| format(format!("no tensor {name}")))?.size();
-        size.as_slice().try_into().map_err(|_| format(format!("tensor {name} is {size:?} where {N} dimensions are expected")))
+        let size =
+            self.tensors.get(name).ok_or_else(|| format(format!("no tensor {name}")))?.size();
+        size.as_slice().try_into().map_err(|_| {
+            format(format!("tensor {name} is {size:?} where {N} dimensions are expected"))
+        })
     }
 
     /// A tensor of floats that must have a shape.
@@ -158,13 +183,17 @@ impl Weights {
         let tensor = self.tensors.get(name).filter(|t| t.kind() == Kind::Float);
         let tensor = tensor.ok_or_else(|| format(format!("no tensor {name}")))?;
         if tensor.size() != shape {
-            return Err(format(format!("tensor {name} is {:?} where {shape:?} is expected", tensor.size())));
+            return Err(format(format!(
+                "tensor {name} is {:?} where {shape:?} is expected",
+                tensor.size()
+            )));
         }
         Ok(tensor.shallow_clone())
     }
 }
 
-/// Writes tensors of f32, i64 or u8, by name, as safetensors without metadata, so that bytes repeat.
+/// Writes tensors of f32, i64 or u8, by name, as safetensors without metadata, so that bytes
+/// repeat.
 pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsError> {
     let io = |source| WeightsError::Io { path: path.to_path_buf(), source };
     let refused = |e: TchError| io(std::io::Error::other(e.to_string()));
@@ -175,15 +204,27 @@ pub fn write(path: &Path, tensors: &[(String, Tensor)]) -> Result<(), WeightsErr
             Kind::Uint8 => Dtype::U8,
             _ => Dtype::F32,
         };
-        let flat = tensor.f_detach().and_then(|t| t.f_to_device(Device::Cpu)?.f_contiguous()).map_err(refused)?;
+        let flat = tensor
+            .f_detach()
+            .and_then(|t| t.f_to_device(Device::Cpu)?.f_contiguous())
+            .map_err(refused)?;
         let mut data = vec![0u8; flat.numel() * flat.kind().elt_size_in_bytes()];
         flat.f_copy_data_u8(&mut data, flat.numel()).map_err(refused)?;
-        bytes.push((name.as_str(), dtype, tensor.size().iter().map(|&d| d as usize).collect::<Vec<_>>(), data));
+        bytes.push((
+            name.as_str(),
+            dtype,
+            tensor.size().iter().map(|&d| d as usize).collect::<Vec<_>>(),
+            data,
+        ));
     }
     let views = bytes.iter().map(|(name, dtype, shape, data)| {
-        (*name, TensorView::new(*dtype, shape.clone(), data).expect("the data is that of the shape"))
+        (
+            *name,
+            TensorView::new(*dtype, shape.clone(), data).expect("the data is that of the shape"),
+        )
     });
-    let whole = safetensors::serialize(views, None).map_err(|e| io(std::io::Error::other(e.to_string())))?;
+    let whole = safetensors::serialize(views, None)
+        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
     std::fs::write(path, whole).map_err(io)
 }
 
@@ -206,12 +247,17 @@ mod tests {
     #[test]
     fn what_is_written_is_read() {
         let path = tempfile::tempdir().unwrap().keep().join("w.safetensors");
-        let (a, b) = (Tensor::from_slice(&[1.5f32, -2.0]).reshape([2, 1]), Tensor::from_slice(&[3i64, -1]));
+        let (a, b) =
+            (Tensor::from_slice(&[1.5f32, -2.0]).reshape([2, 1]), Tensor::from_slice(&[3i64, -1]));
         write(&path, &[("a".to_owned(), a.shallow_clone()), ("b".to_owned(), b)]).unwrap();
         let weights = Weights::read(&path).unwrap();
         assert_eq!(weights.tensor("a", &[2, 1]).unwrap(), a);
         assert_eq!(weights.integers("b", 2).unwrap(), [3, -1]);
-        assert!(weights.tensor("b", &[2]).is_err() && weights.integers("a", 2).is_err() && weights.integers("b", 3).is_err());
+        assert!(
+            weights.tensor("b", &[2]).is_err()
+                && weights.integers("a", 2).is_err()
+                && weights.integers("b", 3).is_err()
+        );
     }
 
     #[test]
@@ -222,11 +268,19 @@ mod tests {
         let view = safetensors::tensor::TensorView::new(Dtype::F32, vec![2, 3], &data).unwrap();
         std::fs::write(&path, safetensors::serialize([("a", view)], None).unwrap()).unwrap();
         let weights = Weights::read(&path).unwrap();
-        assert_eq!(f64::try_from(weights.tensor("a", &[2, 3]).unwrap().sum(Kind::Double)).unwrap(), 15.0);
+        assert_eq!(
+            f64::try_from(weights.tensor("a", &[2, 3]).unwrap().sum(Kind::Double)).unwrap(),
+            15.0
+        );
         assert!(weights.tensor("a", &[3, 2]).unwrap_err().to_string().contains("[2, 3]"));
         assert!(weights.tensor("b", &[1]).is_err());
         assert_eq!(weights.shape::<2>("a").unwrap(), [2, 3]);
-        assert!(weights.shape::<3>("a").is_err() && weights.shape::<1>("b").is_err() && weights.has("a") && !weights.has("b"));
+        assert!(
+            weights.shape::<3>("a").is_err()
+                && weights.shape::<1>("b").is_err()
+                && weights.has("a")
+                && !weights.has("b")
+        );
         std::fs::write(&path, b"not safetensors").unwrap();
         assert!(Weights::read(&path).is_err());
     }

@@ -14,7 +14,8 @@ fn golden() -> PathBuf {
 }
 
 fn apart(a: &Tensor, b: &Tensor) -> f64 {
-    let norm = |t: &Tensor| t.to_kind(Kind::Double).square().sum(Kind::Double).sqrt().double_value(&[]);
+    let norm =
+        |t: &Tensor| t.to_kind(Kind::Double).square().sum(Kind::Double).sqrt().double_value(&[]);
     norm(&(a - b)) / norm(b)
 }
 
@@ -25,7 +26,8 @@ fn network_and_loss_are_those_of_pytorch() {
     let four = |name: &str| file.tensor(name, &file.shape::<4>(name).unwrap()).unwrap();
     let read = || PaperRefiner::read(&golden(), 4).unwrap();
     let (rendered, truth) = (four("golden.rendered"), four("golden.truth"));
-    let references = file.tensor("golden.references", &file.shape::<4>("golden.references").unwrap()).unwrap();
+    let references =
+        file.tensor("golden.references", &file.shape::<4>("golden.references").unwrap()).unwrap();
 
     let network = read();
     let features = tch::no_grad(|| network.encode(&rendered, false)).unwrap();
@@ -48,7 +50,8 @@ fn network_and_loss_are_those_of_pytorch() {
     for (kind, blocks) in [("l1", 0), ("caffe", 3), ("torchvision", 5)] {
         let prefix = format!("golden.{kind}.");
         let perceptual = (blocks > 0).then(|| {
-            let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/vgg-{kind}.safetensors"));
+            let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+                .join(format!("tests/data/vgg-{kind}.safetensors"));
             PerceptualLoss::of(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
         });
         assert_eq!(perceptual.as_ref().map_or(0, PerceptualLoss::blocks), blocks);

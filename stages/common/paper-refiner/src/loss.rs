@@ -4,11 +4,13 @@ use nets::{Conv, Weights};
 use refinement::RefinementError;
 use tch::{Kind, TchError, Tensor};
 
-/// The paper's perceptual loss: mean absolute differences of VGG-19's features after the second ReLU of each block, weighted 1, 0.75, 0.5, 0.5
-/// and 1, of as many blocks as there are weights for.
+/// The paper's perceptual loss: mean absolute differences of VGG-19's features after the second
+/// ReLU of each block, weighted 1, 0.75, 0.5, 0.5 and 1, of as many blocks as there are weights
+/// for.
 ///
-/// Two kinds of file are known by the names in them: torchvision's (`features.N.weight`), and those in Caffe's scaling (`convB_N.weight`), whose
-/// features are hundreds of times as large and are therefore divided by the truth's mean feature, layer by layer.
+/// Two kinds of file are known by the names in them: torchvision's (`features.N.weight`), and those
+/// in Caffe's scaling (`convB_N.weight`), whose features are hundreds of times as large and are
+/// therefore divided by the truth's mean feature, layer by layer.
 #[derive(Debug)]
 pub struct PerceptualLoss {
     /// Convolutions by block; what comes after the last that is compared isn't kept.
@@ -40,7 +42,11 @@ impl PerceptualLoss {
         let (mut blocks, mut inputs, mut index) = (Vec::new(), 3, 0);
         for (block, (outputs, (_, count))) in widths.into_iter().zip(BLOCKS).enumerate() {
             let name = |i: usize| {
-                if caffe { format!("conv{}_{}", block + 1, i + 1) } else { format!("features.{}", index + 2 * i) }
+                if caffe {
+                    format!("conv{}_{}", block + 1, i + 1)
+                } else {
+                    format!("features.{}", index + 2 * i)
+                }
             };
             let names: Vec<String> = (0..count).map(name).collect();
             // The second one's features are compared.
@@ -79,7 +85,11 @@ impl PerceptualLoss {
         let features = self.features(found)?;
         let expected = tch::no_grad(|| self.features(truth))?;
         for ((a, b), share) in features.iter().zip(&expected).zip(SHARES) {
-            let scale = if self.caffe { b.f_abs()?.f_mean(Kind::Float)?.f_double_value(&[])? + LEAST } else { 1.0 };
+            let scale = if self.caffe {
+                b.f_abs()?.f_mean(Kind::Float)?.f_double_value(&[])? + LEAST
+            } else {
+                1.0
+            };
             let apart = a.f_sub(b)?.f_abs()?.f_mean(Kind::Float)?.f_mul_scalar(share / scale)?;
             sum = Some(match sum {
                 Some(sum) => sum.f_add(&apart)?,

@@ -13,7 +13,8 @@ pub struct PaperRefiner {
     width: u32,
 }
 
-/// A convolution of 3×3 with zeros around, normalisation by batch where there is one, ReLU (the last layer has tanh).
+/// A convolution of 3×3 with zeros around, normalisation by batch where there is one, ReLU (the
+/// last layer has tanh).
 #[derive(Debug)]
 struct ConvLayer {
     kernel: Tensor,
@@ -22,7 +23,8 @@ struct ConvLayer {
     stride: i64,
 }
 
-/// Batch normalisation: the mean and variance of a batch while training, their running means afterwards.
+/// Batch normalisation: the mean and variance of a batch while training, their running means
+/// afterwards.
 #[derive(Debug)]
 struct BatchNorm {
     scale: Tensor,
@@ -31,7 +33,8 @@ struct BatchNorm {
     variance: Tensor,
 }
 
-/// Inputs and outputs in multiples of the width (colours where there are none), stride, and whether it is normalised.
+/// Inputs and outputs in multiples of the width (colours where there are none), stride, and whether
+/// it is normalised.
 type Spec = (Option<i64>, Option<i64>, i64, bool);
 
 const ENCODER: [Spec; 7] = [
@@ -72,8 +75,8 @@ const WIDEST: u32 = 1024;
 const WEIGHTS: u64 = 320;
 
 impl PaperRefiner {
-    /// A network that hasn't learnt anything, initialised as the reference does (He et al. 2015; scales of normalisation about 1).
-    /// The published width is 128.
+    /// A network that hasn't learnt anything, initialised as the reference does (He et al. 2015;
+    /// scales of normalisation about 1). The published width is 128.
     pub fn new(width: u32, seed: u64) -> Result<Self, RefinementError> {
         let mut number = 0;
         Self::build(width, |_, shape, part| {
@@ -87,10 +90,14 @@ impl PaperRefiner {
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
             let values: Vec<f32> = match part {
-                LayerTensor::Kernel => (0..count).map(|_| ((2.0 / inputs).sqrt() * normal()) as f32).collect(),
+                LayerTensor::Kernel => {
+                    (0..count).map(|_| ((2.0 / inputs).sqrt() * normal()) as f32).collect()
+                }
                 LayerTensor::Scale => (0..count).map(|_| (1.0 + 0.02 * normal()) as f32).collect(),
                 LayerTensor::Variance => vec![1.0; count as usize],
-                LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => vec![0.0; count as usize],
+                LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => {
+                    vec![0.0; count as usize]
+                }
             };
             Ok(Tensor::f_from_slice(&values)?.f_reshape(shape)?)
         })
@@ -126,14 +133,17 @@ impl PaperRefiner {
         mut tensor: impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
         let mut layers = |name: &str, specs: &[Spec]| {
-            let channels = |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
-            let layer = |(i, &(inputs, outputs, stride, normalised)): (usize, &Spec)| -> Result<ConvLayer, RefinementError> {
+            let channels =
+                |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
+            let layer = |(i, &(inputs, outputs, stride, normalised)): (usize,
+                &Spec)| -> Result<ConvLayer, RefinementError> {
                 let (inputs, outputs) = (channels(inputs), channels(outputs));
                 let mut of = |part: LayerTensor, shape: &[i64]| {
                     let tensor = tensor(&format!("{name}.{i}.{}", part.name()), shape, part)?;
                     Ok::<_, RefinementError>(if part.is_learnt() { tensor.set_requires_grad(true) } else { tensor })
                 };
-                let (kernel, bias) = (of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?, of(LayerTensor::Bias, &[outputs])?);
+                let (kernel, bias) = (of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?,
+                    of(LayerTensor::Bias, &[outputs])?);
                 let norm = if normalised {
                     Some(BatchNorm {
                         scale: of(LayerTensor::Scale, &[outputs])?,
@@ -157,7 +167,9 @@ impl PaperRefiner {
         let of = |name: &str, layers: &[ConvLayer]| -> Vec<(String, Tensor)> {
             let layer = |(i, layer): (usize, &ConvLayer)| {
                 let tensors = layer.tensors().into_iter();
-                tensors.map(|(part, tensor)| (format!("{name}.{i}.{}", part.name()), tensor)).collect::<Vec<_>>()
+                tensors
+                    .map(|(part, tensor)| (format!("{name}.{i}.{}", part.name()), tensor))
+                    .collect::<Vec<_>>()
             };
             layers.iter().enumerate().flat_map(layer).collect()
         };
@@ -166,7 +178,12 @@ impl PaperRefiner {
 
     /// What is learnt.
     pub(crate) fn parameters(&self) -> impl Iterator<Item = Tensor> {
-        self.encoder.iter().chain(&self.decoder).flat_map(ConvLayer::tensors).filter(|(part, _)| part.is_learnt()).map(|(_, t)| t)
+        self.encoder
+            .iter()
+            .chain(&self.decoder)
+            .flat_map(ConvLayer::tensors)
+            .filter(|(part, _)| part.is_learnt())
+            .map(|(_, t)| t)
     }
 
     /// Another handle on the same tensors, for another thread.
@@ -187,9 +204,14 @@ impl PaperRefiner {
         Ok(features)
     }
 
-    /// What patches should look like, -1..1: rendered ones (count × 3 × rows × columns) beside as many references for each (count · references
-    /// × 3 × rows × columns).
-    pub(crate) fn forward(&self, rendered: &Tensor, references: &Tensor, training: bool) -> Result<Tensor, TchError> {
+    /// What patches should look like, -1..1: rendered ones (count × 3 × rows × columns) beside as
+    /// many references for each (count · references × 3 × rows × columns).
+    pub(crate) fn forward(
+        &self,
+        rendered: &Tensor,
+        references: &Tensor,
+        training: bool,
+    ) -> Result<Tensor, TchError> {
         let count = rendered.size()[0];
         let own = self.encode(rendered, training)?;
         let theirs = self.encode(references, training)?;
@@ -197,7 +219,9 @@ impl PaperRefiner {
             let [all, channels, rows, columns] = features.size()[..] else {
                 return Err(TchError::Shape("features have four dimensions".to_owned()));
             };
-            features.f_reshape([count, all / count.max(1), channels, rows, columns])?.f_amax([1], false)
+            features
+                .f_reshape([count, all / count.max(1), channels, rows, columns])?
+                .f_amax([1], false)
         };
         let mut x = None::<Tensor>;
         // From the coarsest on, three layers a size; the last ends in colours.
@@ -208,7 +232,9 @@ impl PaperRefiner {
             for (i, layer) in layers.iter().enumerate() {
                 let is_last = at == 0 && i == 2;
                 if i == 2 && !is_last {
-                    y = y.f_repeat_interleave_self_int(2, 2, None)?.f_repeat_interleave_self_int(2, 3, None)?;
+                    y = y
+                        .f_repeat_interleave_self_int(2, 2, None)?
+                        .f_repeat_interleave_self_int(2, 3, None)?;
                 }
                 y = layer.forward(&y, training)?;
                 y = if is_last { y.f_tanh()? } else { y.f_relu()? };
@@ -251,7 +277,16 @@ impl ConvLayer {
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor, TchError> {
         let y = x.f_conv2d(&self.kernel, Some(&self.bias), [self.stride; 2], [1, 1], [1, 1], 1)?;
         let Some(BatchNorm { scale, shift, mean, variance }) = &self.norm else { return Ok(y) };
-        y.f_batch_norm(Some(scale), Some(shift), Some(mean), Some(variance), training, MOMENTUM, EPSILON, false)
+        y.f_batch_norm(
+            Some(scale),
+            Some(shift),
+            Some(mean),
+            Some(variance),
+            training,
+            MOMENTUM,
+            EPSILON,
+            false,
+        )
     }
 
     fn tensors(&self) -> Vec<(LayerTensor, Tensor)> {
@@ -264,7 +299,9 @@ impl ConvLayer {
                 (LayerTensor::Variance, variance),
             ]
         });
-        let all = [(LayerTensor::Kernel, &self.kernel), (LayerTensor::Bias, &self.bias)].into_iter().chain(norm);
+        let all = [(LayerTensor::Kernel, &self.kernel), (LayerTensor::Bias, &self.bias)]
+            .into_iter()
+            .chain(norm);
         all.map(|(part, tensor)| (part, tensor.shallow_clone())).collect()
     }
 
@@ -275,6 +312,11 @@ impl ConvLayer {
             mean: norm.mean.shallow_clone(),
             variance: norm.variance.shallow_clone(),
         });
-        Self { kernel: self.kernel.shallow_clone(), bias: self.bias.shallow_clone(), norm, stride: self.stride }
+        Self {
+            kernel: self.kernel.shallow_clone(),
+            bias: self.bias.shallow_clone(),
+            norm,
+            stride: self.stride,
+        }
     }
 }

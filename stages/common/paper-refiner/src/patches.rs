@@ -20,9 +20,10 @@ const LOOKS: usize = 4;
 type Corner = (usize, usize);
 
 impl PaperRefiner {
-    /// A view redrawn by patches of 64×64 that overlap by so many pixels, at most by half, and are blended. Each gets `count` patches of references that show the same: where its own
-    /// pixels are seen there, by depth and with nothing before them. One that has fewer is given itself instead, as in the reference.
-    /// An image of three channels in 0..1.
+    /// A view redrawn by patches of 64×64 that overlap by so many pixels, at most by half, and are
+    /// blended. Each gets `count` patches of references that show the same: where its own pixels
+    /// are seen there, by depth and with nothing before them. One that has fewer is given itself
+    /// instead, as in the reference. An image of three channels in 0..1.
     pub fn refine(
         &self,
         rendered: &Rendered,
@@ -32,10 +33,15 @@ impl PaperRefiner {
     ) -> Result<Image, RefinementError> {
         let view = &rendered.view;
         if view.width < PATCH || view.height < PATCH {
-            let reason = format!("{}×{} pixels; the paper's network needs {PATCH}×{PATCH}", view.width, view.height);
+            let reason = format!(
+                "{}×{} pixels; the paper's network needs {PATCH}×{PATCH}",
+                view.width, view.height
+            );
             return Err(RefinementError::View { name: rendered.camera.name.clone(), reason });
         }
-        if let Some(small) = references.iter().find(|r| r.truth.width < PATCH || r.truth.height < PATCH) {
+        if let Some(small) =
+            references.iter().find(|r| r.truth.width < PATCH || r.truth.height < PATCH)
+        {
             let reason = format!("a reference of fewer than {PATCH}×{PATCH} pixels");
             return Err(RefinementError::View { name: small.rendered.camera.name.clone(), reason });
         }
@@ -46,8 +52,10 @@ impl PaperRefiner {
             .collect();
         let redraw = |(corner, network): (Corner, Self)| -> Result<(Corner, Vec<f32>), TchError> {
             let own = patch(view, corner);
-            let mut others: Vec<Vec<f32>> =
-                matches(rendered, references, corner, count).into_iter().map(|(r, at)| patch(&references[r].truth, at)).collect();
+            let mut others: Vec<Vec<f32>> = matches(rendered, references, corner, count)
+                .into_iter()
+                .map(|(r, at)| patch(&references[r].truth, at))
+                .collect();
             if others.is_empty() {
                 others.push(own.clone());
             }
@@ -58,7 +66,12 @@ impl PaperRefiner {
                     .f_permute([0, 3, 1, 2])
             };
             let drawn = no_grad(|| network.forward(&tensor(&[own])?, &tensor(&others)?, false))?;
-            Ok((corner, Vec::<f32>::try_from(&drawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?)?))
+            Ok((
+                corner,
+                Vec::<f32>::try_from(
+                    &drawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?,
+                )?,
+            ))
         };
         let drawn = corners.into_par_iter().map(redraw).collect::<Result<Vec<_>, _>>()?;
         Ok(stitch(view.width, view.height, &drawn))
@@ -85,31 +98,50 @@ pub(crate) fn patch(image: &Image, (x, y): Corner) -> Vec<f32> {
     samples
 }
 
-/// Reference patches that show what a patch does, best first: which reference, and its corner. Pixels spread over the patch each say where the
-/// patch lies in a reference that sees them; the same corner counts once.
-fn matches(rendered: &Rendered, references: &[&KnownView], (x, y): Corner, count: usize) -> Vec<(usize, Corner)> {
+/// Reference patches that show what a patch does, best first: which reference, and its corner.
+/// Pixels spread over the patch each say where the patch lies in a reference that sees them; the
+/// same corner counts once.
+fn matches(
+    rendered: &Rendered,
+    references: &[&KnownView],
+    (x, y): Corner,
+    count: usize,
+) -> Vec<(usize, Corner)> {
     let surface = rendered.surface();
     let surfaces: Vec<Surface<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
     let step = PATCH / LOOKS;
     let mut found = Vec::new();
-    for (dx, dy) in (0..LOOKS).flat_map(|j| (0..LOOKS).map(move |i| (i * step + step / 2, j * step + step / 2))) {
+    for (dx, dy) in
+        (0..LOOKS).flat_map(|j| (0..LOOKS).map(move |i| (i * step + step / 2, j * step + step / 2)))
+    {
         for (r, other) in surfaces.iter().enumerate() {
             let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };
             let truth = &references[r].truth;
-            // The pixel's centre is seen at `place`: its patch begins as far before it as it does here.
+            // The pixel's centre is seen at `place`: its patch begins as far before it as it does
+            // here.
             let corner = |place: f32, by: usize, size: usize| {
-                ((place - 0.5).round() as isize - by as isize).clamp(0, (size - PATCH) as isize) as usize
+                ((place - 0.5).round() as isize - by as isize).clamp(0, (size - PATCH) as isize)
+                    as usize
             };
-            let at = (corner(visibility.place[0], dx, truth.width), corner(visibility.place[1], dy, truth.height));
+            let at = (
+                corner(visibility.place[0], dx, truth.width),
+                corner(visibility.place[1], dy, truth.height),
+            );
             found.push((visibility.cosine.max(0.0) * visibility.detail.min(1.0), r, at));
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)).then(a.2.cmp(&b.2)));
     let mut taken = BTreeSet::new();
-    found.into_iter().map(|(_, r, at)| (r, at)).filter(|patch| taken.insert(*patch)).take(count).collect()
+    found
+        .into_iter()
+        .map(|(_, r, at)| (r, at))
+        .filter(|patch| taken.insert(*patch))
+        .take(count)
+        .collect()
 }
 
-/// Patches in -1..1 as an image in 0..1: where they overlap, each weighs by how far it is from its own border.
+/// Patches in -1..1 as an image in 0..1: where they overlap, each weighs by how far it is from its
+/// own border.
 fn stitch(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Image {
     let (mut sum, mut weights) = (vec![0.0f32; width * height * 3], vec![0.0f32; width * height]);
     let inward = |i: usize| (i + 1).min(PATCH - i) as f32;
@@ -121,7 +153,9 @@ fn stitch(width: usize, height: usize, patches: &[(Corner, Vec<f32>)]) -> Image 
             weights[at] += weight;
         }
     }
-    sum.chunks_exact_mut(3).zip(weights).for_each(|(pixel, w)| pixel.iter_mut().for_each(|v| *v = (*v / w).clamp(0.0, 1.0)));
+    sum.chunks_exact_mut(3)
+        .zip(weights)
+        .for_each(|(pixel, w)| pixel.iter_mut().for_each(|v| *v = (*v / w).clamp(0.0, 1.0)));
     Image::new(width, height, 3, sum)
 }
 
@@ -138,13 +172,17 @@ mod tests {
 
     #[test]
     fn patches_that_do_nothing_are_stitched_to_the_image() {
-        for (width, height, overlap) in [(64, 64, 16), (65, 200, 0), (150, 112, 16), (150, 112, 0), (129, 300, 100)] {
+        for (width, height, overlap) in
+            [(64, 64, 16), (65, 200, 0), (150, 112, 16), (150, 112, 0), (129, 300, 100)]
+        {
             let whole = image(width, height, 3);
-            let corners =
-                starts(height, overlap).into_iter().flat_map(|y| starts(width, overlap).into_iter().map(move |x| (x, y)));
+            let corners = starts(height, overlap)
+                .into_iter()
+                .flat_map(|y| starts(width, overlap).into_iter().map(move |x| (x, y)));
             let patches: Vec<_> = corners.map(|corner| (corner, patch(&whole, corner))).collect();
             let again = stitch(width, height, &patches);
-            let worst = whole.data.iter().zip(&again.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            let worst =
+                whole.data.iter().zip(&again.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
             assert!(worst < 1e-6, "{width}×{height} by {overlap}: {worst}");
         }
     }
@@ -163,15 +201,29 @@ mod tests {
         let (width, height) = (160, 96);
         let camera = Camera {
             name: format!("{pixels}"),
-            intrinsics: Intrinsics { width, height, fx: 100.0, fy: 100.0, cx: 80.0, cy: 48.0, distortion: Default::default() },
-            camera_to_world: [[1.0, 0.0, 0.0, pixels / 50.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+            intrinsics: Intrinsics {
+                width,
+                height,
+                fx: 100.0,
+                fy: 100.0,
+                cx: 80.0,
+                cy: 48.0,
+                distortion: Default::default(),
+            },
+            camera_to_world: [
+                [1.0, 0.0, 0.0, pixels / 50.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 2.0],
+            ],
         };
         let (view, count) = (image(width as usize, height as usize, 4), (width * height) as usize);
-        let rendered = Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
+        let rendered =
+            Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
         KnownView { rendered, truth: image(width as usize, height as usize, 3) }
     }
 
-    /// Before a wall, a reference shows all pixels of a patch at one place; a reference that doesn't look there has none.
+    /// Before a wall, a reference shows all pixels of a patch at one place; a reference that
+    /// doesn't look there has none.
     #[test]
     fn reference_patches_show_the_same_place() {
         let (view, right, away) = (known(0.0), known(20.0), known(400.0));

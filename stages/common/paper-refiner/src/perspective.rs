@@ -1,11 +1,12 @@
 use counter_rng::CounterRng;
 use pixels::Image;
 
-/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at most a share of its half width
-/// and height.
+/// A random perspective, as torchvision draws them: every corner of an image moves inwards by at
+/// most a share of its half width and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
-    /// From places of the warped image to those of the image: (ax + by + c, dx + ey + f) / (gx + hy + 1).
+    /// From places of the warped image to those of the image: (ax + by + c, dx + ey + f) / (gx + hy +
+    /// 1).
     map: [f64; 8],
     /// The rectangle that the image fills once it is warped: x, y, and one past the end.
     pub(crate) filled: [usize; 4],
@@ -22,7 +23,8 @@ impl Perspective {
 
     /// A random one.
     pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
-        let mut inwards = |size: usize| rng.below((DISTORTION * (size / 2) as f64) as u64 + 1) as f64;
+        let mut inwards =
+            |size: usize| rng.below((DISTORTION * (size / 2) as f64) as u64 + 1) as f64;
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {
@@ -30,8 +32,11 @@ impl Perspective {
             (if x > 0.0 { x - dx } else { dx }, if y > 0.0 { y - dy } else { dy })
         });
         let Some(map) = homography(moved, corners) else { return Self::identity(width, height) };
-        let low = |of: fn(&(f64, f64)) -> f64| moved.iter().map(of).fold(f64::INFINITY, f64::min) as usize;
-        let high = |of: fn(&(f64, f64)) -> f64| moved.iter().map(of).fold(0.0, f64::max) as usize + 1;
+        let low = |of: fn(&(f64, f64)) -> f64| {
+            moved.iter().map(of).fold(f64::INFINITY, f64::min) as usize
+        };
+        let high =
+            |of: fn(&(f64, f64)) -> f64| moved.iter().map(of).fold(0.0, f64::max) as usize + 1;
         Self { map, filled: [low(|p| p.0), low(|p| p.1), high(|p| p.0), high(|p| p.1)] }
     }
 
@@ -45,7 +50,9 @@ impl Perspective {
         for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
             let (column, row) = (left + dx, top + dy);
             // NaN is in no image.
-            if !(0.0..image.width as f64).contains(&column) || !(0.0..image.height as f64).contains(&row) {
+            if !(0.0..image.width as f64).contains(&column)
+                || !(0.0..image.height as f64).contains(&row)
+            {
                 continue;
             }
             let share = (1.0 - (u - column).abs()) * (1.0 - (v - row).abs());
@@ -63,11 +70,15 @@ fn homography(from: [(f64, f64); 4], to: [(f64, f64); 4]) -> Option<[f64; 8]> {
         .into_iter()
         .zip(to)
         .flat_map(|((x, y), (u, v))| {
-            [[x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, u], [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, v]]
+            [
+                [x, y, 1.0, 0.0, 0.0, 0.0, -u * x, -u * y, u],
+                [0.0, 0.0, 0.0, x, y, 1.0, -v * x, -v * y, v],
+            ]
         })
         .collect();
     for column in 0..8 {
-        let pivot = (column..8).max_by(|&a, &b| rows[a][column].abs().total_cmp(&rows[b][column].abs()))?;
+        let pivot =
+            (column..8).max_by(|&a, &b| rows[a][column].abs().total_cmp(&rows[b][column].abs()))?;
         rows.swap(column, pivot);
         let by = rows[column][column];
         if by.abs() < 1e-12 {
@@ -96,7 +107,10 @@ mod tests {
         let [a, b, c, d, e, f, g, h] = homography(from, to).unwrap();
         for ((x, y), (u, v)) in from.into_iter().zip(to) {
             let w = g * x + h * y + 1.0;
-            assert!(((a * x + b * y + c) / w - u).abs() < 1e-9 && ((d * x + e * y + f) / w - v).abs() < 1e-9);
+            assert!(
+                ((a * x + b * y + c) / w - u).abs() < 1e-9
+                    && ((d * x + e * y + f) / w - v).abs() < 1e-9
+            );
         }
         assert_eq!(homography([(0.0, 0.0), (1.0, 1.0), (2.0, 2.0), (3.0, 3.0)], to), None);
     }
@@ -113,7 +127,10 @@ mod tests {
             for (x, y) in (0..40).flat_map(|x| (0..30).map(move |y| (x, y))) {
                 // The border fades over a pixel.
                 let inside = x + 1 >= left && x <= right && y + 1 >= top && y <= bottom;
-                assert!(inside || warp.colour(&image, x, y).iter().all(|c| *c < 1e-6), "seed {seed} at {x}, {y}");
+                assert!(
+                    inside || warp.colour(&image, x, y).iter().all(|c| *c < 1e-6),
+                    "seed {seed} at {x}, {y}"
+                );
             }
             assert!(warp.colour(&image, 20, 15)[0] > 0.05);
         }

@@ -26,9 +26,10 @@ pub struct PaperTraining {
     pub seed: u64,
 }
 
-/// Trains a [`PaperRefiner`] on rendered views of references beside the references themselves: a patch of both, warped by one of 200 random
-/// perspectives, with reference patches that lie within a fixed window around it in the image that isn't warped. Its error is
-/// the mean absolute one, of -1..1.
+/// Trains a [`PaperRefiner`] on rendered views of references beside the references themselves: a
+/// patch of both, warped by one of 200 random perspectives, with reference patches that lie within
+/// a fixed window around it in the image that isn't warped. Its error is the mean absolute one, of
+/// -1..1.
 pub struct PaperTrainer {
     network: PaperRefiner,
     options: PaperTraining,
@@ -75,12 +76,16 @@ impl Training for PaperTrainer {
         for i in 0..batch {
             let mut rng = CounterRng::new(seed, PATCHES, self.steps() * batch as u64 + i as u64);
             let number = rng.below(examples.len() as u64);
-            let drawn = TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
+            let drawn =
+                TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
             drawn.append(&mut rendered, &mut truth, &mut others);
         }
         let side = patch as i64;
         let tensor = |samples: &[f32], count: usize| {
-            Tensor::f_from_slice(samples)?.f_reshape([count as i64, side, side, COLOURS])?.f_permute([0, 3, 1, 2])?.f_contiguous()
+            Tensor::f_from_slice(samples)?
+                .f_reshape([count as i64, side, side, COLOURS])?
+                .f_permute([0, 3, 1, 2])?
+                .f_contiguous()
         };
         let (rendered, truth) = (tensor(&rendered, batch)?, tensor(&truth, batch)?);
         let found = self.network.forward(&rendered, &tensor(&others, batch * references)?, true)?;
@@ -105,10 +110,20 @@ impl Training for PaperTrainer {
 }
 
 /// L1 of images in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
-pub(crate) fn loss(found: &Tensor, truth: &Tensor, perceptual: Option<&PerceptualLoss>) -> Result<(Tensor, f64), TchError> {
+pub(crate) fn loss(
+    found: &Tensor,
+    truth: &Tensor,
+    perceptual: Option<&PerceptualLoss>,
+) -> Result<(Tensor, f64), TchError> {
     let first = found.f_sub(truth)?.f_abs()?.f_mean(Kind::Float)?;
     let error = first.f_double_value(&[])?;
-    Ok((perceptual.map_or_else(|| Ok(first.shallow_clone()), |p| p.distance(found, truth)?.f_add(&first))?, error))
+    Ok((
+        perceptual.map_or_else(
+            || Ok(first.shallow_clone()),
+            |p| p.distance(found, truth)?.f_add(&first),
+        )?,
+        error,
+    ))
 }
 
 /// A patch to learn from.
@@ -122,20 +137,36 @@ struct TrainingPatch<'a> {
 }
 
 impl<'a> TrainingPatch<'a> {
-    fn new(example: &'a KnownView, number: u64, options: &PaperTraining, rng: &mut CounterRng) -> Self {
+    fn new(
+        example: &'a KnownView,
+        number: u64,
+        options: &PaperTraining,
+        rng: &mut CounterRng,
+    ) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
         let which = rng.below(PERSPECTIVES);
         // The same 200 throughout.
         let mut shape = CounterRng::new(options.seed, WARPS, number * PERSPECTIVES + which);
-        let warp = if which == 0 { Perspective::identity(width, height) } else { Perspective::draw(width, height, &mut shape) };
+        let warp = if which == 0 {
+            Perspective::identity(width, height)
+        } else {
+            Perspective::draw(width, height, &mut shape)
+        };
         let [left, top, right, bottom] = warp.filled;
-        let within = |low: usize, high: usize, rng: &mut CounterRng| low + rng.below((high.max(low) - low + 1) as u64) as usize;
+        let within = |low: usize, high: usize, rng: &mut CounterRng| {
+            low + rng.below((high.max(low) - low + 1) as u64) as usize
+        };
         let last = |end: usize| end.saturating_sub(options.patch);
-        let corner = (within(left.min(last(right)), last(right), rng), within(top.min(last(bottom)), last(bottom), rng));
+        let corner = (
+            within(left.min(last(right)), last(right), rng),
+            within(top.min(last(bottom)), last(bottom), rng),
+        );
         let near = |at: usize, size: usize, rng: &mut CounterRng| {
             within(at.saturating_sub(WINDOW).min(last(size)), (at + WINDOW).min(last(size)), rng)
         };
-        let references = (0..options.references).map(|_| (near(corner.0, width, rng), near(corner.1, height, rng))).collect();
+        let references = (0..options.references)
+            .map(|_| (near(corner.0, width, rng), near(corner.1, height, rng)))
+            .collect();
         Self { example, warp, patch: options.patch, corner, references }
     }
 
@@ -143,7 +174,8 @@ impl<'a> TrainingPatch<'a> {
     fn append(&self, rendered: &mut Vec<f32>, truth: &mut Vec<f32>, others: &mut Vec<f32>) {
         let signed = |colour: [f32; 3]| colour.map(|v| 2.0 * v - 1.0);
         let places = |(x, y): (usize, usize)| {
-            (y..y + self.patch).flat_map(move |row| (x..x + self.patch).map(move |column| (column, row)))
+            (y..y + self.patch)
+                .flat_map(move |row| (x..x + self.patch).map(move |column| (column, row)))
         };
         for (x, y) in places(self.corner) {
             rendered.extend(signed(self.warp.colour(&self.example.rendered.view, x, y)));
@@ -151,7 +183,9 @@ impl<'a> TrainingPatch<'a> {
         }
         let whole = Perspective::identity(self.example.truth.width, self.example.truth.height);
         for &corner in &self.references {
-            others.extend(places(corner).flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))));
+            others.extend(
+                places(corner).flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))),
+            );
         }
     }
 }
@@ -161,10 +195,14 @@ impl PaperTraining {
     pub fn check(&self, examples: &[KnownView]) -> Result<(), RefinementError> {
         let too_small = |e: &&KnownView| e.truth.width < self.patch || e.truth.height < self.patch;
         let (name, reason) = match examples.iter().find(too_small) {
-            Some(small) => (small.rendered.camera.name.clone(), format!("smaller than a patch of {0}×{0} pixels", self.patch)),
-            None if self.patch == 0 || !self.patch.is_multiple_of(COARSEST) => {
-                ("any".to_owned(), format!("patches of {} pixels: a multiple of {COARSEST} is expected", self.patch))
-            }
+            Some(small) => (
+                small.rendered.camera.name.clone(),
+                format!("smaller than a patch of {0}×{0} pixels", self.patch),
+            ),
+            None if self.patch == 0 || !self.patch.is_multiple_of(COARSEST) => (
+                "any".to_owned(),
+                format!("patches of {} pixels: a multiple of {COARSEST} is expected", self.patch),
+            ),
             None => return Ok(()),
         };
         Err(RefinementError::View { name, reason })
@@ -182,7 +220,9 @@ mod tests {
     /// Stripes beside the same with less contrast.
     fn example() -> KnownView {
         let level = |i: usize| if (i % 48 / 6).is_multiple_of(2) { 0.2f32 } else { 0.8 };
-        let view = (0..48 * 40).flat_map(|i| [0.5 * level(i) + 0.25; 3].into_iter().chain([1.0])).collect();
+        let view = (0..48 * 40)
+            .flat_map(|i| [0.5 * level(i) + 0.25; 3].into_iter().chain([1.0]))
+            .collect();
         let truth = (0..48 * 40).flat_map(|i| [level(i); 3]).collect();
         let camera = Camera {
             name: "stripes".into(),
@@ -198,11 +238,13 @@ mod tests {
             camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
         };
         let view = Image::new(48, 40, 4, view);
-        let rendered = Rendered { camera, view, depth: vec![2.0; 48 * 40], opacity: vec![1.0; 48 * 40] };
+        let rendered =
+            Rendered { camera, view, depth: vec![2.0; 48 * 40], opacity: vec![1.0; 48 * 40] };
         KnownView { rendered, truth: Image::new(48, 40, 3, truth) }
     }
 
-    const OPTIONS: PaperTraining = PaperTraining { steps: 60, batch: 4, patch: 16, references: 2, rate: 3e-3, seed: 5 };
+    const OPTIONS: PaperTraining =
+        PaperTraining { steps: 60, batch: 4, patch: 16, references: 2, rate: 3e-3, seed: 5 };
 
     #[test]
     fn training_learns_and_goes_on_where_it_was() {
@@ -224,13 +266,19 @@ mod tests {
         let mut again = start();
         again.resume(&path).unwrap();
         while again.step(&examples).unwrap().is_some() {}
-        let same = trainer.network().named().iter().zip(again.network().named()).all(|((_, a), (_, b))| *a == b);
+        let same = trainer
+            .network()
+            .named()
+            .iter()
+            .zip(again.network().named())
+            .all(|((_, a), (_, b))| *a == b);
         assert!(same, "a resumed training ends elsewhere");
     }
 
     #[test]
     fn patches_must_fit() {
-        let said = |patch| PaperTraining { patch, ..OPTIONS }.check(&[example()]).unwrap_err().to_string();
+        let said =
+            |patch| PaperTraining { patch, ..OPTIONS }.check(&[example()]).unwrap_err().to_string();
         assert!(said(64).contains("64×64") && said(20).contains("multiple of 8"));
     }
 }

@@ -1,6 +1,7 @@
 use crate::Image;
 
-/// How another exposure made an image from what it should be, channel by channel: v ↦ gain · v + offset.
+/// How another exposure made an image from what it should be, channel by channel: v ↦ gain · v +
+/// offset.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Exposure {
     /// Factors of red, green and blue.
@@ -17,9 +18,9 @@ const LEAST_BLOCKS: f64 = 12.0;
 const POSSIBLE: [f32; 2] = [0.1, 10.0];
 
 impl Exposure {
-    /// The exposure of an image against another of its size that has the right one: the line through both by least squares, a
-    /// channel at a time. Means of square blocks of pixels are compared, of what is clipped in neither. None where too little
-    /// is left, or no line fits.
+    /// The exposure of an image against another of its size that has the right one: the line
+    /// through both by least squares, a channel at a time. Means of square blocks of pixels are
+    /// compared, of what is clipped in neither. None where too little is left, or no line fits.
     ///
     /// # Panics
     /// With fewer than three channels, other sizes, or no pixels in a block.
@@ -44,23 +45,28 @@ impl Exposure {
         Some(exposure)
     }
 
-    /// No more than what a field gets wrong: factors within 10 % and offsets within 0.05 are none. (Views of fern come to 1 %, of lego to 6 %.)
+    /// No more than what a field gets wrong: factors within 10 % and offsets within 0.05 are none.
+    /// (Views of fern come to 1 %, of lego to 6 %.)
     pub fn is_none(&self) -> bool {
-        self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1) && self.offset.iter().all(|o| o.abs() <= 0.05)
+        self.gain.iter().all(|g| (g - 1.0).abs() <= 0.1)
+            && self.offset.iter().all(|o| o.abs() <= 0.05)
     }
 
-    /// Gives an image the right exposure: colours in 0..1, or from 0 to alpha where they are premultiplied.
+    /// Gives an image the right exposure: colours in 0..1, or from 0 to alpha where they are
+    /// premultiplied.
     pub fn take_back(&self, image: &mut Image) {
         for pixel in image.data.chunks_exact_mut(image.channels) {
             let alpha = if let [_, _, _, alpha] = pixel { *alpha } else { 1.0 };
             for (c, value) in pixel.iter_mut().take(3).enumerate() {
-                *value = ((*value - self.offset[c] * alpha) / self.gain[c]).clamp(0.0, alpha.max(0.0));
+                *value =
+                    ((*value - self.offset[c] * alpha) / self.gain[c]).clamp(0.0, alpha.max(0.0));
             }
         }
     }
 }
 
-/// Means of both images' channel over blocks, of those blocks of which at least half is clipped in neither.
+/// Means of both images' channel over blocks, of those blocks of which at least half is clipped in
+/// neither.
 fn block_means(right: &Image, seen: &Image, channel: usize, block: usize) -> Vec<[f64; 2]> {
     let (width, height) = (seen.width, seen.height);
     let is_known = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
@@ -69,7 +75,8 @@ fn block_means(right: &Image, seen: &Image, channel: usize, block: usize) -> Vec
         let (mut n, mut sum) = (0usize, [0.0f64; 2]);
         for row in y..(y + block).min(height) {
             for column in x..(x + block).min(width) {
-                let pair = [right, seen].map(|image| image.data[(row * width + column) * image.channels + channel]);
+                let pair = [right, seen]
+                    .map(|image| image.data[(row * width + column) * image.channels + channel]);
                 if pair.into_iter().all(is_known) {
                     n += 1;
                     (0..2).for_each(|i| sum[i] += f64::from(pair[i]));

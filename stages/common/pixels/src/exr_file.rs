@@ -29,7 +29,8 @@ pub struct Channel {
     pub sample_type: SampleType,
 }
 
-/// The channels of a rendered view: colour and opacity, premultiplied; depth; where it was asked for, the distance along the ray.
+/// The channels of a rendered view: colour and opacity, premultiplied; depth; where it was asked
+/// for, the distance along the ray.
 pub const VIEW_CHANNELS: [Channel; 6] = [
     Channel { name: "R", sample_type: SampleType::Half },
     Channel { name: "G", sample_type: SampleType::Half },
@@ -40,7 +41,8 @@ pub const VIEW_CHANNELS: [Channel; 6] = [
 ];
 
 /// What a rendered view's file says of them.
-pub const VIEW_NOTE: &str = "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
+pub const VIEW_NOTE: &str =
+    "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
 
 /// What an EXR file holds.
 #[derive(Clone, Debug, PartialEq)]
@@ -61,7 +63,11 @@ impl ExrImage {
 
     /// Channels R, G, B and A together, where it has them.
     pub fn premultiplied(&self) -> Option<Image> {
-        let [Some(r), Some(g), Some(b), Some(a)] = ["R", "G", "B", "A"].map(|name| self.channel(name)) else { return None };
+        let [Some(r), Some(g), Some(b), Some(a)] =
+            ["R", "G", "B", "A"].map(|name| self.channel(name))
+        else {
+            return None;
+        };
         let data = (0..r.len()).flat_map(|i| [r[i], g[i], b[i], a[i]]).collect();
         Some(Image::new(self.width, self.height, 4, data))
     }
@@ -70,10 +76,12 @@ impl ExrImage {
 /// Rows compressed together by ZIP16.
 const BAND_ROWS: usize = 16;
 
-/// Writes an EXR file (scan lines, ZIP) whose bytes repeat: increasing line order, compressed in order, one attribute.
+/// Writes an EXR file (scan lines, ZIP) whose bytes repeat: increasing line order, compressed in
+/// order, one attribute.
 ///
-/// `band(first_row, rows, samples)` fills up to 16 rows at a time, `channels` interleaved in the order given, so memory doesn't
-/// grow with the image. `note` says what the colours are. A sample that isn't finite stops the writing.
+/// `band(first_row, rows, samples)` fills up to 16 rows at a time, `channels` interleaved in the
+/// order given, so memory doesn't grow with the image. `note` says what the colours are. A sample
+/// that isn't finite stops the writing.
 pub fn write_exr<E: From<PixelError>>(
     path: &Path,
     (width, height): (usize, usize),
@@ -88,7 +96,12 @@ pub fn write_exr<E: From<PixelError>>(
             SampleType::Half => exr::meta::attribute::SampleType::F16,
             SampleType::Float => exr::meta::attribute::SampleType::F32,
         };
-        ChannelDescription { name: Text::from(channels[i].name), sample_type, quantize_linearly: false, sampling: (1, 1).into() }
+        ChannelDescription {
+            name: Text::from(channels[i].name),
+            sample_type,
+            quantize_linearly: false,
+            sampling: (1, 1).into(),
+        }
     });
     let list = ChannelList::new(described.collect());
     // Measured in facts/pipelines.md: the crate's default line order wrote 40 different files of 40.
@@ -101,28 +114,36 @@ pub fn write_exr<E: From<PixelError>>(
     header.own_attributes.layer_name = None;
     header.own_attributes.other.insert(Text::from("note"), AttributeValue::Text(Text::from(note)));
 
-    let file = File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let file =
+        File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
     let mut failure: Option<E> = None;
     let mut samples = vec![0.0f32; width * BAND_ROWS * channels.len()];
-    let written = exr::block::write(BufWriter::new(file), [header].into_iter().collect(), true, |meta, writer| {
-        let mut compressor = writer.sequential_blocks_compressor(&meta);
-        for (index, block) in exr::block::enumerate_ordered_header_block_indices(&meta.headers) {
-            let (first, rows) = (block.pixel_position.y(), block.pixel_size.height());
-            let samples = &mut samples[..width * rows * channels.len()];
-            let filled = band(first, rows, samples).and_then(|()| {
-                check_finite(path, channels, width, first, samples)?;
-                Ok(block_bytes(samples, width, channels, &order))
-            });
-            match filled {
-                Ok(data) => compressor.compress_block(index, UncompressedBlock { index: block, data })?,
-                Err(error) => {
-                    failure = Some(error);
-                    return Err(exr::error::Error::Aborted);
+    let written = exr::block::write(
+        BufWriter::new(file),
+        [header].into_iter().collect(),
+        true,
+        |meta, writer| {
+            let mut compressor = writer.sequential_blocks_compressor(&meta);
+            for (index, block) in exr::block::enumerate_ordered_header_block_indices(&meta.headers)
+            {
+                let (first, rows) = (block.pixel_position.y(), block.pixel_size.height());
+                let samples = &mut samples[..width * rows * channels.len()];
+                let filled = band(first, rows, samples).and_then(|()| {
+                    check_finite(path, channels, width, first, samples)?;
+                    Ok(block_bytes(samples, width, channels, &order))
+                });
+                match filled {
+                    Ok(data) => compressor
+                        .compress_block(index, UncompressedBlock { index: block, data })?,
+                    Err(error) => {
+                        failure = Some(error);
+                        return Err(exr::error::Error::Aborted);
+                    }
                 }
             }
-        }
-        Ok(())
-    });
+            Ok(())
+        },
+    );
     match (failure, written) {
         (Some(error), _) => Err(error),
         (None, Ok(())) => Ok(()),
@@ -130,7 +151,13 @@ pub fn write_exr<E: From<PixelError>>(
     }
 }
 
-fn check_finite(path: &Path, channels: &[Channel], width: usize, first: usize, samples: &[f32]) -> Result<(), PixelError> {
+fn check_finite(
+    path: &Path,
+    channels: &[Channel],
+    width: usize,
+    first: usize,
+    samples: &[f32],
+) -> Result<(), PixelError> {
     let Some(at) = samples.iter().position(|v| !v.is_finite()) else { return Ok(()) };
     let pixel = at / channels.len();
     Err(PixelError::NotFinite {
@@ -151,7 +178,9 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
             match channels[channel].sample_type {
                 SampleType::Half => {
                     // Largest finite half; beyond it a conversion would make infinity.
-                    line.for_each(|&v| data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes()));
+                    line.for_each(|&v| {
+                        data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes())
+                    });
                 }
                 SampleType::Float => line.for_each(|v| data.extend(v.to_ne_bytes())),
             }
@@ -166,12 +195,16 @@ fn format(path: &Path, reason: &str) -> PixelError {
 }
 
 fn open(path: &Path) -> Result<BufReader<File>, PixelError> {
-    File::open(path).map(BufReader::new).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
+    File::open(path)
+        .map(BufReader::new)
+        .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
 }
 
-/// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any view has is refused.
+/// Columns and rows of the first layer, by the header alone; one that asks for more pixels than any
+/// view has is refused.
 pub fn exr_size(path: &Path) -> Result<(usize, usize), PixelError> {
-    let meta = exr::meta::MetaData::read_from_buffered(open(path)?, false).map_err(|e| exr_error(path, e))?;
+    let meta = exr::meta::MetaData::read_from_buffered(open(path)?, false)
+        .map_err(|e| exr_error(path, e))?;
     if let Some(header) = meta.headers.iter().find(|h| h.layer_size.area() > MAX_PIXELS) {
         let (width, height) = (header.layer_size.width(), header.layer_size.height());
         return Err(PixelError::TooLarge { path: path.to_path_buf(), width, height });
@@ -192,10 +225,15 @@ pub fn read_exr(path: &Path) -> Result<ExrImage, PixelError> {
         .non_parallel()
         .from_buffered(open(path)?)
         .map_err(|e| exr_error(path, e))?;
-    let layer = image.layer_data.into_iter().next().ok_or_else(|| format(path, "it has no layer"))?;
+    let layer =
+        image.layer_data.into_iter().next().ok_or_else(|| format(path, "it has no layer"))?;
     let (width, height) = (layer.size.width(), layer.size.height());
-    let channels =
-        layer.channel_data.list.into_iter().map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect())).collect();
+    let channels = layer
+        .channel_data
+        .list
+        .into_iter()
+        .map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect()))
+        .collect();
     Ok(ExrImage { width, height, channels })
 }
 
@@ -204,7 +242,10 @@ fn exr_error(path: &Path, error: exr::error::Error) -> PixelError {
         exr::error::Error::Io(source) if source.kind() != std::io::ErrorKind::UnexpectedEof => {
             PixelError::Io { path: path.to_path_buf(), source }
         }
-        other => PixelError::Format { path: path.to_path_buf(), reason: format!("not a whole EXR ({other})") },
+        other => PixelError::Format {
+            path: path.to_path_buf(),
+            reason: format!("not a whole EXR ({other})"),
+        },
     }
 }
 
@@ -223,13 +264,19 @@ mod tests {
     }
 
     fn write(path: &Path, width: usize, height: usize) {
-        write_exr(path, (width, height), &CHANNELS, "test", |first, rows, samples| -> Result<(), PixelError> {
-            assert_eq!(samples.len(), width * rows * 3);
-            for (i, v) in samples.iter_mut().enumerate() {
-                *v = value(i / 3 % width, first + i / 3 / width, i % 3);
-            }
-            Ok(())
-        })
+        write_exr(
+            path,
+            (width, height),
+            &CHANNELS,
+            "test",
+            |first, rows, samples| -> Result<(), PixelError> {
+                assert_eq!(samples.len(), width * rows * 3);
+                for (i, v) in samples.iter_mut().enumerate() {
+                    *v = value(i / 3 % width, first + i / 3 / width, i % 3);
+                }
+                Ok(())
+            },
+        )
         .unwrap();
     }
 
@@ -247,7 +294,10 @@ mod tests {
             for (c, name) in ["R", "A", "Z"].into_iter().enumerate() {
                 for (i, &v) in image.channel(name).unwrap().iter().enumerate() {
                     let expected = value(i % width, i / width, c);
-                    assert!((v - expected).abs() <= if c == 2 { 0.0 } else { expected * 1e-3 }, "{name} {i}: {v} {expected}");
+                    assert!(
+                        (v - expected).abs() <= if c == 2 { 0.0 } else { expected * 1e-3 },
+                        "{name} {i}: {v} {expected}"
+                    );
                 }
             }
         }
@@ -269,12 +319,14 @@ mod tests {
     #[test]
     fn nan_never_reaches_a_file() {
         let dir = tempfile::tempdir().unwrap();
-        let result = write_exr(&dir.path().join("a.exr"), (4, 4), &CHANNELS, "", |_, _, samples| {
-            samples.fill(0.0);
-            samples[3 * 5 + 2] = f32::NAN;
-            Ok::<(), PixelError>(())
-        });
-        assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel, .. }) if channel == "Z"));
+        let result =
+            write_exr(&dir.path().join("a.exr"), (4, 4), &CHANNELS, "", |_, _, samples| {
+                samples.fill(0.0);
+                samples[3 * 5 + 2] = f32::NAN;
+                Ok::<(), PixelError>(())
+            });
+        assert!(matches!(result, Err(PixelError::NotFinite { x: 1, y: 1, ref channel,
+                .. }) if channel == "Z"));
     }
 
     #[test]

@@ -20,8 +20,9 @@ pub fn heat(palette: Palette, value: f32) -> [u8; 3] {
     [colour.r, colour.g, colour.b]
 }
 
-/// The range of depths that an image of them shows: from the nearest hundredth to the farthest, since a floater or two must not
-/// take the whole scale. `None` where opacity `a` is nowhere one half.
+/// The range of depths that an image of them shows: from the nearest hundredth to the farthest,
+/// since a floater or two must not take the whole scale. `None` where opacity `a` is nowhere one
+/// half.
 pub fn depth_range(z: &[f32], a: &[f32]) -> Option<(f32, f32)> {
     let mut seen: Vec<f32> = z.iter().zip(a).filter(|(_, a)| **a >= 0.5).map(|(z, _)| *z).collect();
     seen.sort_by(f32::total_cmp);
@@ -34,7 +35,8 @@ pub fn common_range(ranges: impl IntoIterator<Item = (f32, f32)>) -> Option<(f32
     ranges.into_iter().reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
-/// Depth as colours from near (warm) to far, even in disparity where the far end is many times as far; white where nothing stands.
+/// Depth as colours from near (warm) to far, even in disparity where the far end is many times as
+/// far; white where nothing stands.
 pub fn draw_depth(width: usize, z: &[f32], a: &[f32], (near, far): (f32, f32)) -> Rgba8 {
     let scale = |z: f32| if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z };
     let (low, high) = (scale(near), scale(far));
@@ -51,7 +53,8 @@ pub fn draw_depth(width: usize, z: &[f32], a: &[f32], (near, far): (f32, f32)) -
 mod tests {
     use super::*;
 
-    /// One image spans little, the other much: alone the first is even in depth, the second in disparity.
+    /// One image spans little, the other much: alone the first is even in depth, the second in
+    /// disparity.
     #[test]
     fn a_depth_has_one_colour_in_all_images() {
         let depths = |step: f32| (0..=100).map(|i| 2.0 + step * i as f32).collect::<Vec<f32>>();
@@ -61,7 +64,11 @@ mod tests {
         let at_three = |image: &Rgba8, i: usize| image.data[4 * i..4 * i + 4].to_vec();
         let range = common_range(ranges).unwrap();
         assert_eq!(at_three(&drawn(&close, range), 50), at_three(&drawn(&deep, range), 2));
-        assert_ne!(at_three(&drawn(&close, ranges[0]), 50), at_three(&drawn(&deep, ranges[1]), 2), "each by itself");
+        assert_ne!(
+            at_three(&drawn(&close, ranges[0]), 50),
+            at_three(&drawn(&deep, ranges[1]), 2),
+            "each by itself"
+        );
         assert_eq!(common_range([]), None);
     }
 }

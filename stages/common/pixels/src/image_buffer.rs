@@ -39,7 +39,11 @@ impl Image {
     /// # Panics
     /// When there aren't `width · height · channels` of them.
     pub fn new(width: usize, height: usize, channels: usize, data: Vec<f32>) -> Self {
-        assert_eq!(data.len(), width * height * channels, "an image has `channels` samples a pixel");
+        assert_eq!(
+            data.len(),
+            width * height * channels,
+            "an image has `channels` samples a pixel"
+        );
         Self { width, height, channels, data }
     }
 
@@ -47,14 +51,17 @@ impl Image {
     pub fn premultiplied(image: &Rgba8) -> Self {
         let level = |v: u8| f32::from(v) / 255.0;
         let mut data = vec![0.0; image.data.len()];
-        for (out, [r, g, b, a]) in data.as_chunks_mut::<4>().0.iter_mut().zip(image.data.as_chunks::<4>().0) {
+        for (out, [r, g, b, a]) in
+            data.as_chunks_mut::<4>().0.iter_mut().zip(image.data.as_chunks::<4>().0)
+        {
             let alpha = level(*a);
             *out = [level(*r) * alpha, level(*g) * alpha, level(*b) * alpha, alpha];
         }
         Self::new(image.width, image.height, 4, data)
     }
 
-    /// RGBA with premultiplied alpha over a grey level, in floating point as the paper does: rgb + (1-a)·background.
+    /// RGBA with premultiplied alpha over a grey level, in floating point as the paper does: rgb +
+    /// (1-a)·background.
     ///
     /// # Panics
     /// On an image without alpha.
@@ -80,7 +87,11 @@ impl Image {
             [r, g, b] => [to_u8(*r), to_u8(*g), to_u8(*b), 255],
             _ => [to_u8(p[0]), to_u8(p[0]), to_u8(p[0]), 255],
         };
-        Rgba8::new(self.width, self.height, self.data.chunks_exact(self.channels).flat_map(pixel).collect())
+        Rgba8::new(
+            self.width,
+            self.height,
+            self.data.chunks_exact(self.channels).flat_map(pixel).collect(),
+        )
     }
 }
 
@@ -90,7 +101,8 @@ pub fn to_u8(value: f32) -> u8 {
     (value * 255.0 + 0.5) as u8
 }
 
-/// Peak signal-to-noise ratio in dB, peak 1, of a mean squared error. No error at all has none; 100 dB stands for it.
+/// Peak signal-to-noise ratio in dB, peak 1, of a mean squared error. No error at all has none; 100
+/// dB stands for it.
 pub fn psnr_of(mean_squared_error: f64) -> f64 {
     (-10.0 * mean_squared_error.log10()).min(100.0)
 }

@@ -2,8 +2,8 @@ use std::path::Path;
 
 use crate::{Image, PixelError, read_exr, read_png};
 
-/// Reads a view's image as RGBA with premultiplied alpha: a PNG has straight alpha or none, an EXR premultiplied alpha in its
-/// channels R, G, B, A.
+/// Reads a view's image as RGBA with premultiplied alpha: a PNG has straight alpha or none, an EXR
+/// premultiplied alpha in its channels R, G, B, A.
 pub fn read_premultiplied(path: &Path) -> Result<Image, PixelError> {
     if path.extension().is_none_or(|e| e != "exr") {
         return Ok(Image::premultiplied(&read_png(path)?));

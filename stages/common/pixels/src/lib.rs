@@ -1,11 +1,15 @@
 //! Image buffers and what happens to pixels on the way in and out.
 //!
-//! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Image`]: floating-point samples, channels interleaved.
-//! * [`read_premultiplied`]: a view's image, PNG (straight alpha) or EXR (premultiplied), as premultiplied RGBA.
-//! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format, whose bytes repeat;
-//!   [`VIEW_CHANNELS`]: what a rendered view's EXR has.
-//! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's `avg`.
-//! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]: which one made LR images.
+//! * [`Rgba8`]: 8-bit RGBA with straight alpha, as in PNG; [`Image`]: floating-point samples,
+//!   channels interleaved.
+//! * [`read_premultiplied`]: a view's image, PNG (straight alpha) or EXR (premultiplied), as
+//!   premultiplied RGBA.
+//! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format,
+//!   whose bytes repeat; [`VIEW_CHANNELS`]: what a rendered view's EXR has.
+//! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's
+//!   `avg`.
+//! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]:
+//!   which one made LR images.
 //! * [`Exposure`]: what another exposure made of an image.
 //! * [`Mask`]: which pixels of an image count.
 //! * [`sample_cubic`], [`Image::colour_at`]: an image between its pixels.
@@ -37,7 +41,9 @@ mod srgb;
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exposure::Exposure;
-pub use exr_file::{Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr};
+pub use exr_file::{
+    Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr,
+};
 pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
 pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
 pub use image_file::read_premultiplied;
@@ -70,7 +76,10 @@ pub enum PixelError {
         reason: String,
     },
     /// An image that is larger than any that is read.
-    #[error("{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for example): make the image smaller")]
+    #[error(
+        "{path}: {width}×{height} pixels; at most {MAX_PIXELS} are read (16384×16384, for \
+        example): make the image smaller"
+    )]
     TooLarge {
         /// The file.
         path: PathBuf,

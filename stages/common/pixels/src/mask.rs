@@ -2,8 +2,8 @@ use std::path::Path;
 
 use crate::{Image, PixelError, Rgba8, read_png};
 
-/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene, people who walked by for
-/// example.
+/// Which pixels of an image count, row by row; the others show what doesn't belong to the scene,
+/// people who walked by for example.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mask {
     /// Columns.
@@ -17,15 +17,23 @@ pub struct Mask {
 impl Mask {
     /// From an image: what is dark or transparent there doesn't count.
     pub fn of(image: &Rgba8) -> Self {
-        let is_bright = |p: &[u8]| p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128;
-        Self { width: image.width, height: image.height, counts: image.data.chunks_exact(4).map(is_bright).collect() }
+        let is_bright =
+            |p: &[u8]| p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128;
+        Self {
+            width: image.width,
+            height: image.height,
+            counts: image.data.chunks_exact(4).map(is_bright).collect(),
+        }
     }
 
     /// Reads a PNG, see [`Mask::of`], for an image of that size.
     pub fn read(path: &Path, (width, height): (usize, usize)) -> Result<Self, PixelError> {
         let image = read_png(path)?;
         if (image.width, image.height) != (width, height) {
-            let reason = format!("{}×{} pixels where its image has {width}×{height}", image.width, image.height);
+            let reason = format!(
+                "{}×{} pixels where its image has {width}×{height}",
+                image.width, image.height
+            );
             return Err(PixelError::Format { path: path.to_path_buf(), reason });
         }
         Ok(Self::of(&image))
@@ -37,8 +45,8 @@ impl Mask {
         Rgba8::new(self.width, self.height, self.counts.iter().flat_map(pixel).collect())
     }
 
-    /// The mask of the image at another size: a pixel counts where all that lies under it does, and under so many pixels around
-    /// it, which its kernel reads.
+    /// The mask of the image at another size: a pixel counts where all that lies under it does, and
+    /// under so many pixels around it, which its kernel reads.
     #[must_use]
     pub fn resized(&self, (width, height): (usize, usize), around: usize) -> Self {
         // Columns or rows under the pixels around one.
@@ -48,10 +56,15 @@ impl Mask {
         };
         // Across first: `around` may be wide.
         let mut narrow = vec![true; width * self.height];
-        for (row, line) in narrow.chunks_exact_mut(width.max(1)).zip(self.counts.chunks_exact(self.width.max(1))) {
-            row.iter_mut().enumerate().for_each(|(x, counts)| *counts = line[under(x, width, self.width)].iter().all(|c| *c));
+        for (row, line) in
+            narrow.chunks_exact_mut(width.max(1)).zip(self.counts.chunks_exact(self.width.max(1)))
+        {
+            row.iter_mut().enumerate().for_each(|(x, counts)| {
+                *counts = line[under(x, width, self.width)].iter().all(|c| *c)
+            });
         }
-        let pixel = |i: usize| under(i / width, height, self.height).all(|y| narrow[y * width + i % width]);
+        let pixel =
+            |i: usize| under(i / width, height, self.height).all(|y| narrow[y * width + i % width]);
         Self { width, height, counts: (0..width * height).map(pixel).collect() }
     }
 
@@ -60,7 +73,8 @@ impl Mask {
         self.counts.iter().filter(|c| **c).count() as f64 / self.counts.len().max(1) as f64
     }
 
-    /// Gives an image another's pixels where its own don't count, so that the two don't differ there.
+    /// Gives an image another's pixels where its own don't count, so that the two don't differ
+    /// there.
     ///
     /// # Panics
     /// When the sizes differ.
@@ -70,7 +84,10 @@ impl Mask {
             (image.width, image.height) == size && (other.width, other.height) == size,
             "a mask and its images have one size"
         );
-        let pixels = image.data.chunks_exact_mut(image.channels).zip(other.data.chunks_exact(other.channels));
+        let pixels = image
+            .data
+            .chunks_exact_mut(image.channels)
+            .zip(other.data.chunks_exact(other.channels));
         for ((to, from), counts) in pixels.zip(&self.counts) {
             if !counts {
                 to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
@@ -84,12 +101,20 @@ mod tests {
     use super::*;
 
     fn mask(width: usize, rows: &[&str]) -> Mask {
-        Mask { width, height: rows.len(), counts: rows.iter().flat_map(|r| r.bytes().map(|b| b == b'#')).collect() }
+        Mask {
+            width,
+            height: rows.len(),
+            counts: rows.iter().flat_map(|r| r.bytes().map(|b| b == b'#')).collect(),
+        }
     }
 
     #[test]
     fn dark_and_transparent_pixels_do_not_count() {
-        let image = Rgba8::new(4, 1, vec![255, 255, 255, 255, 10, 10, 10, 255, 255, 255, 255, 0, 128, 128, 128, 128]);
+        let image = Rgba8::new(
+            4,
+            1,
+            vec![255, 255, 255, 255, 10, 10, 10, 255, 255, 255, 255, 0, 128, 128, 128, 128],
+        );
         assert_eq!(Mask::of(&image), mask(4, &["#..#"]));
         assert_eq!(Mask::of(&mask(4, &["#..#"]).to_rgba8()), mask(4, &["#..#"]));
         assert_eq!(mask(4, &["#..#"]).share(), 0.5);

@@ -1,8 +1,9 @@
 use crate::Image;
 use crate::pillow_resample::{Filter, coefficients};
 
-/// A resampling along one axis as a linear map in floats: output `i` is Σ weight·input over a run of inputs that starts at
-/// `first(i)`. Every run has the same length, so that a caller's loop has too; what pads it weighs 0.
+/// A resampling along one axis as a linear map in floats: output `i` is Σ weight·input over a run
+/// of inputs that starts at `first(i)`. Every run has the same length, so that a caller's loop has
+/// too; what pads it weighs 0.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AxisTaps {
     inputs: usize,
@@ -18,8 +19,11 @@ impl AxisTaps {
     /// When a side is 0.
     pub fn new(filter: Filter, inputs: usize, outputs: usize) -> Self {
         assert!(inputs > 0 && outputs > 0, "a side of 0 pixels can't be resized");
-        let runs: Vec<(usize, Vec<f64>)> =
-            if inputs == outputs { (0..inputs).map(|i| (i, vec![1.0])).collect() } else { coefficients(inputs, outputs, filter) };
+        let runs: Vec<(usize, Vec<f64>)> = if inputs == outputs {
+            (0..inputs).map(|i| (i, vec![1.0])).collect()
+        } else {
+            coefficients(inputs, outputs, filter)
+        };
         let length = runs.iter().map(|(_, w)| w.len()).max().unwrap_or(0);
         let mut weights = vec![0.0; length * outputs];
         let mut firsts = Vec::with_capacity(outputs);
@@ -50,9 +54,10 @@ impl AxisTaps {
         self.firsts.len()
     }
 
-    /// Weights P = (s·K·Kᵀ)⁻¹·K of the map's pseudo-inverse K⁺ = s·Pᵀ, where s = inputs/outputs: along one axis, the smallest
-    /// change to the inputs that adds r to the outputs is K⁺·r. Shares of the whole are like K's own, so that a flat r asks as much of
-    /// every input as Kᵀ·r does; where K weakens fine detail, P makes up for it. Weights farther than `reach` outputs from an
+    /// Weights P = (s·K·Kᵀ)⁻¹·K of the map's pseudo-inverse K⁺ = s·Pᵀ, where s = inputs/outputs:
+    /// along one axis, the smallest change to the inputs that adds r to the outputs is K⁺·r. Shares
+    /// of the whole are like K's own, so that a flat r asks as much of every input as Kᵀ·r does;
+    /// where K weakens fine detail, P makes up for it. Weights farther than `reach` outputs from an
     /// input are left out.
     pub fn inverse(&self, reach: usize) -> Self {
         let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
@@ -61,16 +66,20 @@ impl AxisTaps {
             let (first, weights) = self.run(a);
             (first..).zip(weights).map(|(i, &w)| f64::from(w) * f64::from(self.weight(b, i))).sum()
         };
-        let band = (1..n).take_while(|d| (0..n - d).any(|a| dot(a, a + d) != 0.0)).last().unwrap_or(0);
+        let band =
+            (1..n).take_while(|d| (0..n - d).any(|a| dot(a, a + d) != 0.0)).last().unwrap_or(0);
         // Lower Cholesky factor, row by row: column a - band + k of row a is factor[a][k].
         let mut factor = vec![vec![0.0; band + 1]; n];
         for a in 0..n {
             for b in a.saturating_sub(band)..=a {
                 let from = a.saturating_sub(band);
-                let product: f64 =
-                    (from..b).filter(|k| k + band >= b).map(|k| factor[a][k + band - a] * factor[b][k + band - b]).sum();
+                let product: f64 = (from..b)
+                    .filter(|k| k + band >= b)
+                    .map(|k| factor[a][k + band - a] * factor[b][k + band - b])
+                    .sum();
                 let rest = scale * dot(b, a) - product;
-                factor[a][b + band - a] = if a == b { (rest + RIDGE).sqrt() } else { rest / factor[b][band] };
+                factor[a][b + band - a] =
+                    if a == b { (rest + RIDGE).sqrt() } else { rest / factor[b][band] };
             }
         }
         let length = ((2.0 * reach as f64 * scale).ceil() as usize).min(self.inputs);
@@ -80,11 +89,13 @@ impl AxisTaps {
             z.fill(0.0);
             z[q] = 1.0;
             for a in 0..n {
-                let sum: f64 = (a.saturating_sub(band)..a).map(|b| factor[a][b + band - a] * z[b]).sum();
+                let sum: f64 =
+                    (a.saturating_sub(band)..a).map(|b| factor[a][b + band - a] * z[b]).sum();
                 z[a] = (z[a] - sum) / factor[a][band];
             }
             for a in (0..n).rev() {
-                let sum: f64 = (a + 1..n.min(a + band + 1)).map(|b| factor[b][a + band - b] * z[b]).sum();
+                let sum: f64 =
+                    (a + 1..n.min(a + band + 1)).map(|b| factor[b][a + band - b] * z[b]).sum();
                 z[a] = (z[a] - sum) / factor[a][band];
             }
             let centre = ((q as f64 + 0.5) * scale - 0.5 * length as f64).round().max(0.0) as usize;
@@ -95,7 +106,8 @@ impl AxisTaps {
             let weight = |i: usize| {
                 let apart = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();
                 let within = f64::from(u8::from(apart <= reach as f64));
-                (within * near.clone().map(|a| z[a] * f64::from(self.weight(a, i))).sum::<f64>()) as f32
+                (within * near.clone().map(|a| z[a] * f64::from(self.weight(a, i))).sum::<f64>())
+                    as f32
             };
             weights.extend((first..first + length).map(weight));
         }
@@ -103,11 +115,13 @@ impl AxisTaps {
     }
 }
 
-/// Keeps the pseudo-inverse bounded: what a kernel weakens to less than this share of power isn't asked for.
+/// Keeps the pseudo-inverse bounded: what a kernel weakens to less than this share of power isn't
+/// asked for.
 const RIDGE: f64 = 0.02;
 
-/// A separable resampling of images as a linear operator: what [`resize_pillow`](crate::resize_pillow) does, without its
-/// rounding and clipping. `apply` and `adjoint` are each other's transpose.
+/// A separable resampling of images as a linear operator: what
+/// [`resize_pillow`](crate::resize_pillow) does, without its rounding and clipping. `apply` and
+/// `adjoint` are each other's transpose.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Resampling {
     /// Along rows.
@@ -135,10 +149,18 @@ impl Resampling {
     /// # Panics
     /// When the image hasn't the operator's input size.
     pub fn apply(&self, image: &Image) -> Image {
-        assert_eq!((image.width, image.height), (self.x.inputs, self.y.inputs), "the operator is for another size");
+        assert_eq!(
+            (image.width, image.height),
+            (self.x.inputs, self.y.inputs),
+            "the operator is for another size"
+        );
         let (width, height, channels) = (self.x.outputs(), self.y.outputs(), image.channels);
         let mut narrow = vec![0.0; width * image.height * channels];
-        for (row, out) in image.data.chunks_exact(image.width * channels).zip(narrow.chunks_exact_mut(width * channels)) {
+        for (row, out) in image
+            .data
+            .chunks_exact(image.width * channels)
+            .zip(narrow.chunks_exact_mut(width * channels))
+        {
             for (i, pixel) in out.chunks_exact_mut(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
                 for (from, w) in row[first * channels..].chunks_exact(channels).zip(weights) {
@@ -149,7 +171,9 @@ impl Resampling {
         let mut data = vec![0.0; width * height * channels];
         for (j, out) in data.chunks_exact_mut(width * channels).enumerate() {
             let (first, weights) = self.y.run(j);
-            for (row, w) in narrow[first * width * channels..].chunks_exact(width * channels).zip(weights) {
+            for (row, w) in
+                narrow[first * width * channels..].chunks_exact(width * channels).zip(weights)
+            {
                 out.iter_mut().zip(row).for_each(|(sum, v)| *sum += w * v);
             }
         }
@@ -161,7 +185,11 @@ impl Resampling {
     /// # Panics
     /// When the image hasn't the operator's output size.
     pub fn adjoint(&self, image: &Image) -> Image {
-        assert_eq!((image.width, image.height), (self.x.outputs(), self.y.outputs()), "the operator is for another size");
+        assert_eq!(
+            (image.width, image.height),
+            (self.x.outputs(), self.y.outputs()),
+            "the operator is for another size"
+        );
         let (width, height, channels) = (self.x.inputs, self.y.inputs, image.channels);
         let mut tall = vec![0.0; image.width * height * channels];
         for (j, row) in image.data.chunks_exact(image.width * channels).enumerate() {
@@ -171,7 +199,9 @@ impl Resampling {
             }
         }
         let mut data = vec![0.0; width * height * channels];
-        for (row, out) in tall.chunks_exact(image.width * channels).zip(data.chunks_exact_mut(width * channels)) {
+        for (row, out) in
+            tall.chunks_exact(image.width * channels).zip(data.chunks_exact_mut(width * channels))
+        {
             for (i, pixel) in row.chunks_exact(channels).enumerate() {
                 let (first, weights) = self.x.run(i);
                 for (to, w) in out[first * channels..].chunks_exact_mut(channels).zip(weights) {
@@ -199,20 +229,26 @@ mod tests {
         Image::new(width, height, 3, data.collect())
     }
 
-    /// K·(s·Pᵀ) is the identity but for the ridge, for every filter that blurs no more than it must; and a flat residual asks the
-    /// same of all inputs.
+    /// K·(s·Pᵀ) is the identity but for the ridge, for every filter that blurs no more than it
+    /// must; and a flat residual asks the same of all inputs.
     #[test]
     fn inverse_undoes_the_map() {
         for filter in [Filter::Box, Filter::Bicubic, Filter::Lanczos] {
-            for (hr, lr) in [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)] {
+            for (hr, lr) in
+                [(80, 40), (100, 25), (60, 40), (54, 20), (40, 40), (3, 2), (2, 1), (1, 1)]
+            {
                 let map = AxisTaps::new(filter, hr, lr);
                 let inverse = map.inverse(40);
                 let scale = hr as f32 / lr as f32;
                 for a in 0..lr {
                     for b in 0..lr {
-                        let entry: f32 = (0..hr).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
+                        let entry: f32 =
+                            (0..hr).map(|i| map.weight(a, i) * scale * inverse.weight(b, i)).sum();
                         let expected = f32::from(u8::from(a == b));
-                        assert!((entry - expected).abs() < 0.06, "{filter:?} {hr} → {lr}: {a} {b} {entry}");
+                        assert!(
+                            (entry - expected).abs() < 0.06,
+                            "{filter:?} {hr} → {lr}: {a} {b} {entry}"
+                        );
                     }
                 }
             }
@@ -233,7 +269,8 @@ mod tests {
         ) {
             let operator = Resampling::new(filter, (w, h), (v, u));
             let (x, y) = (image(w, h, seed), image(v, u, !seed));
-            let dot = |a: &Image, b: &Image| a.data.iter().zip(&b.data).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum::<f64>();
+            let dot = |a: &Image, b: &Image| a.data.iter().zip(&b.data).map(|(&a,
+                &b)| f64::from(a) * f64::from(b)).sum::<f64>();
             let (left, right) = (dot(&operator.apply(&x), &y), dot(&x, &operator.adjoint(&y)));
             prop_assert!((left - right).abs() < 1e-4 * left.abs().max(1.0), "{left} {right}");
         }
@@ -246,13 +283,21 @@ mod tests {
             for (width, height) in [(20, 15), (27, 11), (13, 30), (40, 45)] {
                 let mut image = image(40, 30, 7).to_rgba8();
                 // Away from black and white nothing is clipped.
-                image.data.chunks_exact_mut(4).for_each(|p| p[..3].iter_mut().for_each(|c| *c = 64 + *c / 2));
+                image
+                    .data
+                    .chunks_exact_mut(4)
+                    .for_each(|p| p[..3].iter_mut().for_each(|c| *c = 64 + *c / 2));
                 let bytes: Rgba8 = resize_pillow(&image, width, height, filter);
                 let operator = Resampling::new(filter, (40, 30), (width, height));
                 let floats = operator.apply(&Image::premultiplied(&image).over(1.0));
                 for (p, q) in bytes.data.chunks_exact(4).zip(floats.data.chunks_exact(3)) {
                     // Two passes, each rounded to half a level.
-                    (0..3).for_each(|c| assert!((f32::from(p[c]) / 255.0 - q[c]).abs() < 1.3 / 255.0, "{filter:?} {p:?} {q:?}"));
+                    (0..3).for_each(|c| {
+                        assert!(
+                            (f32::from(p[c]) / 255.0 - q[c]).abs() < 1.3 / 255.0,
+                            "{filter:?} {p:?} {q:?}"
+                        )
+                    });
                 }
             }
         }

@@ -1,7 +1,8 @@
 //! Pillow's 8-bit resampling (Pillow 12.3, `Resample.c`), to the last bit.
 //!
-//! What makes it bit-exact: RGBA is premultiplied in 8 bits first; the horizontal pass comes first and is clipped to 8 bits
-//! before the vertical one; weights are computed in f64, normalised, and rounded to 22 bits.
+//! What makes it bit-exact: RGBA is premultiplied in 8 bits first; the horizontal pass comes first
+//! and is clipped to 8 bits before the vertical one; weights are computed in f64, normalised, and
+//! rounded to 22 bits.
 
 use crate::Rgba8;
 
@@ -78,8 +79,9 @@ pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(
             // `as` truncates towards zero and saturates at 0, as the C code's cast and clamp do.
             let first = (centre - support + 0.5) as usize;
             let end = ((centre + support + 0.5) as usize).min(input);
-            let mut weights: Vec<f64> =
-                (first..end).map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch))).collect();
+            let mut weights: Vec<f64> = (first..end)
+                .map(|x| filter.weight((x as f64 - centre + 0.5) * (1.0 / stretch)))
+                .collect();
             let sum: f64 = weights.iter().sum();
             if sum != 0.0 {
                 weights.iter_mut().for_each(|w| *w /= sum);
@@ -95,7 +97,8 @@ fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
         (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
     };
     let runs = coefficients(input, output, filter).into_iter();
-    runs.map(|(first, weights)| Taps { first, weights: weights.into_iter().map(fixed).collect() }).collect()
+    runs.map(|(first, weights)| Taps { first, weights: weights.into_iter().map(fixed).collect() })
+        .collect()
 }
 
 fn clip(accumulated: i32) -> u8 {
@@ -107,7 +110,10 @@ fn clip(accumulated: i32) -> u8 {
 /// # Panics
 /// When a side is 0.
 pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter) -> Rgba8 {
-    assert!(width > 0 && height > 0 && image.width > 0 && image.height > 0, "a side of 0 pixels can't be resized");
+    assert!(
+        width > 0 && height > 0 && image.width > 0 && image.height > 0,
+        "a side of 0 pixels can't be resized"
+    );
     if (width, height) == (image.width, image.height) {
         return image.clone();
     }
@@ -135,7 +141,9 @@ pub fn resize_pillow(image: &Rgba8, width: usize, height: usize, filter: Filter)
         let mut sums = vec![0i32; row_len];
         for tap in &taps {
             sums.fill(1 << (PRECISION_BITS - 1));
-            for (row, &w) in current.data[tap.first * row_len..].chunks_exact(row_len).zip(&tap.weights) {
+            for (row, &w) in
+                current.data[tap.first * row_len..].chunks_exact(row_len).zip(&tap.weights)
+            {
                 for (sum, &v) in sums.iter_mut().zip(row) {
                     *sum += i32::from(v) * w;
                 }

@@ -6,14 +6,17 @@ use crate::{MAX_PIXELS, PixelError, Rgba8};
 
 /// Reads any PNG as 8-bit RGBA; one without alpha is opaque.
 pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
-    let file = File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+    let file =
+        File::open(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
     let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(8 * MAX_PIXELS as u64);
     reader.limits(limits);
-    let image =
-        reader.decode().map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?.into_rgba8();
+    let image = reader
+        .decode()
+        .map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?
+        .into_rgba8();
     let (width, height) = (image.width() as usize, image.height() as usize);
     Ok(Rgba8::new(width, height, image.into_raw()))
 }
@@ -21,7 +24,8 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
 /// Writes RGBA, or RGB where every pixel is opaque.
 pub fn write_png(path: &Path, image: &Rgba8) -> Result<(), PixelError> {
     let bytes = encode_png(image);
-    std::fs::write(path, bytes).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
+    std::fs::write(path, bytes)
+        .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })
 }
 
 /// The bytes that [`write_png`] writes.
@@ -59,15 +63,19 @@ pub struct PngRows {
 impl PngRows {
     /// Starts a file.
     pub fn create(path: &Path, width: usize, height: usize) -> Result<Self, PixelError> {
-        let file = File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
+        let file = File::create(path)
+            .map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
         let started = encoder(BufWriter::new(file), width, height, false).write_header();
-        let stream = started.and_then(png::Writer::into_stream_writer).map_err(|e| png_error(path, e))?;
+        let stream =
+            started.and_then(png::Writer::into_stream_writer).map_err(|e| png_error(path, e))?;
         Ok(Self { stream, path: path.to_path_buf() })
     }
 
     /// Appends whole rows of 8-bit samples.
     pub fn write(&mut self, samples: &[u8]) -> Result<(), PixelError> {
-        self.stream.write_all(samples).map_err(|source| PixelError::Io { path: self.path.clone(), source })
+        self.stream
+            .write_all(samples)
+            .map_err(|source| PixelError::Io { path: self.path.clone(), source })
     }
 
     /// Ends the file; all rows must have been written.

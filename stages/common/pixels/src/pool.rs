@@ -1,9 +1,11 @@
 use crate::{Image, Rgba8};
 
-/// Mean of s×s blocks of 8-bit RGBA, colour and alpha apart and nothing rounded: the paper code's `--ds_method avg`.
+/// Mean of s×s blocks of 8-bit RGBA, colour and alpha apart and nothing rounded: the paper code's
+/// `--ds_method avg`.
 ///
-/// The reference implementation pools *straight* colour, so what hides behind transparent pixels bleeds into edges; that is
-/// kept, for comparison's sake. `None` when the size isn't a multiple of (sx, sy).
+/// The reference implementation pools *straight* colour, so what hides behind transparent pixels
+/// bleeds into edges; that is kept, for comparison's sake. `None` when the size isn't a multiple of
+/// (sx, sy).
 pub fn average_pool(image: &Rgba8, sx: usize, sy: usize) -> Option<Image> {
     if sx == 0 || sy == 0 || !image.width.is_multiple_of(sx) || !image.height.is_multiple_of(sy) {
         return None;

@@ -1,4 +1,5 @@
-//! Every sample of our resampling equals pinned Pillow's: odd sizes, one axis alone, enlarging, transparent edges.
+//! Every sample of our resampling equals pinned Pillow's: odd sizes, one axis alone, enlarging,
+//! transparent edges.
 
 #![allow(missing_docs, reason = "a test")]
 #[allow(unreachable_pub, reason = "shared with eval's tests")]
@@ -9,7 +10,8 @@ use pixels::{Filter, Rgba8, resize_pillow};
 #[test]
 fn equals_pillow_on_every_sample() {
     let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/pillow");
-    let list: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.join("cases.json")).unwrap()).unwrap();
+    let list: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(folder.join("cases.json")).unwrap()).unwrap();
     let cases = list["cases"].as_array().unwrap();
     assert_eq!(cases.len(), 27);
     for case in cases {
@@ -21,7 +23,8 @@ fn equals_pillow_on_every_sample() {
             "lanczos" => Filter::Lanczos,
             other => panic!("unknown filter {other}"),
         };
-        let image = Rgba8::new(w, h, pattern::pattern(w, h, 4, case["seed"].as_u64().unwrap() as u32));
+        let image =
+            Rgba8::new(w, h, pattern::pattern(w, h, 4, case["seed"].as_u64().unwrap() as u32));
         let ours = resize_pillow(&image, tw, th, filter);
         let theirs = std::fs::read(folder.join(case["file"].as_str().unwrap())).unwrap();
         let differing = ours.data.iter().zip(&theirs).filter(|(a, b)| a != b).count();

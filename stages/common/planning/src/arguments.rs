@@ -1,8 +1,9 @@
 //! What stands after `=` on the command line: `-p NAME=VALUE[,VALUE…]`.
 //!
-//! One rule for a value: a JSON number, `true`, `false` or `null` is that; nothing at all is `null`; what begins with `[`, `{` or `"` is JSON,
-//! commas inside it included; anything else is a word, as it stands. So `0x10`, `+2`, `02` and ` 2` are words, and where a number is
-//! expected the parameter's type refuses them.
+//! One rule for a value: a JSON number, `true`, `false` or `null` is that; nothing at all is
+//! `null`; what begins with `[`, `{` or `"` is JSON, commas inside it included; anything else is a
+//! word, as it stands. So `0x10`, `+2`, `02` and ` 2` are words, and where a number is expected the
+//! parameter's type refuses them.
 
 use serde_json::Value;
 
@@ -26,7 +27,9 @@ pub(crate) fn folders(text: &str) -> Result<Vec<&str>, String> {
 
 fn value(piece: &str) -> Result<Value, String> {
     if piece.is_empty() {
-        return Err("a value between commas is empty; leave the comma out, or write null".to_owned());
+        return Err(
+            "a value between commas is empty; leave the comma out, or write null".to_owned()
+        );
     }
     let parsed = serde_json::from_str::<Value>(piece);
     if piece.starts_with(JSON) {
@@ -43,7 +46,11 @@ fn split(text: &str) -> Vec<&str> {
     let mut pieces = Vec::new();
     let mut rest = Some(text);
     while let Some(text) = rest {
-        let end = if text.starts_with(JSON) { json_end(text) } else { text.find(',').unwrap_or(text.len()) };
+        let end = if text.starts_with(JSON) {
+            json_end(text)
+        } else {
+            text.find(',').unwrap_or(text.len())
+        };
         pieces.push(&text[..end]);
         rest = text.get(end + 1..);
     }
@@ -95,7 +102,8 @@ mod tests {
             ("a: b", json!(["a: b"])),
             ("5\"", json!(["5\""])),
         ] {
-            let found: Vec<Value> = values(text).unwrap().into_iter().map(|(_, value)| value).collect();
+            let found: Vec<Value> =
+                values(text).unwrap().into_iter().map(|(_, value)| value).collect();
             assert_eq!(Value::from(found), expected, "{text}");
         }
     }

@@ -1,4 +1,5 @@
-//! What the command line sets: values of parameters and inputs, each for a stage, swept where there are several.
+//! What the command line sets: values of parameters and inputs, each for a stage, swept where there
+//! are several.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -42,8 +43,8 @@ pub(crate) enum Kind {
     Input,
 }
 
-/// One value of an axis: as it was written, and what it sets. On the command line that is one thing; a scene, a protocol or a variant of an
-/// experiment sets several.
+/// One value of an axis: as it was written, and what it sets. On the command line that is one
+/// thing; a scene, a protocol or a variant of an experiment sets several.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct AxisValue {
     pub text: String,
@@ -80,7 +81,12 @@ impl Kind {
     }
 
     /// Whether a block gives that name itself.
-    pub(crate) fn is_given(self, program: Option<&StageProgram>, block: &StageBlock, name: &str) -> bool {
+    pub(crate) fn is_given(
+        self,
+        program: Option<&StageProgram>,
+        block: &StageBlock,
+        name: &str,
+    ) -> bool {
         match self {
             Self::Parameter => program.is_some_and(|program| program.is_given(block, name)),
             Self::Input => block.inputs.contains_key(name),
@@ -137,7 +143,8 @@ pub(crate) struct Scope<'a> {
 }
 
 impl Scope<'_> {
-    /// The axes in the order in which they were given, the last one where several set the same; and what to say of it.
+    /// The axes in the order in which they were given, the last one where several set the same; and
+    /// what to say of it.
     pub(crate) fn axes(&self, request: &Request) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
         let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
         let mut experiment = experiment::axes(self, request)?;
@@ -148,7 +155,8 @@ impl Scope<'_> {
             if let Some(earlier) = axes.iter().position(|earlier| earlier.is_of(&axis)) {
                 notes.push(format!("{}: overridden by {}", axes.remove(earlier).given, axis.given));
             }
-            // A sweep of the file gives way; what sets several things at once stays, and the command line wins over a part of it.
+            // A sweep of the file gives way; what sets several things at once stays, and the
+            // command line wins over a part of it.
             let before = experiment.len();
             experiment.retain(|earlier| !earlier.is_single() || !earlier.is_of(&axis));
             // What takes the place of an axis with a name is in tables, too.
@@ -160,7 +168,12 @@ impl Scope<'_> {
     }
 
     /// What a name and a value of an experiment's file set.
-    pub(crate) fn setting(&self, kind: Kind, name: &str, value: &Value) -> Result<Setting, PlanError> {
+    pub(crate) fn setting(
+        &self,
+        kind: Kind,
+        name: &str,
+        value: &Value,
+    ) -> Result<Setting, PlanError> {
         let in_file = |error: PlanError| match error {
             PlanError::Usage(problem) => {
                 let problem = problem.trim_start_matches(kind.flag()).trim_start();
@@ -170,14 +183,19 @@ impl Scope<'_> {
         };
         let (stage, name) = self.owner(kind, name, &value.to_string()).map_err(in_file)?;
         let program = self.programs.require(&stage)?;
-        let value = if kind == Kind::Parameter { program.schema.canonical_value(&name, value) } else { value.clone() };
+        let value = if kind == Kind::Parameter {
+            program.schema.canonical_value(&name, value)
+        } else {
+            value.clone()
+        };
         Ok(Setting { stage, kind, name, value })
     }
 
     fn axis(&self, kind: Kind, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
         let given = format!("{} {text}", kind.flag());
         let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
-        let (name, text) = text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
+        let (name, text) =
+            text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
         let (stage, name) = self.owner(kind, name, text)?;
         let program = self.programs.require(&stage)?;
         let value = |(text, value): (&str, Value)| AxisValue {
@@ -187,38 +205,59 @@ impl Scope<'_> {
         let values: Vec<AxisValue> = match kind {
             Kind::Parameter => {
                 let given = arguments::values(text).map_err(usage)?.into_iter();
-                given.map(|(text, given)| value((text, program.schema.canonical_value(&name, &given)))).collect()
+                given
+                    .map(|(text, given)| {
+                        value((text, program.schema.canonical_value(&name, &given)))
+                    })
+                    .collect()
             }
-            Kind::Input => arguments::folders(text).map_err(usage)?.into_iter().map(|text| value((text, folder(text)))).collect(),
+            Kind::Input => arguments::folders(text)
+                .map_err(usage)?
+                .into_iter()
+                .map(|text| value((text, folder(text))))
+                .collect(),
         };
-        let values = each_once(values, |again, first| notes.push(format!("{given}: {again} is {first} again; it is made once")));
+        let values = each_once(values, |again, first| {
+            notes.push(format!("{given}: {again} is {first} again; it is made once"))
+        });
         if program.description.sink && kind == Kind::Input {
-            return Err(usage(format!("{stage} is a sink, which shows what the run made; it takes no folder")));
+            return Err(usage(format!(
+                "{stage} is a sink, which shows what the run made; it takes no folder"
+            )));
         }
         if program.description.sink && values.len() > 1 {
-            return Err(usage(format!("{stage} is a sink and shows all points of a sweep at once; give one value")));
+            return Err(usage(format!(
+                "{stage} is a sink and shows all points of a sweep at once; give one value"
+            )));
         }
         let is_named = values.len() > 1;
         Ok(Axis { name, values, is_named, given })
     }
 
-    /// The stage that a name belongs to, and the name without it. Where several stages have the name, that one is meant that the targets need; a
-    /// block that extends another follows that one.
+    /// The stage that a name belongs to, and the name without it. Where several stages have the
+    /// name, that one is meant that the targets need; a block that extends another follows that
+    /// one.
     fn owner(&self, kind: Kind, name: &str, value: &str) -> Result<(String, String), PlanError> {
         // A stage's own name may have a point.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
-        let stated = splits.find(|(stage, _)| self.pipeline.stages.contains_key(*stage)).or_else(|| name.split_once('.'));
+        let stated = splits
+            .find(|(stage, _)| self.pipeline.stages.contains_key(*stage))
+            .or_else(|| name.split_once('.'));
         if let Some((stage, own)) = stated {
             return self.stated_owner(kind, (stage, own), value);
         }
-        let has = |stage: &str| self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name));
+        let has = |stage: &str| {
+            self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name))
+        };
         let follows = |stage: &str| {
             let block = &self.pipeline.stages[stage];
             let is_own = || kind.is_given(self.programs.get(stage), block, name);
             block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !is_own())
         };
-        let with_name: Vec<&String> = self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
-        let meant: Vec<&String> = with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
+        let with_name: Vec<&String> =
+            self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
+        let meant: Vec<&String> =
+            with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
         // A stage that is needed had the name, and another one has it.
         if meant.is_empty()
             && let Some(problem) = self.renamed(kind, self.needed, name, value)
@@ -229,16 +268,26 @@ impl Scope<'_> {
             [] => Err(self.unknown(kind, name, value)),
             [stage] => Ok((stage.clone(), name.to_owned())),
             ref several => {
-                let options = several.iter().map(|s| format!("{s}.{name}")).collect::<Vec<_>>().join(", ");
-                let problem = format!("{} {name}: more than one stage has it; say which: {options}", kind.flag());
+                let options =
+                    several.iter().map(|s| format!("{s}.{name}")).collect::<Vec<_>>().join(", ");
+                let problem = format!(
+                    "{} {name}: more than one stage has it; say which: {options}",
+                    kind.flag()
+                );
                 Err(PlanError::Usage(problem))
             }
         }
     }
 
     /// The stage that is named itself, which must have such a parameter or input.
-    fn stated_owner(&self, kind: Kind, (stage, own): (&str, &str), value: &str) -> Result<(String, String), PlanError> {
-        let usage = |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
+    fn stated_owner(
+        &self,
+        kind: Kind,
+        (stage, own): (&str, &str),
+        value: &str,
+    ) -> Result<(String, String), PlanError> {
+        let usage =
+            |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
         if !self.pipeline.stages.contains_key(stage) {
             let known = known_blocks(stage, self.pipeline.stages.keys().map(String::as_str));
             return Err(usage(format!("no stage {stage:?}; {known}")));
@@ -272,9 +321,15 @@ impl Scope<'_> {
         }
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
-        let meant = artifact::nearest(name, known).map(|known| format!("did you mean {known}? ")).unwrap_or_default();
-        let problem =
-            format!("{} {name}: no stage has such {} {}; {meant}see `STAGE --help`", kind.flag(), kind.article(), kind.noun());
+        let meant = artifact::nearest(name, known)
+            .map(|known| format!("did you mean {known}? "))
+            .unwrap_or_default();
+        let problem = format!(
+            "{} {name}: no stage has such {} {}; {meant}see `STAGE --help`",
+            kind.flag(),
+            kind.article(),
+            kind.noun()
+        );
         let unasked: Vec<&str> = self.programs.unknown().collect();
         if unasked.is_empty() {
             return PlanError::Usage(problem);
@@ -289,7 +344,8 @@ pub(crate) fn folder(name: &str) -> Value {
     Value::from(leads_to.to_string_lossy())
 }
 
-/// Values without those that mean the same as an earlier one; `tell` is told of these and of the earlier ones.
+/// Values without those that mean the same as an earlier one; `tell` is told of these and of the
+/// earlier ones.
 fn each_once(values: Vec<AxisValue>, mut tell: impl FnMut(&str, &str)) -> Vec<AxisValue> {
     let mut kept: Vec<AxisValue> = Vec::new();
     for value in values {

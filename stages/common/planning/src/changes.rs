@@ -20,7 +20,13 @@ pub struct Change {
 pub fn changes(before: &Map<String, Value>, now: &Map<String, Value>) -> Vec<Change> {
     let names: BTreeSet<&String> = before.keys().chain(now.keys()).collect();
     let differing = names.into_iter().filter(|name| before.get(*name) != now.get(*name));
-    differing.map(|name| Change { name: name.clone(), before: before.get(name).cloned(), now: now.get(name).cloned() }).collect()
+    differing
+        .map(|name| Change {
+            name: name.clone(),
+            before: before.get(name).cloned(),
+            now: now.get(name).cloned(),
+        })
+        .collect()
 }
 
 /// The beginning of a hash, for people.
@@ -31,8 +37,13 @@ pub fn short(hash: &str) -> &str {
 impl std::fmt::Display for Change {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "{}: {} → {}", self.name, words(self.before.as_ref()), words(self.now.as_ref()))?;
-        match (self.before.as_ref().and_then(Value::as_f64), self.now.as_ref().and_then(Value::as_f64)) {
-            (Some(before), Some(now)) if self.name.starts_with("metric ") => write!(f, " ({:+.4})", now - before),
+        match (
+            self.before.as_ref().and_then(Value::as_f64),
+            self.now.as_ref().and_then(Value::as_f64),
+        ) {
+            (Some(before), Some(now)) if self.name.starts_with("metric ") => {
+                write!(f, " ({:+.4})", now - before)
+            }
             _ => Ok(()),
         }
     }
@@ -56,10 +67,13 @@ mod tests {
     fn every_difference_in_words() {
         let map = |value: Value| value.as_object().cloned().unwrap();
         let before = map(json!({
-            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null, "parameter scale": 2, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
+            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null, "parameter \
+            scale": 2, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
         }));
         let now = map(json!({
-            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter near": 0.5, "parameter scale": 4.0, "metric mean.psnr": 31, "device": "cpu", "input z": "y"
+            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter \
+            near": 0.5, "parameter scale": 4.0, "metric mean.psnr": 31, "device": "cpu", "input \
+                z": "y"
         }));
         let found: Vec<String> = changes(&before, &now).iter().map(ToString::to_string).collect();
         let expected = [

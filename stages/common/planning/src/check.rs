@@ -1,4 +1,5 @@
-//! Checks of the whole file, whatever is asked for: first of what it says alone, then of its blocks against their stages' descriptions.
+//! Checks of the whole file, whatever is asked for: first of what it says alone, then of its blocks
+//! against their stages' descriptions.
 
 use std::collections::BTreeSet;
 
@@ -16,15 +17,23 @@ pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
     let known = |name: &str| known_blocks(name, pipeline.stages.keys().map(String::as_str));
     for name in &pipeline.default {
         if !pipeline.stages.contains_key(name) {
-            let problem = format!("stage {name}: named in `default`, but there is no such stage; {}", known(name));
+            let problem = format!(
+                "stage {name}: named in `default`, but there is no such stage; {}",
+                known(name)
+            );
             return Err(pipeline.error_in_default(problem));
         }
     }
     for (name, block) in &pipeline.stages {
         extension(pipeline, name, block)?;
         for (input, source) in &block.inputs {
-            if let Some(other) = Source::of(source).stage().filter(|other| !pipeline.stages.contains_key(*other)) {
-                let problem = format!("input {input}: no stage {other:?}; a folder begins with ./ or /; {}", known(other));
+            if let Some(other) =
+                Source::of(source).stage().filter(|other| !pipeline.stages.contains_key(*other))
+            {
+                let problem = format!(
+                    "input {input}: no stage {other:?}; a folder begins with ./ or /; {}",
+                    known(other)
+                );
                 return Err(pipeline.error(name, Part::Input(input), problem));
             }
         }
@@ -43,16 +52,20 @@ fn extension(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), 
         Some(other_block) if other_block.extends.is_some() => {
             format!("extends: {other:?} itself extends another; name that one")
         }
-        Some(_) if block.run.is_some() => "run: what it runs follows from `extends`; give one of them".to_owned(),
+        Some(_) if block.run.is_some() => {
+            "run: what it runs follows from `extends`; give one of them".to_owned()
+        }
         Some(_) => return Ok(()),
     };
     Err(pipeline.error(name, Part::Field("extends"), problem))
 }
 
-/// Checks every block whose stage is known against its description, and every input against what it names.
+/// Checks every block whose stage is known against its description, and every input against what it
+/// names.
 pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), PipelineError> {
     // What is wrong with a block that others extend is said of it alone.
-    let (extending, own): (Vec<_>, Vec<_>) = pipeline.stages.iter().partition(|(_, block)| block.extends.is_some());
+    let (extending, own): (Vec<_>, Vec<_>) =
+        pipeline.stages.iter().partition(|(_, block)| block.extends.is_some());
     for (name, block) in own.into_iter().chain(extending) {
         let Some(program) = programs.get(name) else { continue };
         parameters(pipeline, program, name, block)?;
@@ -61,9 +74,14 @@ pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), Pip
                 .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
         }
         for (input, port) in &program.description.inputs {
-            let is_given = block.inputs.contains_key(input) || (program.description.sink && !block.inputs.is_empty());
+            let is_given = block.inputs.contains_key(input)
+                || (program.description.sink && !block.inputs.is_empty());
             if !port.optional && !is_given {
-                return Err(pipeline.error(name, Part::Block, format!("input {input} is missing ({})", port.summary)));
+                return Err(pipeline.error(
+                    name,
+                    Part::Block,
+                    format!("input {input} is missing ({})", port.summary),
+                ));
             }
         }
     }
@@ -71,18 +89,30 @@ pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), Pip
 }
 
 /// Checks the parameters of a block, over those of the block that it extends.
-fn parameters(pipeline: &Pipeline, program: &StageProgram, name: &str, block: &StageBlock) -> Result<(), PipelineError> {
+fn parameters(
+    pipeline: &Pipeline,
+    program: &StageProgram,
+    name: &str,
+    block: &StageBlock,
+) -> Result<(), PipelineError> {
     let mut given = Map::new();
     pipeline.layers(name).for_each(|layer| program.lay_over(&mut given, &pipeline.stages[layer]));
     let Err(problems) = program.schema.resolve(&given) else { return Ok(()) };
     let parameter = problems[0].name.split('/').next().unwrap_or_default();
-    let part = if program.is_given(block, parameter) { Part::Parameter(parameter) } else { Part::Block };
+    let part =
+        if program.is_given(block, parameter) { Part::Parameter(parameter) } else { Part::Block };
     Err(pipeline.error(name, part, problems[0].to_string()))
 }
 
 /// Checks one input of a stage against what it names.
-fn check_input(description: &Description, input: &str, source: &str, programs: &Programs) -> Result<(), String> {
-    // A sink gets one record of all that it is shown; what its inputs are called is the file's own affair.
+fn check_input(
+    description: &Description,
+    input: &str,
+    source: &str,
+    programs: &Programs,
+) -> Result<(), String> {
+    // A sink gets one record of all that it is shown; what its inputs are called is the file's own
+    // affair.
     let record = || description.inputs.get("run").filter(|_| description.sink);
     let Some(port) = description.inputs.get(input).or_else(record) else {
         if let Some(rename) = renamed(Named::Input, &description.name, input) {
@@ -92,14 +122,17 @@ fn check_input(description: &Description, input: &str, source: &str, programs: &
         return Err(format!("it has no input {input:?}; {known}"));
     };
     let Source::Stage { name: other, subtree } = Source::of(source) else {
-        let problem = format!("input {input}: a sink shows stages, and {source} is a folder; name a stage");
+        let problem =
+            format!("input {input}: a sink shows stages, and {source} is a folder; name a stage");
         return if description.sink { Err(problem) } else { Ok(()) };
     };
     match programs.get(other) {
-        Some(made_by) if made_by.description.sink => {
-            Err(format!("input {input}: {other} is a sink, which shows a run; nothing can be made of that"))
+        Some(made_by) if made_by.description.sink => Err(format!(
+            "input {input}: {other} is a sink, which shows a run; nothing can be made of that"
+        )),
+        Some(made_by) if !description.sink => {
+            check_kind((input, port), source, (other, subtree), made_by)
         }
-        Some(made_by) if !description.sink => check_kind((input, port), source, (other, subtree), made_by),
         _ => Ok(()),
     }
 }
@@ -115,7 +148,11 @@ fn check_kind(
     let kind = match subtree {
         None => &output.kind,
         Some(folder) => output.subtrees.get(folder).ok_or_else(|| {
-            let known = known_subtrees(&made_by.description.name, folder, output.subtrees.keys().map(String::as_str));
+            let known = known_subtrees(
+                &made_by.description.name,
+                folder,
+                output.subtrees.keys().map(String::as_str),
+            );
             format!("input {input}: {other} has no folder {folder:?}; {known}")
         })?,
     };
@@ -130,8 +167,12 @@ pub(crate) fn needs<'a>(pipeline: &'a Pipeline, stage: &str) -> impl Iterator<It
     pipeline.stages[stage].inputs.values().filter_map(|source| Source::of(source).stage())
 }
 
-/// The stages that targets come to, themselves included; `sources` are the stages that one names as inputs.
-pub(crate) fn closure(targets: &[String], sources: impl Fn(&str) -> Vec<String>) -> BTreeSet<String> {
+/// The stages that targets come to, themselves included; `sources` are the stages that one names as
+/// inputs.
+pub(crate) fn closure(
+    targets: &[String],
+    sources: impl Fn(&str) -> Vec<String>,
+) -> BTreeSet<String> {
     let mut found: BTreeSet<String> = BTreeSet::new();
     let mut open: Vec<String> = targets.to_vec();
     while let Some(stage) = open.pop() {
@@ -142,12 +183,15 @@ pub(crate) fn closure(targets: &[String], sources: impl Fn(&str) -> Vec<String>)
     found
 }
 
-/// An order in which every stage comes after those it needs: Kahn's, by name where there is a choice; what is left over is a cycle.
+/// An order in which every stage comes after those it needs: Kahn's, by name where there is a
+/// choice; what is left over is a cycle.
 pub(crate) fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
     let mut left: BTreeSet<&str> = pipeline.stages.keys().map(String::as_str).collect();
     let mut order: Vec<String> = Vec::new();
     while !left.is_empty() {
-        let Some(ready) = left.iter().find(|s| needs(pipeline, s).all(|n| !left.contains(n))).copied() else {
+        let Some(ready) =
+            left.iter().find(|s| needs(pipeline, s).all(|n| !left.contains(n))).copied()
+        else {
             return Err(cycle(pipeline, &left));
         };
         left.remove(ready);
@@ -160,10 +204,16 @@ pub(crate) fn order(pipeline: &Pipeline) -> Result<Vec<String>, PipelineError> {
 fn cycle(pipeline: &Pipeline, left: &BTreeSet<&str>) -> PipelineError {
     let mut path: Vec<&str> = left.first().copied().into_iter().collect();
     // Walk from need to need inside what is left until a stage comes again.
-    while let Some(next) = path.last().and_then(|last| needs(pipeline, last).find(|n| left.contains(n))) {
+    while let Some(next) =
+        path.last().and_then(|last| needs(pipeline, last).find(|n| left.contains(n)))
+    {
         if let Some(at) = path.iter().position(|s| *s == next) {
             let cycle = [&path[at..], &[next]].concat().join(" ← ");
-            return pipeline.error(path[at], Part::Block, format!("its inputs lead back to it: {cycle}"));
+            return pipeline.error(
+                path[at],
+                Part::Block,
+                format!("its inputs lead back to it: {cycle}"),
+            );
         }
         path.push(next);
     }

@@ -1,4 +1,5 @@
-//! From stages and values to nodes: every stage once for each combination of the values that reach it.
+//! From stages and values to nodes: every stage once for each combination of the values that reach
+//! it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -47,19 +48,43 @@ impl<'a> Expansion<'a> {
         let files = Files::new(pipeline, choice)?;
         let (nodes, notes) = (Vec::new(), Vec::new());
         let (of_stage, of_result, left_out) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
-        Ok(Self { pipeline, programs, axes, choice, files, nodes, of_stage, of_result, left_out, notes })
+        Ok(Self {
+            pipeline,
+            programs,
+            axes,
+            choice,
+            files,
+            nodes,
+            of_stage,
+            of_result,
+            left_out,
+            notes,
+        })
     }
 
-    /// Makes the nodes of what the targets need, in an order in which each comes after those that it needs.
-    pub(crate) fn expand(mut self, order: &[String], targets: &[String]) -> Result<Plan, PlanError> {
-        let is_sink = |stage: &str| self.programs.get(stage).is_some_and(|program| program.description.sink);
+    /// Makes the nodes of what the targets need, in an order in which each comes after those that
+    /// it needs.
+    pub(crate) fn expand(
+        mut self,
+        order: &[String],
+        targets: &[String],
+    ) -> Result<Plan, PlanError> {
+        let is_sink =
+            |stage: &str| self.programs.get(stage).is_some_and(|program| program.description.sink);
         let sources = |stage: &str| match is_sink(stage) {
-            true => shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect(),
+            true => {
+                shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect()
+            }
             // An input replaced from the command line needs nothing.
-            false => self.block_inputs(stage).filter_map(|(_, source)| source.stage()).map(str::to_owned).collect(),
+            false => self
+                .block_inputs(stage)
+                .filter_map(|(_, source)| source.stage())
+                .map(str::to_owned)
+                .collect(),
         };
         let wanted = closure(targets, sources);
-        let of_targets: Vec<&str> = wanted.iter().map(String::as_str).filter(|stage| is_sink(stage)).collect();
+        let of_targets: Vec<&str> =
+            wanted.iter().map(String::as_str).filter(|stage| is_sink(stage)).collect();
         check_shown(self.pipeline, &of_targets, self.choice)?;
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
@@ -78,28 +103,44 @@ impl<'a> Expansion<'a> {
         let (mut shows, mut left_out) = (BTreeSet::new(), Vec::new());
         for of in shown(self.pipeline, stage, self.choice) {
             shows.extend(self.of_stage.get(of).into_iter().flatten().map(|(_, node)| *node));
-            left_out.extend(self.left_out.get(of).into_iter().flatten().map(|(point, reason)| FailedPoint {
-                stage: of.to_owned(),
-                point: self.label(point),
-                values: self.values(point),
-                reason: Some(reason.clone()),
+            left_out.extend(self.left_out.get(of).into_iter().flatten().map(|(point, reason)| {
+                FailedPoint {
+                    stage: of.to_owned(),
+                    point: self.label(point),
+                    values: self.values(point),
+                    reason: Some(reason.clone()),
+                }
             }));
         }
-        Ok(Sink { stage: stage.to_owned(), program, parameters, shows: shows.into_iter().collect(), left_out })
+        Ok(Sink {
+            stage: stage.to_owned(),
+            program,
+            parameters,
+            shows: shows.into_iter().collect(),
+            left_out,
+        })
     }
 
     /// A block's inputs less those that the command line or an experiment replaces at every point.
     fn block_inputs(&self, stage: &str) -> impl Iterator<Item = (&'a str, Source<'a>)> {
-        let inputs = self.pipeline.stages[stage].inputs.iter().map(|(name, source)| (name.as_str(), Source::of(source)));
+        let inputs = self.pipeline.stages[stage]
+            .inputs
+            .iter()
+            .map(|(name, source)| (name.as_str(), Source::of(source)));
         let is_set = |axis: &Axis, name: &str| {
-            let sets = |set: &Setting| set.stage == stage && set.kind == Kind::Input && set.name == name;
+            let sets =
+                |set: &Setting| set.stage == stage && set.kind == Kind::Input && set.name == name;
             axis.values.iter().all(|value| value.settings.iter().any(sets))
         };
-        let replaced: Vec<bool> = inputs.clone().map(|(name, _)| self.axes.iter().any(|axis| is_set(axis, name))).collect();
+        let replaced: Vec<bool> = inputs
+            .clone()
+            .map(|(name, _)| self.axes.iter().any(|axis| is_set(axis, name)))
+            .collect();
         inputs.zip(replaced).filter(|(_, is_replaced)| !is_replaced).map(|(input, _)| input)
     }
 
-    /// Whether a setting reaches a stage itself: given for it, or for the one it extends where it doesn't say otherwise.
+    /// Whether a setting reaches a stage itself: given for it, or for the one it extends where it
+    /// doesn't say otherwise.
     fn sets(&self, set: &Setting, stage: &str) -> bool {
         let block = &self.pipeline.stages[stage];
         let is_own = || set.kind.is_given(self.programs.get(stage), block, &set.name);
@@ -107,7 +148,11 @@ impl<'a> Expansion<'a> {
     }
 
     /// The settings of a point that reach a stage, in the order of the axes.
-    fn settings<'b>(&'b self, stage: &'b str, point: &'b Point) -> impl Iterator<Item = &'b Setting> {
+    fn settings<'b>(
+        &'b self,
+        stage: &'b str,
+        point: &'b Point,
+    ) -> impl Iterator<Item = &'b Setting> {
         let of_axis = move |(index, axis): (usize, &'b Axis)| {
             // A stage that an axis doesn't reach has no value of it; a sink has the only one.
             &axis.values[point.get(&index).copied().unwrap_or(0)].settings
@@ -137,7 +182,8 @@ impl<'a> Expansion<'a> {
                 inputs,
                 program: Arc::clone(program),
             };
-            let given: GivenInputs = node.inputs.iter().map(|input| (input.name.clone(), self.made_by(input))).collect();
+            let given: GivenInputs =
+                node.inputs.iter().map(|input| (input.name.clone(), self.made_by(input))).collect();
             if let Some(problem) = program.description.broken_rule(&node.parameters, &given) {
                 return Err(PlanError::Usage(format!("stage {}: {problem}", node.label())));
             }
@@ -159,28 +205,41 @@ impl<'a> Expansion<'a> {
         }
         let parents = self.block_inputs(stage).filter_map(|(_, source)| source.stage());
         let left_out = parents.flat_map(|parent| self.left_out.get(parent).into_iter().flatten());
-        left_out.filter(|(values, _)| is_inside(values, point)).map(|(_, reason)| reason.clone()).next()
+        left_out
+            .filter(|(values, _)| is_inside(values, point))
+            .map(|(_, reason)| reason.clone())
+            .next()
     }
 
-    /// All combinations of the values that reach a stage: those of its own axes and of its parents'.
+    /// All combinations of the values that reach a stage: those of its own axes and of its
+    /// parents'.
     fn points(&self, stage: &str) -> Result<Vec<Point>, PlanError> {
         let is_set = |axis: &&usize| self.axes[**axis].settings().any(|set| self.sets(set, stage));
         let all: Vec<usize> = (0..self.axes.len()).collect();
         let mut reach: BTreeSet<usize> = all.iter().filter(is_set).copied().collect();
         for parent in self.block_inputs(stage).filter_map(|(_, source)| source.stage()) {
             let made = self.of_stage.get(parent).into_iter().flatten().map(|(values, _)| values);
-            let left_out = self.left_out.get(parent).into_iter().flatten().map(|(values, _)| values);
+            let left_out =
+                self.left_out.get(parent).into_iter().flatten().map(|(values, _)| values);
             reach.extend(made.chain(left_out).flat_map(|values| values.keys().copied()));
         }
         let mut points: Vec<Point> = vec![Point::new()];
         for axis in reach {
             let values = self.axes[axis].values.len();
             if points.len() * values + self.nodes.len() > MOST_NODES {
-                let problem = format!("the sweep comes to more than {MOST_NODES} points of {stage}; sweep fewer values at once");
+                let problem = format!(
+                    "the sweep comes to more than {MOST_NODES} points of {stage}; sweep fewer \
+                    values at once"
+                );
                 return Err(PlanError::Usage(problem));
             }
-            let with = |point: &Point, value| point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect();
-            points = points.iter().flat_map(|point| (0..values).map(move |value| with(point, value))).collect();
+            let with = |point: &Point, value| {
+                point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect()
+            };
+            points = points
+                .iter()
+                .flat_map(|point| (0..values).map(move |value| with(point, value)))
+                .collect();
         }
         Ok(points)
     }
@@ -189,10 +248,13 @@ impl<'a> Expansion<'a> {
     fn node_inputs(&self, stage: &str, point: &Point) -> Vec<NodeInput> {
         let of_block = self.block_inputs(stage).map(|(name, source)| {
             let from = match source {
-                Source::Folder(path) => Origin::Folder(self.pipeline.resolve(stage, Part::Input(name), path)),
-                Source::Stage { name, subtree } => {
-                    Origin::Node { index: self.parent(name, point), subtree: subtree.map(str::to_owned) }
+                Source::Folder(path) => {
+                    Origin::Folder(self.pipeline.resolve(stage, Part::Input(name), path))
                 }
+                Source::Stage { name, subtree } => Origin::Node {
+                    index: self.parent(name, point),
+                    subtree: subtree.map(str::to_owned),
+                },
             };
             (name.to_owned(), from)
         });
@@ -226,24 +288,42 @@ impl<'a> Expansion<'a> {
     fn values(&self, point: &Point) -> BTreeMap<String, String> {
         let only = self.axes.iter().filter(|axis| axis.is_named && axis.values.len() == 1);
         let only = only.map(|axis| (axis, axis.values[0].text.as_str()));
-        self.named(point).chain(only).map(|(axis, text)| (axis.name.clone(), text.to_owned())).collect()
+        self.named(point)
+            .chain(only)
+            .map(|(axis, text)| (axis.name.clone(), text.to_owned()))
+            .collect()
     }
 
     fn named<'b>(&'b self, point: &'b Point) -> impl Iterator<Item = (&'b Axis, &'b str)> {
-        let values = point.iter().map(|(axis, value)| (&self.axes[*axis], *value)).filter(|(axis, _)| axis.is_named);
+        let values = point
+            .iter()
+            .map(|(axis, value)| (&self.axes[*axis], *value))
+            .filter(|(axis, _)| axis.is_named);
         values.map(|(axis, value)| (axis, axis.values[value].text.as_str()))
     }
 
-    /// A stage's parameters at a point: the command line's over the file's, those over what it extends, and that over the defaults.
-    fn resolve(&self, stage: &str, program: &StageProgram, point: &Point) -> Result<Value, PlanError> {
+    /// A stage's parameters at a point: the command line's over the file's, those over what it
+    /// extends, and that over the defaults.
+    fn resolve(
+        &self,
+        stage: &str,
+        program: &StageProgram,
+        point: &Point,
+    ) -> Result<Value, PlanError> {
         let mut given = Map::new();
         for layer in self.pipeline.layers(stage) {
             program.lay_over(&mut given, &self.pipeline.stages[layer]);
-            let set = self.settings(stage, point).filter(|set| set.kind == Kind::Parameter && set.stage == layer);
-            let from_line: Map<String, Value> = set.map(|set| (set.name.clone(), set.value.clone())).collect();
+            let set = self
+                .settings(stage, point)
+                .filter(|set| set.kind == Kind::Parameter && set.stage == layer);
+            let from_line: Map<String, Value> =
+                set.map(|set| (set.name.clone(), set.value.clone())).collect();
             program.schema.lay_over(&mut given, &from_line);
         }
-        program.schema.resolve(&given).map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
+        program
+            .schema
+            .resolve(&given)
+            .map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
     }
 }
 

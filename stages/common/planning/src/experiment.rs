@@ -1,4 +1,5 @@
-//! Experiments: a pipeline file with scenes, protocols and variants, each of which sets several things at once.
+//! Experiments: a pipeline file with scenes, protocols and variants, each of which sets several
+//! things at once.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -11,7 +12,8 @@ use serde_json::{Map, Value};
 use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, folder};
 use crate::plan::{PlanError, Request};
 
-/// What a pipeline file says of an experiment, besides its blocks. A file that extends others changes theirs part by part.
+/// What a pipeline file says of an experiment, besides its blocks. A file that extends others
+/// changes theirs part by part.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Experiment {
@@ -21,21 +23,26 @@ pub struct Experiment {
     pub folders: Vec<String>,
     /// Scenes: names of data sets, or `demo` for the pipeline's own.
     pub scenes: Vec<String>,
-    /// Protocols: names of `presets`. An unknown one of the form WIDTHxSCALE has the settings of preset `other`.
+    /// Protocols: names of `presets`. An unknown one of the form WIDTHxSCALE has the settings of
+    /// preset `other`.
     pub protocols: Vec<String>,
-    /// Parameters that go together, by name and then by `[STAGE.]NAME`. Preset `every` holds what all of them have, where they don't say
-    /// otherwise. In words, `{width}`, `{scale}` and `{hr_width}` stand for a protocol's own.
+    /// Parameters that go together, by name and then by `[STAGE.]NAME`. Preset `every` holds what
+    /// all of them have, where they don't say otherwise. In words, `{width}`, `{scale}` and
+    /// `{hr_width}` stand for a protocol's own.
     pub presets: BTreeMap<String, Map<String, Value>>,
-    /// Inputs that come from the folder of the data sets, by `[STAGE.]NAME`; left out where the folder isn't there.
+    /// Inputs that come from the folder of the data sets, by `[STAGE.]NAME`; left out where the
+    /// folder isn't there.
     pub inputs: BTreeMap<String, String>,
-    /// Files in the folder of the data sets without which a block isn't made, by block. `{NAME}` stands for the block's parameter.
+    /// Files in the folder of the data sets without which a block isn't made, by block. `{NAME}`
+    /// stands for the block's parameter.
     pub needs: BTreeMap<String, String>,
-    /// Inputs of sinks that are shown unless the command line chooses, by their names or by the blocks that they are; a sink that has none of
-    /// them shows all of its own.
+    /// Inputs of sinks that are shown unless the command line chooses, by their names or by the
+    /// blocks that they are; a sink that has none of them shows all of its own.
     pub show: Vec<String>,
     /// Variants, in the order of the table; they form no product.
     pub variants: Vec<Variant>,
-    /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the place of one.
+    /// Parameters with several values each, by `[STAGE.]NAME`; they form a product. `-p` takes the
+    /// place of one.
     pub sweeps: BTreeMap<String, Vec<Value>>,
 }
 
@@ -103,8 +110,10 @@ impl Experiment {
 
     /// Whether it sets something of that name, itself.
     pub(crate) fn names(&self, name: &str) -> bool {
-        let parameters = self.presets.values().chain(self.variants.iter().map(|variant| &variant.parameters));
-        let inputs = [&self.inputs].into_iter().chain(self.variants.iter().map(|variant| &variant.inputs));
+        let parameters =
+            self.presets.values().chain(self.variants.iter().map(|variant| &variant.parameters));
+        let inputs =
+            [&self.inputs].into_iter().chain(self.variants.iter().map(|variant| &variant.inputs));
         parameters.into_iter().any(|parameters| parameters.contains_key(name))
             || inputs.into_iter().any(|inputs| inputs.contains_key(name))
             || self.sweeps.contains_key(name)
@@ -125,13 +134,23 @@ impl Experiment {
 pub(crate) fn axes(scope: &Scope<'_>, request: &Request) -> Result<Vec<Axis>, PlanError> {
     let (experiment, choice) = (&scope.pipeline.experiment, &request.choice);
     if experiment.is_none() {
-        let is_asked = !(choice.scenes.is_empty() && choice.protocols.is_empty() && choice.variants.is_empty());
-        let problem = "--scene, --protocol and --variant are for experiments; name one as target, such as quality";
+        let is_asked = !(choice.scenes.is_empty()
+            && choice.protocols.is_empty()
+            && choice.variants.is_empty());
+        let problem = "--scene, --protocol and --variant are for experiments; name one as target, \
+            such as quality";
         return if is_asked { Err(PlanError::Usage(problem.to_owned())) } else { Ok(Vec::new()) };
     }
     let asked = Asked { scope, experiment, choice };
-    let axes = [("scene", asked.scenes()?), ("protocol", asked.protocols()?), ("variant", asked.variants()?)];
-    let axes = axes.into_iter().filter(|(_, values)| !values.is_empty()).map(|(name, values)| Axis::new(name, values));
+    let axes = [
+        ("scene", asked.scenes()?),
+        ("protocol", asked.protocols()?),
+        ("variant", asked.variants()?),
+    ];
+    let axes = axes
+        .into_iter()
+        .filter(|(_, values)| !values.is_empty())
+        .map(|(name, values)| Axis::new(name, values));
     let sweeps = experiment.sweeps.iter().map(|(name, values)| asked.sweep(name, values));
     axes.map(Ok).chain(sweeps).collect()
 }
@@ -145,7 +164,11 @@ struct Asked<'a> {
 
 impl Asked<'_> {
     fn scenes(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let names = if self.choice.scenes.is_empty() { &self.experiment.scenes } else { &self.choice.scenes };
+        let names = if self.choice.scenes.is_empty() {
+            &self.experiment.scenes
+        } else {
+            &self.choice.scenes
+        };
         let common = self.inputs(&self.experiment.inputs)?;
         let scene = |name: &String| {
             let mut settings = common.clone();
@@ -161,10 +184,19 @@ impl Asked<'_> {
     /// That input of a block, and those of other blocks that come from the same source.
     fn alike(&self, own: &Setting) -> Vec<Setting> {
         let stages = &self.scope.pipeline.stages;
-        let Some(source) = stages[&own.stage].inputs.get(&own.name) else { return vec![own.clone()] };
-        let inputs = stages.iter().flat_map(|(stage, block)| block.inputs.iter().map(move |(name, from)| (stage, name, from)));
+        let Some(source) = stages[&own.stage].inputs.get(&own.name) else {
+            return vec![own.clone()];
+        };
+        let inputs = stages.iter().flat_map(|(stage, block)| {
+            block.inputs.iter().map(move |(name, from)| (stage, name, from))
+        });
         let same = inputs.filter(|(.., from)| *from == source);
-        same.map(|(stage, name, _)| Setting { stage: stage.clone(), name: name.clone(), ..own.clone() }).collect()
+        same.map(|(stage, name, _)| Setting {
+            stage: stage.clone(),
+            name: name.clone(),
+            ..own.clone()
+        })
+        .collect()
     }
 
     /// The folder of a scene.
@@ -172,11 +204,15 @@ impl Asked<'_> {
         let data = self.experiment.data(self.choice);
         let place = |inside: &String| data.join(inside).join(name);
         let here = ".".to_owned();
-        let found = self.experiment.folders.iter().chain([&here]).map(place).find(|path| path.is_dir());
+        let found =
+            self.experiment.folders.iter().chain([&here]).map(place).find(|path| path.is_dir());
         match found {
             Some(path) => Ok(folder(&path.to_string_lossy())),
             None => {
-                let problem = format!("no scene {name} in {}; --data names a folder that has it", data.display());
+                let problem = format!(
+                    "no scene {name} in {}; --data names a folder that has it",
+                    data.display()
+                );
                 Err(PlanError::Usage(problem))
             }
         }
@@ -185,17 +221,31 @@ impl Asked<'_> {
     /// Inputs from the data sets' folder, those that are there.
     fn inputs(&self, inputs: &BTreeMap<String, String>) -> Result<Vec<Setting>, PlanError> {
         let data = self.experiment.data(self.choice);
-        let there = inputs.iter().map(|(name, inside)| (name, data.join(inside))).filter(|(_, path)| path.is_dir());
-        there.map(|(name, path)| self.scope.setting(Kind::Input, name, &folder(&path.to_string_lossy()))).collect()
+        let there = inputs
+            .iter()
+            .map(|(name, inside)| (name, data.join(inside)))
+            .filter(|(_, path)| path.is_dir());
+        there
+            .map(|(name, path)| {
+                self.scope.setting(Kind::Input, name, &folder(&path.to_string_lossy()))
+            })
+            .collect()
     }
 
     fn protocols(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let names = if self.choice.protocols.is_empty() { &self.experiment.protocols } else { &self.choice.protocols };
-        let protocol = |name: &String| Ok(AxisValue { text: name.clone(), settings: self.parameters(&self.preset(name)?)? });
+        let names = if self.choice.protocols.is_empty() {
+            &self.experiment.protocols
+        } else {
+            &self.choice.protocols
+        };
+        let protocol = |name: &String| {
+            Ok(AxisValue { text: name.clone(), settings: self.parameters(&self.preset(name)?)? })
+        };
         names.iter().map(protocol).collect()
     }
 
-    /// A preset's parameters over those of `every`; those of `other` with the width and the scale for one that isn't named.
+    /// A preset's parameters over those of `every`; those of `other` with the width and the scale
+    /// for one that isn't named.
     fn preset(&self, name: &str) -> Result<Map<String, Value>, PlanError> {
         let presets = &self.experiment.presets;
         let is_protocol = |name: &str| ![OTHER, EVERY].contains(&name);
@@ -209,8 +259,13 @@ impl Asked<'_> {
                 preset.insert("prep.scale".to_owned(), Value::from(scale));
             }
             (None, None) => {
-                let known = known_names(name, presets.keys().map(String::as_str).filter(|known| is_protocol(known)));
-                return Err(PlanError::Usage(format!("no protocol {name:?}, and not of the form WIDTHxSCALE; {known}")));
+                let known = known_names(
+                    name,
+                    presets.keys().map(String::as_str).filter(|known| is_protocol(known)),
+                );
+                return Err(PlanError::Usage(format!(
+                    "no protocol {name:?}, and not of the form WIDTHxSCALE; {known}"
+                )));
             }
         }
         if let Some(sizes) = sizes {
@@ -222,13 +277,21 @@ impl Asked<'_> {
     fn variants(&self) -> Result<Vec<AxisValue>, PlanError> {
         let all = &self.experiment.variants;
         let known = |name: &str| known_names(name, all.iter().map(|variant| variant.name.as_str()));
-        if let Some(name) = self.choice.variants.iter().find(|name| !all.iter().any(|variant| variant.name == **name)) {
+        if let Some(name) = self
+            .choice
+            .variants
+            .iter()
+            .find(|name| !all.iter().any(|variant| variant.name == **name))
+        {
             return Err(PlanError::Usage(format!("no variant {name:?}; {}", known(name))));
         }
-        let is_wanted = |variant: &&Variant| self.choice.variants.is_empty() || self.choice.variants.contains(&variant.name);
+        let is_wanted = |variant: &&Variant| {
+            self.choice.variants.is_empty() || self.choice.variants.contains(&variant.name)
+        };
         let wanted = all.iter().filter(is_wanted).take(self.choice.first.unwrap_or(usize::MAX));
         let variant = |variant: &Variant| {
-            let settings = [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
+            let settings =
+                [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
             Ok(AxisValue { text: variant.name.clone(), settings })
         };
         wanted.map(variant).collect()
@@ -238,15 +301,25 @@ impl Asked<'_> {
     fn sweep(&self, name: &str, values: &[Value]) -> Result<Axis, PlanError> {
         let value = |value: &Value| {
             let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-            Ok(AxisValue { text, settings: vec![self.scope.setting(Kind::Parameter, name, value)?] })
+            Ok(AxisValue {
+                text,
+                settings: vec![self.scope.setting(Kind::Parameter, name, value)?],
+            })
         };
         let values = values.iter().map(value).collect::<Result<Vec<_>, PlanError>>()?;
-        let name = values.first().and_then(|value| value.settings.first()).map_or(name, |setting| &setting.name).to_owned();
+        let name = values
+            .first()
+            .and_then(|value| value.settings.first())
+            .map_or(name, |setting| &setting.name)
+            .to_owned();
         Ok(Axis::new(&name, values))
     }
 
     fn parameters(&self, parameters: &Map<String, Value>) -> Result<Vec<Setting>, PlanError> {
-        parameters.iter().map(|(name, value)| self.scope.setting(Kind::Parameter, name, value)).collect()
+        parameters
+            .iter()
+            .map(|(name, value)| self.scope.setting(Kind::Parameter, name, value))
+            .collect()
     }
 }
 
@@ -259,7 +332,13 @@ fn sizes(name: &str) -> Option<(u32, f64)> {
 /// Puts a protocol's sizes into a word that names them; what is a number then, is meant as one.
 fn fill(value: &mut Value, (width, scale): (u32, f64)) {
     let Some(word) = value.as_str().filter(|word| word.contains('{')) else { return };
-    let sizes = [("{width}", f64::from(width)), ("{scale}", scale), ("{hr_width}", (f64::from(width) * scale).round())];
-    let filled = sizes.iter().fold(word.to_owned(), |word, (name, size)| word.replace(name, &size.to_string()));
+    let sizes = [
+        ("{width}", f64::from(width)),
+        ("{scale}", scale),
+        ("{hr_width}", (f64::from(width) * scale).round()),
+    ];
+    let filled = sizes
+        .iter()
+        .fold(word.to_owned(), |word, (name, size)| word.replace(name, &size.to_string()));
     *value = filled.parse().map_or_else(|_| Value::from(filled.as_str()), Value::Number);
 }

@@ -48,14 +48,17 @@ fn descriptions() -> BTreeMap<String, Description> {
         (
             "score",
             "metrics",
-            json!({"field": {"kinds": ["field"], "summary": ""}, "weights": {"kinds": ["w"], "optional": true, "summary": ""}}),
+            json!({"field": {"kinds": ["field"], "summary": ""},
+                "weights": {"kinds": ["w"], "optional": true, "summary": ""}}),
             json!({"samples": integer(2)}),
         ),
         ("table", "table", json!({"run": {"kinds": ["run"], "summary": ""}}), json!({})),
     ];
     let whole = |(name, kind, inputs, parameters): (&str, &str, Value, Value)| {
-        let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs, "output": {"kind": kind},
-            "parameters": {"properties": parameters}, "sink": name == "table", "partial": name == "table"});
+        let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs,
+            "output": {"kind": kind},
+            "parameters": {"properties": parameters}, "sink": name == "table",
+            "partial": name == "table"});
         (name.to_owned(), serde_json::from_value(text).unwrap())
     };
     described.map(whole).into()
@@ -63,10 +66,16 @@ fn descriptions() -> BTreeMap<String, Description> {
 
 /// The plan of an experiment, whose data sets lie in a folder of their own.
 fn plan_of(text: &str, data: &Path, change: impl Fn(&mut Request)) -> Result<Plan, PlanError> {
-    let mut request =
-        Request { choice: Selection { data: Some(data.to_path_buf()), ..Selection::default() }, ..Request::default() };
+    let mut request = Request {
+        choice: Selection { data: Some(data.to_path_buf()), ..Selection::default() },
+        ..Request::default()
+    };
     change(&mut request);
-    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+    Plan::from_descriptions(
+        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
+        &descriptions(),
+        &request,
+    )
 }
 
 fn data() -> tempfile::TempDir {
@@ -104,8 +113,14 @@ fn scenes_protocols_and_variants_are_axes() {
     let last = plan.nodes.last().unwrap();
     let values = [("protocol", "100x2"), ("scene", "lego"), ("variant", "one ray, shown")];
     assert_eq!(last.values, values.map(|(name, value)| (name.to_owned(), value.to_owned())).into());
-    assert_eq!((&last.parameters["samples"], &plan.nodes[3].parameters["warmup"]), (&json!(1), &json!(0)));
-    assert_eq!((&plan.nodes[0].parameters["lr_width"], &plan.nodes[2].parameters["rays"]), (&json!(100), &json!(1000)));
+    assert_eq!(
+        (&last.parameters["samples"], &plan.nodes[3].parameters["warmup"]),
+        (&json!(1), &json!(0))
+    );
+    assert_eq!(
+        (&plan.nodes[0].parameters["lr_width"], &plan.nodes[2].parameters["rays"]),
+        (&json!(100), &json!(1000))
+    );
     let folder = |node: usize, input: &str| {
         let input = plan.nodes[node].inputs.iter().find(|one| one.name == input).unwrap();
         match &input.from {
@@ -126,9 +141,13 @@ fn the_command_line_chooses_and_wins() {
         labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect()
     };
     let named = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
-    assert_eq!(scores(&|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))), ["score"]);
     assert_eq!(
-        scores(&|r| (r.choice.scenes, r.choice.variants) = (named(&["demo"]), named(&["no warm-up", "as it is"]))),
+        scores(&|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))),
+        ["score"]
+    );
+    assert_eq!(
+        scores(&|r| (r.choice.scenes, r.choice.variants) =
+            (named(&["demo"]), named(&["no warm-up", "as it is"]))),
         ["score [variant=as it is]", "score [variant=no warm-up]"]
     );
     let plan = plan_of(EXPERIMENT, data.path(), |r| {
@@ -139,9 +158,18 @@ fn the_command_line_chooses_and_wins() {
     });
     let plan = plan.unwrap();
     // Both variants come to one node, for what they set is set otherwise.
-    assert_eq!(labels(&plan)[2..4], ["train [variant=as it is, lr_width=20]", "train [variant=as it is, lr_width=30]"]);
-    assert_eq!((&plan.nodes[0].parameters["lr_width"], &plan.nodes[0].parameters["scale"]), (&json!(20), &json!(3)));
-    assert_eq!((&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]), (&json!(7), &json!(500)));
+    assert_eq!(
+        labels(&plan)[2..4],
+        ["train [variant=as it is, lr_width=20]", "train [variant=as it is, lr_width=30]"]
+    );
+    assert_eq!(
+        (&plan.nodes[0].parameters["lr_width"], &plan.nodes[0].parameters["scale"]),
+        (&json!(20), &json!(3))
+    );
+    assert_eq!(
+        (&plan.nodes[2].parameters["warmup"], &plan.nodes[2].parameters["rays"]),
+        (&json!(7), &json!(500))
+    );
 }
 
 /// The pipeline's own scene sets nothing, and tables name it nonetheless.
@@ -150,14 +178,19 @@ fn an_only_value_is_every_nodes() {
     let data = data();
     let text = EXPERIMENT.replace("  inputs: {score.weights: weights}\n", "");
     let plan = plan_of(&text, data.path(), |r| r.choice.scenes = vec!["demo".to_owned()]).unwrap();
-    assert!(plan.nodes.iter().all(|node| node.values["scene"] == "demo" && !node.label().contains("demo")));
+    assert!(
+        plan.nodes
+            .iter()
+            .all(|node| node.values["scene"] == "demo" && !node.label().contains("demo"))
+    );
 }
 
 #[test]
 fn a_sweep_of_the_file_gives_way() {
     let data = data();
     let text = EXPERIMENT.replace("  variants:\n", "  sweeps: {train.rays: [5, 6]}\n  variants:\n");
-    let choose = |r: &mut Request| (r.choice.scenes, r.choice.first) = (vec!["demo".to_owned()], Some(1));
+    let choose =
+        |r: &mut Request| (r.choice.scenes, r.choice.first) = (vec!["demo".to_owned()], Some(1));
     let plan = plan_of(&text, data.path(), choose).unwrap();
     assert_eq!(labels(&plan)[1..3], ["train [rays=5]", "train [rays=6]"]);
     let plan = plan_of(&text, data.path(), |r| {
@@ -167,7 +200,8 @@ fn a_sweep_of_the_file_gives_way() {
     assert_eq!(labels(&plan.unwrap())[1..2], ["train"]);
 }
 
-/// An experiment whose sink shows two fields' scores; one of them is of a scene of its own and needs a file.
+/// An experiment whose sink shows two fields' scores; one of them is of a scene of its own and
+/// needs a file.
 const SHOWN: &str = "
   prep-large:
     extends: prep
@@ -186,7 +220,8 @@ fn shown() -> String {
     let text = EXPERIMENT.replace("\n  table:\n    inputs: {run: score}\n", SHOWN);
     let text = text.replace(
         "  variants:\n",
-        "    every: {prep-large.lr_width: '{hr_width}', score-large.samples: '{scale}'}\n  variants:\n",
+        "    every: {prep-large.lr_width: '{hr_width}', score-large.samples: '{scale}'}\n  \
+        variants:\n",
     );
     text.replace("  variants:\n", "  needs: {train-large: 'weights/x{rays}'}\n  variants:\n")
 }
@@ -197,13 +232,17 @@ fn only_what_is_to_be_shown_is_made() {
     std::fs::write(data.path().join("weights/x500"), "").unwrap();
     let plan = |show: &[&str]| {
         plan_of(&shown(), data.path(), |r| {
-            (r.choice.scenes, r.choice.protocols, r.choice.first) = (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
+            (r.choice.scenes, r.choice.protocols, r.choice.first) =
+                (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
             r.choice.show = show.iter().map(|name| (*name).to_owned()).collect();
         })
     };
     for (show, expected) in [
         (&[][..], &["prep", "prep-large", "train", "score", "train-large", "score-large"][..]),
-        (&["large", "score"], &["prep", "prep-large", "train", "score", "train-large", "score-large"]),
+        (
+            &["large", "score"],
+            &["prep", "prep-large", "train", "score", "train-large", "score-large"],
+        ),
         (&["small"], &["prep", "train", "score"]),
         (&["score-large"], &["prep-large", "train-large", "score-large"]),
     ] {
@@ -213,16 +252,23 @@ fn only_what_is_to_be_shown_is_made() {
         expected.sort_unstable();
         assert_eq!(made, expected, "{show:?}");
     }
-    // The scene is every block's that has the pipeline's own otherwise; sizes follow from the protocol.
+    // The scene is every block's that has the pipeline's own otherwise; sizes follow from the
+    // protocol.
     let large = &plan(&["large"]).unwrap().nodes;
-    let folder =
-        NodeInput { name: "dataset".to_owned(), from: Origin::Folder(data.path().join("second/lego").canonicalize().unwrap()) };
-    assert_eq!((&large[0].inputs[..], &large[0].parameters["lr_width"]), (&[folder][..], &json!(150)));
+    let folder = NodeInput {
+        name: "dataset".to_owned(),
+        from: Origin::Folder(data.path().join("second/lego").canonicalize().unwrap()),
+    };
+    assert_eq!(
+        (&large[0].inputs[..], &large[0].parameters["lr_width"]),
+        (&[folder][..], &json!(150))
+    );
     assert_eq!(large[2].parameters["samples"], json!(3));
     let problem = |show: &[&str]| plan(show).map(|plan| labels(&plan)).unwrap_err().to_string();
     assert_eq!(
         problem(&["larg"]),
-        "--show larg: table has no such input; did you mean large? known: large, score, score-large, small"
+        "--show larg: table has no such input; did you mean large? known: large, score, \
+        score-large, small"
     );
 }
 
@@ -235,13 +281,24 @@ fn what_lacks_a_file_is_left_out() {
         (r.choice.scenes, r.choice.first) = (vec!["chair".to_owned()], Some(1));
     });
     let plan = plan.unwrap();
-    let scores: Vec<String> = labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect();
-    assert_eq!(scores, ["score [protocol=50x3]", "score [protocol=100x2]", "score-large [protocol=50x3]"]);
+    let scores: Vec<String> =
+        labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect();
+    assert_eq!(
+        scores,
+        ["score [protocol=50x3]", "score [protocol=100x2]", "score-large [protocol=50x3]"]
+    );
     assert_eq!(plan.sinks[0].shows.len(), 3);
     let [left_out] = &plan.sinks[0].left_out[..] else { panic!("{:?}", plan.sinks[0].left_out) };
-    assert_eq!((left_out.stage.as_str(), left_out.values["protocol"].as_str()), ("score-large", "100x2"));
+    assert_eq!(
+        (left_out.stage.as_str(), left_out.values["protocol"].as_str()),
+        ("score-large", "100x2")
+    );
     assert_eq!(left_out.reason.as_deref(), Some("no weights/x1000"));
-    assert!(plan.notes[0].starts_with("train-large: left out: no weights/x1000 in "), "{:?}", plan.notes);
+    assert!(
+        plan.notes[0].starts_with("train-large: left out: no weights/x1000 in "),
+        "{:?}",
+        plan.notes
+    );
 }
 
 #[test]
@@ -258,7 +315,11 @@ fn what_there_is_not_is_refused() {
             &|c| c.protocols = vec!["100y2".to_owned()],
             "no protocol \"100y2\", and not of the form WIDTHxSCALE; did you mean 100x2?",
         ),
-        (EXPERIMENT.to_owned(), &|c| c.protocols = vec!["other".to_owned()], "no protocol \"other\""),
+        (
+            EXPERIMENT.to_owned(),
+            &|c| c.protocols = vec!["other".to_owned()],
+            "no protocol \"other\"",
+        ),
         (
             EXPERIMENT.to_owned(),
             &|c| c.variants = vec!["no warmup".to_owned()],

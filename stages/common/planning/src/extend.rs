@@ -19,7 +19,8 @@ impl Pipeline {
         Self::parse(&bytes, path)
     }
 
-    /// The pipeline of a file's bytes; `path` says where relative paths start, and is named in errors.
+    /// The pipeline of a file's bytes; `path` says where relative paths start, and is named in
+    /// errors.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let file = File::parse(bytes, path)?;
         let mut trail = vec![file.id.clone()];
@@ -30,7 +31,8 @@ impl Pipeline {
     pub fn joined(mut self, other: Self) -> Result<Self, String> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_same(&other, name)) {
-            let [one, two] = [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.display());
+            let [one, two] =
+                [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.display());
             return Err(format!("block {name} isn't the same in {one} and in {two}"));
         }
         self.stages.extend(other.stages);
@@ -48,14 +50,18 @@ impl Pipeline {
 fn extended(file: File, trail: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineError> {
     let mut all: Option<Pipeline> = None;
     for other in &file.written.extends {
-        let fail = |problem: String| file.error(&["extends"], format!("extends {other}: {problem}"));
+        let fail =
+            |problem: String| file.error(&["extends"], format!("extends {other}: {problem}"));
         let id = file.folder().join(other).canonicalize();
-        let id = id.map_err(|e| fail(format!("{e}; a path is relative to the file in which it stands")))?;
+        let id = id
+            .map_err(|e| fail(format!("{e}; a path is relative to the file in which it stands")))?;
         if trail.contains(&id) {
             return Err(fail("that file is this one or extends it; leave it out".to_owned()));
         }
         if trail.len() == DEEPEST {
-            return Err(fail(format!("more than {DEEPEST} files extend one another; extend a file nearer to the last")));
+            return Err(fail(format!(
+                "more than {DEEPEST} files extend one another; extend a file nearer to the last"
+            )));
         }
         let bytes = std::fs::read(&id).map_err(|e| fail(e.to_string()))?;
         trail.push(id.clone());
@@ -63,7 +69,9 @@ fn extended(file: File, trail: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineEr
         trail.pop();
         all = Some(match all {
             None => pipeline,
-            Some(all) => all.joined(pipeline).map_err(|problem| fail(format!("{problem}; extend one of them")))?,
+            Some(all) => all
+                .joined(pipeline)
+                .map_err(|problem| fail(format!("{problem}; extend one of them")))?,
         });
     }
     Ok(changed(all.unwrap_or_default(), file))

@@ -51,7 +51,10 @@ fn a_file_changes_part_by_part_what_it_extends() {
     assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), ["a", "b", "c"]);
     let (a, b) = (&pipeline.stages["a"], &pipeline.stages["b"]);
     let layers: Vec<_> = a.parameter_layers().filter(|layer| !layer.is_empty()).collect();
-    assert_eq!(serde_json::to_value(layers).unwrap(), serde_json::json!([{"one": 1, "two": 2}, {"two": 3}]));
+    assert_eq!(
+        serde_json::to_value(layers).unwrap(),
+        serde_json::json!([{"one": 1, "two": 2}, {"two": 3}])
+    );
     assert_eq!(a.inputs.keys().collect::<Vec<_>>(), ["x", "y", "z"]);
     assert_eq!((b.run.as_deref(), b.extends.as_deref()), (None, Some("a")));
     assert_eq!(b.inputs["x"], "a");
@@ -69,7 +72,11 @@ fn a_file_changes_part_by_part_what_it_extends() {
     ] {
         let error = pipeline.error(stage, part, "wrong").to_string();
         assert_eq!(error, format!("{}:{line}: stage {stage}: wrong", file.display()));
-        assert_eq!(pipeline.resolve(stage, part, "./it"), file.with_file_name("it"), "{stage} {part:?}");
+        assert_eq!(
+            pipeline.resolve(stage, part, "./it"),
+            file.with_file_name("it"),
+            "{stage} {part:?}"
+        );
     }
     let error = pipeline.error_in_default("wrong".to_owned()).to_string();
     assert_eq!(error, format!("{}:1: wrong", lower.display()));
@@ -78,12 +85,22 @@ fn a_file_changes_part_by_part_what_it_extends() {
 /// Each in one line, with the line of `extends`.
 #[test]
 fn files_that_cannot_be_extended() {
-    let deep: Vec<(String, String)> =
-        (0..10).map(|i| (format!("{i}.yaml"), format!("\nextends: {}.yaml", (i + 1).min(9)))).collect();
-    let deep: Vec<(&str, &str)> = deep.iter().map(|(name, text)| (name.as_str(), text.as_str())).collect();
+    let deep: Vec<(String, String)> = (0..10)
+        .map(|i| (format!("{i}.yaml"), format!("\nextends: {}.yaml", (i + 1).min(9))))
+        .collect();
+    let deep: Vec<(&str, &str)> =
+        deep.iter().map(|(name, text)| (name.as_str(), text.as_str())).collect();
     for (files, place, words) in [
-        (&[("x.yaml", "\nextends: ../none.yaml\n")][..], "x.yaml:2: ", "a path is relative to the file in which it stands"),
-        (&[("x.yaml", "extends: x.yaml")], "x.yaml:1: ", "extends x.yaml: that file is this one or extends it"),
+        (
+            &[("x.yaml", "\nextends: ../none.yaml\n")][..],
+            "x.yaml:2: ",
+            "a path is relative to the file in which it stands",
+        ),
+        (
+            &[("x.yaml", "extends: x.yaml")],
+            "x.yaml:1: ",
+            "extends x.yaml: that file is this one or extends it",
+        ),
         (
             &[("x.yaml", "extends: y.yaml"), ("y.yaml", "extends: [./x.yaml]")],
             "y.yaml:1: ",
@@ -91,8 +108,16 @@ fn files_that_cannot_be_extended() {
         ),
         (&[("x.yaml", "extends: 0.yaml")], "6.yaml:2: ", "more than 8 files extend one another"),
         (&[("x.yaml", "extends: .")], "x.yaml:1: ", "extends .: "),
-        (&[("x.yaml", "extends: {a: b}")], "x.yaml:1", "expected the path of a pipeline file, or a list of paths"),
-        (&[("x.yaml", "extends: y.yaml"), ("y.yaml", "default: [a]\nstages:\n  a: {like: b}")], "y.yaml:3: ", "`extends` now"),
+        (
+            &[("x.yaml", "extends: {a: b}")],
+            "x.yaml:1",
+            "expected the path of a pipeline file, or a list of paths",
+        ),
+        (
+            &[("x.yaml", "extends: y.yaml"), ("y.yaml", "default: [a]\nstages:\n  a: {like: b}")],
+            "y.yaml:3: ",
+            "`extends` now",
+        ),
         (&[("x.yaml", "stages: {}")], "x.yaml: ", "missing field `default`"),
         (&[("x.yaml", "default: []")], "x.yaml: ", "missing field `stages`"),
         (
@@ -103,31 +128,50 @@ fn files_that_cannot_be_extended() {
             "x.yaml:1: ",
             "isn't the same in",
         ),
-        (&[("x.yaml", "extends: [y/y.yaml, pipeline.yaml]"), ("y/y.yaml", BASE)], "x.yaml:1: ", "block a isn't the same in"),
+        (
+            &[("x.yaml", "extends: [y/y.yaml, pipeline.yaml]"), ("y/y.yaml", BASE)],
+            "x.yaml:1: ",
+            "block a isn't the same in",
+        ),
     ] {
         let folder = base_and(&[files, &deep].concat());
         let home = folder.path().canonicalize().unwrap();
         let error = Pipeline::read(&home.join("x.yaml")).unwrap_err().to_string();
-        assert!(error.starts_with(&home.join(place).display().to_string()) && error.contains(words), "{error}");
+        assert!(
+            error.starts_with(&home.join(place).display().to_string()) && error.contains(words),
+            "{error}"
+        );
         assert!(!error.contains('\n'), "{error}");
     }
     // Eight are fine, and so is one file by two ways.
     for text in ["extends: 3.yaml", "extends: [y.yaml, pipeline.yaml, z.yaml]"] {
         let shared = "extends: pipeline.yaml\nstages: {d: {}}";
-        let folder =
-            base_and(&[&deep[..9], &[("9.yaml", BASE), ("x.yaml", text), ("y.yaml", shared), ("z.yaml", shared)]].concat());
+        let folder = base_and(
+            &[
+                &deep[..9],
+                &[("9.yaml", BASE), ("x.yaml", text), ("y.yaml", shared), ("z.yaml", shared)],
+            ]
+            .concat(),
+        );
         let pipeline = Pipeline::read(&folder.path().join("x.yaml")).unwrap();
         assert_eq!(pipeline.default, ["b"]);
     }
 }
 
-/// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the blocks of those.
+/// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the
+/// blocks of those.
 #[test]
 fn targets_are_found_beside_the_pipeline() {
     let shelf = [
-        ("pipelines/c.yaml", "extends: ../pipeline.yaml\nstages: {c: {inputs: {x: b}}, inner: {}, b: {}}"),
+        (
+            "pipelines/c.yaml",
+            "extends: ../pipeline.yaml\nstages: {c: {inputs: {x: b}}, inner: {}, b: {}}",
+        ),
         ("pipelines/d.yaml", "extends: c.yaml\ndefault: [inner, a]\nstages: {other: {}}"),
-        ("pipelines/e.yaml", "extends: ../pipeline.yaml\nstages: {e: {}, a: {parameters: {one: 7}}}"),
+        (
+            "pipelines/e.yaml",
+            "extends: ../pipeline.yaml\nstages: {e: {}, a: {parameters: {one: 7}}}",
+        ),
         ("pipelines/broken.yaml", "stages: ["),
         ("pipelines/notes.txt", "c"),
     ];
@@ -151,10 +195,17 @@ fn targets_are_found_beside_the_pipeline() {
         assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), stages, "{names:?}");
     }
     for (names, words) in [
-        (&["othre"][..], &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"][..]),
+        (
+            &["othre"][..],
+            &["no stage \"othre\"; did you mean other? known: a, b, broken, c, d, e, inner, other"]
+                [..],
+        ),
         (&["../pipeline"], &["no stage \"../pipeline\""]),
         (&["broken"], &["pipelines/broken.yaml"]),
-        (&["c", "e"], &["e can't be made together with c: block a isn't the same in", "make it by itself"]),
+        (
+            &["c", "e"],
+            &["e can't be made together with c: block a isn't the same in", "make it by itself"],
+        ),
         (&["joined"], &["no stage \"joined\"; it is called hr-finetune now"]),
     ] {
         let error = find(names).unwrap_err().to_string();
@@ -162,14 +213,25 @@ fn targets_are_found_beside_the_pipeline() {
     }
 }
 
-/// A file of `pipelines/` shares store and pages with pipeline.yaml; a pipeline of its own has its own, wherever it lies.
+/// A file of `pipelines/` shares store and pages with pipeline.yaml; a pipeline of its own has its
+/// own, wherever it lies.
 #[test]
 fn the_store_lies_beside_the_pipeline() {
-    let more = [("pipelines/c.yaml", UPPER), ("pipelines/alone.yaml", BASE), ("other/x.yaml", "extends: ../pipelines/c.yaml")];
+    let more = [
+        ("pipelines/c.yaml", UPPER),
+        ("pipelines/alone.yaml", BASE),
+        ("other/x.yaml", "extends: ../pipelines/c.yaml"),
+    ];
     let folder = base_and(&more);
     let home = |file: &str| {
         let pipeline = Pipeline::read(&folder.path().join(file)).unwrap();
-        pipeline.home().canonicalize().unwrap().strip_prefix(folder.path().canonicalize().unwrap()).unwrap().to_owned()
+        pipeline
+            .home()
+            .canonicalize()
+            .unwrap()
+            .strip_prefix(folder.path().canonicalize().unwrap())
+            .unwrap()
+            .to_owned()
     };
     for (file, expected) in [
         ("pipeline.yaml", ""),
@@ -185,8 +247,10 @@ fn the_store_lies_beside_the_pipeline() {
 /// The repository's pipelines.
 fn shipped() -> (Pipeline, Vec<String>) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../..");
-    let files = std::fs::read_dir(root.join("pipelines")).unwrap().map(|entry| entry.unwrap().path());
-    let mut names: Vec<String> = files.map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned()).collect();
+    let files =
+        std::fs::read_dir(root.join("pipelines")).unwrap().map(|entry| entry.unwrap().path());
+    let mut names: Vec<String> =
+        files.map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned()).collect();
     names.sort();
     (Pipeline::read(&root.join("pipeline.yaml")).unwrap(), names)
 }
@@ -201,7 +265,18 @@ fn holds_together(pipeline: &Pipeline) -> Result<(), crate::PipelineError> {
 fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
     let (pipeline, names) = shipped();
     assert_eq!(pipeline.stages.len(), 6);
-    assert_eq!(names, ["hr-finetune", "paper-refine", "reference-refine", "refined", "registered", "sisr-fuse", "video"]);
+    assert_eq!(
+        names,
+        [
+            "hr-finetune",
+            "paper-refine",
+            "reference-refine",
+            "refined",
+            "registered",
+            "sisr-fuse",
+            "video"
+        ]
+    );
     let (all, blocks) = targets::find(&pipeline, &names).unwrap();
     assert_eq!(blocks, names);
     holds_together(&all).unwrap();
@@ -209,7 +284,8 @@ fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
         let (of_file, _) = targets::find(&pipeline, std::slice::from_ref(name)).unwrap();
         assert_eq!(&of_file.default, std::slice::from_ref(name));
         holds_together(&of_file).unwrap();
-        // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say otherwise.
+        // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say
+        // otherwise.
         assert!(pipeline.stages.keys().all(|stage| pipeline.has_same(&of_file, stage)), "{name}");
     }
 }
@@ -232,18 +308,28 @@ fn old_names_are_told_the_new_ones() {
             let pipeline = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap();
             let error = holds_together(&pipeline).unwrap_err().to_string();
             assert!(error.starts_with(&format!("p.yaml:{line}: ")), "{error}");
-            assert!(error.contains(&format!("it is called {new} now")) || error.contains(&said), "{error}");
+            assert!(
+                error.contains(&format!("it is called {new} now")) || error.contains(&said),
+                "{error}"
+            );
         }
     }
-    let uses: BTreeSet<&str> = all.stages.values().flat_map(|block| block.inputs.values().map(String::as_str)).collect();
+    let uses: BTreeSet<&str> =
+        all.stages.values().flat_map(|block| block.inputs.values().map(String::as_str)).collect();
     for (program, old, new) in renames::SUBTREES {
-        assert!(uses.contains(format!("{program}/{new}").as_str()) && !uses.contains(format!("{program}/{old}").as_str()));
+        assert!(
+            uses.contains(format!("{program}/{new}").as_str())
+                && !uses.contains(format!("{program}/{old}").as_str())
+        );
         assert_eq!(renames::known_subtrees(program, old, [new]), format!("it is called {new} now"));
         assert_eq!(renames::known_subtrees("other", old, [new]), format!("known: {new}"));
     }
     for (old, new) in renames::WORDS {
         let text = format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    {old}: a\n");
         let error = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap_err().to_string();
-        assert_eq!(error, format!("p.yaml:5: stage b: `{old}` is called `{new}` now; write `{new}:`"));
+        assert_eq!(
+            error,
+            format!("p.yaml:5: stage b: `{old}` is called `{new}` now; write `{new}:`")
+        );
     }
 }

@@ -14,17 +14,19 @@ use crate::renames;
 
 /// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.
 ///
-/// A file that extends others has their blocks, too. For a block that both have, the file may give a part alone:
-/// an input or a parameter takes the place of the one of that name, `run` or `extends` the place of either.
-/// Paths are relative to the file in which they stand.
+/// A file that extends others has their blocks, too. For a block that both have, the file may give
+/// a part alone: an input or a parameter takes the place of the one of that name, `run` or
+/// `extends` the place of either. Paths are relative to the file in which they stand.
 #[derive(Clone, Debug, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct PipelineFile {
-    /// Another pipeline file, or several, whose blocks this one has, too. Several may share blocks, but not change them.
+    /// Another pipeline file, or several, whose blocks this one has, too. Several may share blocks,
+    /// but not change them.
     #[serde(deserialize_with = "one_or_more")]
     #[schemars(with = "OneOrMore")]
     pub extends: Vec<String>,
-    /// What `nerf-sr run` makes when no target is named. Left out, it is that of the first extended file.
+    /// What `nerf-sr run` makes when no target is named. Left out, it is that of the first extended
+    /// file.
     pub default: Vec<String>,
     /// The stages by name.
     pub stages: BTreeMap<String, StageBlock>,
@@ -58,15 +60,17 @@ fn one_or_more<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<String>
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct StageBlock {
-    /// What to run: a path from the file's folder, or the name of a binary beside `nerf-sr`; without it: the block's name.
+    /// What to run: a path from the file's folder, or the name of a binary beside `nerf-sr`;
+    /// without it: the block's name.
     pub run: Option<String>,
-    /// Another block: this one runs the same program, with the parameters that the file and the command line give the
-    /// other one, except those given here.
+    /// Another block: this one runs the same program, with the parameters that the file and the
+    /// command line give the other one, except those given here.
     pub extends: Option<String>,
-    /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that begins with `.` or `/`.
+    /// Inputs: another stage (`prep`), a folder of its artifact (`prep/train`), or a path that
+    /// begins with `.` or `/`.
     pub inputs: BTreeMap<String, String>,
-    /// Parameters that differ from the stage's defaults. One that selects a variant may hold that variant's own: `field: {grid: {n_levels: 4}}` is
-    /// `field: grid` and `n_levels: 4`.
+    /// Parameters that differ from the stage's defaults. One that selects a variant may hold that
+    /// variant's own: `field: {grid: {n_levels: 4}}` is `field: grid` and `n_levels: 4`.
     pub parameters: Map<String, Value>,
     /// What it needs of a machine, where a cluster runs it.
     #[serde(skip_serializing_if = "Resources::is_empty")]
@@ -116,19 +120,27 @@ pub struct File {
 }
 
 impl File {
-    /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their line.
+    /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their
+    /// line.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let fail = |line: Option<usize>, problem: String| PipelineError { place: place(path, line), problem };
+        let fail = |line: Option<usize>, problem: String| PipelineError {
+            place: place(path, line),
+            problem,
+        };
         let text = yaml_lines::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
-        let located = |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
+        let located =
+            |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
         // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.
-        let mapping: serde_yaml::Mapping = serde_yaml::from_str(text).map_err(|e| match yaml_lines::line_of_duplicate(text) {
-            Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
-            None => located(e),
-        })?;
+        let mapping: serde_yaml::Mapping =
+            serde_yaml::from_str(text).map_err(|e| match yaml_lines::line_of_duplicate(text) {
+                Some(line) => fail(Some(line), format!("{}; leave one of them", without_line(&e))),
+                None => located(e),
+            })?;
         let mut document = serde_yaml::Value::Mapping(mapping);
         let merged = yaml_lines::merge(&mut document).map_err(located)?;
-        let line_of = |keys: &[String]| yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>());
+        let line_of = |keys: &[String]| {
+            yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>())
+        };
         if let Some((keys, problem)) = problem_of(&document) {
             return Err(fail(line_of(&keys), problem));
         }
@@ -142,8 +154,11 @@ impl File {
         };
         let id = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
         let file = Self { path: path.to_path_buf(), id, written, text: text.to_owned() };
-        let named = file.written.stages.keys().find_map(|name| Some((name, problem_of_name(name)?)));
-        named.map_or(Ok(()), |(name, problem)| Err(file.error(&["stages", name], format!("stage {name:?}: {problem}"))))?;
+        let named =
+            file.written.stages.keys().find_map(|name| Some((name, problem_of_name(name)?)));
+        named.map_or(Ok(()), |(name, problem)| {
+            Err(file.error(&["stages", name], format!("stage {name:?}: {problem}")))
+        })?;
         Ok(file)
     }
 

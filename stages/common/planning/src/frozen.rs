@@ -1,4 +1,5 @@
-//! A plan as a file: what is queued stays what was submitted, whatever becomes of pipeline.yaml meanwhile.
+//! A plan as a file: what is queued stays what was submitted, whatever becomes of pipeline.yaml
+//! meanwhile.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -73,7 +74,11 @@ pub enum FrozenError {
 impl Frozen {
     /// The plan as it is written; pages go to a folder.
     pub fn new(plan: &Plan, out: &Path) -> Self {
-        let programs = plan.nodes.iter().map(|node| &node.program).chain(plan.sinks.iter().map(|sink| &sink.program));
+        let programs = plan
+            .nodes
+            .iter()
+            .map(|node| &node.program)
+            .chain(plan.sinks.iter().map(|sink| &sink.program));
         let nodes = plan.nodes.iter().map(|node| FrozenNode {
             stage: node.stage.clone(),
             point: node.point.clone(),
@@ -93,7 +98,9 @@ impl Frozen {
             out: out.to_path_buf(),
             devices: plan.devices.clone(),
             resources: plan.resources.clone(),
-            programs: programs.map(|program| (program.path.clone(), program.description.clone())).collect(),
+            programs: programs
+                .map(|program| (program.path.clone(), program.description.clone()))
+                .collect(),
             nodes: nodes.collect(),
             sinks: sinks.collect(),
         }
@@ -101,36 +108,65 @@ impl Frozen {
 
     /// Reads a file that a submission wrote.
     pub fn read(path: &Path) -> Result<Self, FrozenError> {
-        let bytes = std::fs::read(path).map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
-        serde_json::from_slice(&bytes).map_err(|source| FrozenError::Form { path: path.to_path_buf(), source })
+        let bytes = std::fs::read(path)
+            .map_err(|source| FrozenError::Read { path: path.to_path_buf(), source })?;
+        serde_json::from_slice(&bytes)
+            .map_err(|source| FrozenError::Form { path: path.to_path_buf(), source })
     }
 
-    /// The plan of one task: the nodes that it needs, and itself at the end. Sinks are counted after the nodes.
+    /// The plan of one task: the nodes that it needs, and itself at the end. Sinks are counted
+    /// after the nodes.
     pub fn part(&self, number: usize) -> Result<Plan, FrozenError> {
         let absent = || FrozenError::Task(number);
-        let sink = number.checked_sub(self.nodes.len()).map(|index| self.sinks.get(index).ok_or_else(absent)).transpose()?;
-        let mut wanted: BTreeSet<usize> = sink.map_or_else(|| [number].into(), |sink| sink.shows.iter().copied().collect());
+        let sink = number
+            .checked_sub(self.nodes.len())
+            .map(|index| self.sinks.get(index).ok_or_else(absent))
+            .transpose()?;
+        let mut wanted: BTreeSet<usize> =
+            sink.map_or_else(|| [number].into(), |sink| sink.shows.iter().copied().collect());
         for index in (0..self.nodes.len()).rev() {
             if wanted.contains(&index) {
                 wanted.extend(self.nodes[index].inputs.iter().filter_map(NodeInput::node));
             }
         }
-        let position: BTreeMap<usize, usize> = wanted.iter().enumerate().map(|(at, &index)| (index, at)).collect();
+        let position: BTreeMap<usize, usize> =
+            wanted.iter().enumerate().map(|(at, &index)| (index, at)).collect();
         let mut programs = BTreeMap::new();
         let mut nodes = Vec::with_capacity(wanted.len());
         for node in wanted.iter().map(|&index| &self.nodes[index]) {
             let FrozenNode { stage, point, values, parameters, inputs, program } = node;
-            let (stage, point, values, parameters) = (stage.clone(), point.clone(), values.clone(), parameters.clone());
+            let (stage, point, values, parameters) =
+                (stage.clone(), point.clone(), values.clone(), parameters.clone());
             let inputs = inputs.iter().map(|input| input.moved(&position)).collect();
-            nodes.push(Node { stage, point, values, parameters, inputs, program: self.program(program, &mut programs)? });
+            nodes.push(Node {
+                stage,
+                point,
+                values,
+                parameters,
+                inputs,
+                program: self.program(program, &mut programs)?,
+            });
         }
         let mut sinks = Vec::new();
         if let Some(FrozenSink { stage, parameters, shows, left_out, program }) = sink {
-            let (stage, parameters, left_out) = (stage.clone(), parameters.clone(), left_out.clone());
+            let (stage, parameters, left_out) =
+                (stage.clone(), parameters.clone(), left_out.clone());
             let shows = shows.iter().map(|index| position[index]).collect();
-            sinks.push(Sink { stage, parameters, shows, left_out, program: self.program(program, &mut programs)? });
+            sinks.push(Sink {
+                stage,
+                parameters,
+                shows,
+                left_out,
+                program: self.program(program, &mut programs)?,
+            });
         }
-        Ok(Plan { nodes, sinks, notes: Vec::new(), devices: self.devices.clone(), resources: self.resources.clone() })
+        Ok(Plan {
+            nodes,
+            sinks,
+            notes: Vec::new(),
+            devices: self.devices.clone(),
+            resources: self.resources.clone(),
+        })
     }
 
     fn program<'a>(
@@ -143,7 +179,8 @@ impl Frozen {
         }
         let absent = || FrozenError::Program(format!("nothing describes {}", path.display()));
         let description = self.programs.get(path).ok_or_else(absent)?;
-        let program = Arc::new(StageProgram::new(path, description.clone()).map_err(FrozenError::Program)?);
+        let program =
+            Arc::new(StageProgram::new(path, description.clone()).map_err(FrozenError::Program)?);
         known.insert(path, Arc::clone(&program));
         Ok(program)
     }
@@ -153,7 +190,9 @@ impl NodeInput {
     /// The same input where nodes have other places.
     fn moved(&self, position: &BTreeMap<usize, usize>) -> Self {
         let from = match &self.from {
-            Origin::Node { index, subtree } => Origin::Node { index: position[index], subtree: subtree.clone() },
+            Origin::Node { index, subtree } => {
+                Origin::Node { index: position[index], subtree: subtree.clone() }
+            }
             Origin::Folder(folder) => Origin::Folder(folder.clone()),
         };
         Self { name: self.name.clone(), from }

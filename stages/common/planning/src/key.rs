@@ -1,5 +1,5 @@
-//! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are what `why` says. So an
-//! explanation can't drift from the key.
+//! The key of an action. [`parts`] makes one flat list; its hash is the key, its differences are
+//! what `why` says. So an explanation can't drift from the key.
 
 use std::cmp::Reverse;
 
@@ -9,7 +9,8 @@ use serde_json::{Map, Value, json};
 use crate::changes::{Change, changes};
 use crate::plan::Node;
 
-/// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host, the block's name.
+/// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host,
+/// the block's name.
 pub fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<String, Value> {
     let description = &node.program.description;
     let mut parts = Map::new();
@@ -30,20 +31,30 @@ pub fn parts(node: &Node, inputs: &[(String, String)], device: &str) -> Map<Stri
     parts
 }
 
-/// What differs between a key and the nearest earlier one of the same block, in words; `None` when there is no earlier one.
+/// What differs between a key and the nearest earlier one of the same block, in words; `None` when
+/// there is no earlier one.
 pub fn explain(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<String>> {
     Some(nearest_changes(parts, stage, records)?.iter().map(ToString::to_string).collect())
 }
 
 /// The same, for programs.
-pub fn nearest_changes(parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Option<Vec<Change>> {
+pub fn nearest_changes(
+    parts: &Map<String, Value>,
+    stage: &str,
+    records: &[Record],
+) -> Option<Vec<Change>> {
     let record = nearest(parts, records.iter().filter(|record| record.stage == stage))?;
     Some(changes(&record.key_parts, parts))
 }
 
 /// The record whose key differs in the fewest parts; of several the newest.
-pub fn nearest<'a>(parts: &Map<String, Value>, records: impl Iterator<Item = &'a Record>) -> Option<&'a Record> {
-    records.min_by_key(|record| (changes(&record.key_parts, parts).len(), Reverse(record.started_unix)))
+pub fn nearest<'a>(
+    parts: &Map<String, Value>,
+    records: impl Iterator<Item = &'a Record>,
+) -> Option<&'a Record> {
+    records.min_by_key(|record| {
+        (changes(&record.key_parts, parts).len(), Reverse(record.started_unix))
+    })
 }
 
 #[cfg(test)]
@@ -51,7 +62,12 @@ mod tests {
     use super::*;
 
     fn record(stage: &str, started_unix: u64, parts: &Value) -> Record {
-        Record { stage: stage.to_owned(), key_parts: parts.as_object().unwrap().clone(), started_unix, ..Record::default() }
+        Record {
+            stage: stage.to_owned(),
+            key_parts: parts.as_object().unwrap().clone(),
+            started_unix,
+            ..Record::default()
+        }
     }
 
     #[test]

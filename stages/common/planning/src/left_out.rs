@@ -14,9 +14,14 @@ use crate::renames::known_blocks;
 
 /// The stages that a sink shows, of those that its block names.
 pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) -> Vec<&'a str> {
-    let inputs = pipeline.stages[sink].inputs.iter().filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
+    let inputs = pipeline.stages[sink]
+        .inputs
+        .iter()
+        .filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
     let wanted = if choice.show.is_empty() { &pipeline.experiment.show } else { &choice.show };
-    let is_wanted = |(name, stage): &(&String, &str)| wanted.iter().any(|wanted| wanted == *name || wanted == stage);
+    let is_wanted = |(name, stage): &(&String, &str)| {
+        wanted.iter().any(|wanted| wanted == *name || wanted == stage)
+    };
     let chosen: Vec<&str> = inputs.clone().filter(is_wanted).map(|(_, stage)| stage).collect();
     // A file's own choice needn't be meant for this sink.
     let shows_all = choice.show.is_empty() && chosen.is_empty();
@@ -24,23 +29,36 @@ pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) 
 }
 
 /// Checks that sinks have the inputs that are wanted of them.
-pub(crate) fn check_shown(pipeline: &Pipeline, sinks: &[&str], choice: &Selection) -> Result<(), PlanError> {
+pub(crate) fn check_shown(
+    pipeline: &Pipeline,
+    sinks: &[&str],
+    choice: &Selection,
+) -> Result<(), PlanError> {
     if choice.show.is_empty() {
         return Ok(());
     }
     if sinks.is_empty() {
-        let problem = "--show chooses what a sink shows, and no target is one; name one as target, such as report";
+        let problem = "--show chooses what a sink shows, and no target is one; name one as \
+            target, such as report";
         return Err(PlanError::Usage(problem.to_owned()));
     }
-    let names =
-        sinks.iter().flat_map(|sink| pipeline.stages[*sink].inputs.keys().map(String::as_str).chain(needs(pipeline, sink)));
+    let names = sinks.iter().flat_map(|sink| {
+        pipeline.stages[*sink].inputs.keys().map(String::as_str).chain(needs(pipeline, sink))
+    });
     let known: BTreeSet<&str> = names.collect();
     if let Some(name) = choice.show.iter().find(|name| !known.contains(name.as_str())) {
-        let problem = format!("--show {name}: {} has no such input; {}", sinks.join(", "), known_names(name, known));
+        let problem = format!(
+            "--show {name}: {} has no such input; {}",
+            sinks.join(", "),
+            known_names(name, known)
+        );
         return Err(PlanError::Usage(problem));
     }
     match sinks.iter().find(|sink| shown(pipeline, sink, choice).is_empty()) {
-        Some(sink) => Err(PlanError::Usage(format!("--show {}: {sink} has none of these; leave it out", choice.show.join(",")))),
+        Some(sink) => Err(PlanError::Usage(format!(
+            "--show {}: {sink} has none of these; leave it out",
+            choice.show.join(",")
+        ))),
         None => Ok(()),
     }
 }
@@ -58,7 +76,9 @@ impl Files {
         let of = pipeline.experiment.needs.clone();
         if let Some(name) = of.keys().find(|name| !pipeline.stages.contains_key(*name)) {
             let known = known_blocks(name, pipeline.stages.keys().map(String::as_str));
-            return Err(PlanError::Usage(format!("experiment: needs {name}: no such stage; {known}")));
+            return Err(PlanError::Usage(format!(
+                "experiment: needs {name}: no such stage; {known}"
+            )));
         }
         Ok(Self { data: pipeline.experiment.data(choice), of })
     }

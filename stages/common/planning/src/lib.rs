@@ -1,11 +1,12 @@
 //! From pipeline files, command lines and what stages say of themselves to a plan; nothing is run.
 //!
-//! * [`PipelineFile`]: a file as written. [`Pipeline`]: its blocks with those of the files that it extends. [`find`] looks for targets in
-//!   `pipelines/` and `experiments/`, too.
+//! * [`PipelineFile`]: a file as written. [`Pipeline`]: its blocks with those of the files that it
+//!   extends. [`find`] looks for targets in `pipelines/` and `experiments/`, too.
 //! * [`Experiment`]: scenes, protocols and variants of a file, each of which sets several things.
 //! * [`Programs`]: what each stage says of itself; those that aren't known are asked.
-//! * [`Plan`]: stages × swept values as nodes in an order that works, and what of them is cached, will run, or waits. `check` looks at the
-//!   whole file, `arguments` and `axes` at the command line, `expand` makes the nodes.
+//! * [`Plan`]: stages × swept values as nodes in an order that works, and what of them is cached,
+//!   will run, or waits. `check` looks at the whole file, `arguments` and `axes` at the command
+//!   line, `expand` makes the nodes.
 //! * [`parts`]: the parts of an action's key; one list feeds both the hash and `why` ([`changes`]).
 //!
 //! ```no_run
@@ -41,7 +42,10 @@ pub use file::{PipelineFile, StageBlock};
 pub use frozen::{Frozen, FrozenError};
 pub use key::{explain, nearest, nearest_changes, parts};
 pub use pipeline::{Part, Pipeline, PipelineError};
-pub use plan::{Devices, Node, NodeInput, Origin, Plan, PlanError, Request, Sink, State, input_hashes, source_hash};
+pub use plan::{
+    Devices, Node, NodeInput, Origin, Plan, PlanError, Request, Sink, State, input_hashes,
+    source_hash,
+};
 pub use renames::known_blocks;
 pub use stages::{Asking, Programs, StageProgram, executable};
 pub use targets::find;

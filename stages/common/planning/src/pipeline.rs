@@ -76,7 +76,8 @@ pub struct PipelineError {
 }
 
 impl Pipeline {
-    /// The blocks that a stage's parameters come from, the weightiest last: the one it extends, then its own.
+    /// The blocks that a stage's parameters come from, the weightiest last: the one it extends,
+    /// then its own.
     pub fn layers<'a>(&'a self, stage: &'a str) -> impl Iterator<Item = &'a str> {
         self.stages[stage].extends.as_deref().into_iter().chain([stage])
     }
@@ -87,8 +88,8 @@ impl Pipeline {
         said.fold(Resources::default(), |all, more| all.changed(more))
     }
 
-    /// The project's folder, where the store, pages and `pipelines/` are: the file's own. A file of `pipelines/` shares
-    /// those of the folder above.
+    /// The project's folder, where the store, pages and `pipelines/` are: the file's own. A file of
+    /// `pipelines/` shares those of the folder above.
     pub fn home(&self) -> PathBuf {
         let folder = self.files[0].folder();
         let ends = |folder: &Path| SHELVES.iter().any(|shelf| folder.ends_with(shelf));
@@ -114,7 +115,8 @@ impl Pipeline {
     fn roots(&self, stage: &str) -> Vec<Option<&Path>> {
         let block = &self.stages[stage];
         let run = block.run.iter().filter(|run| run.contains('/')).map(|_| Part::Field("run"));
-        let folders = block.inputs.iter().filter(|(_, source)| Source::of(source).stage().is_none());
+        let folders =
+            block.inputs.iter().filter(|(_, source)| Source::of(source).stage().is_none());
         let parts = run.chain(folders.map(|(name, _)| Part::Input(name)));
         parts.map(|part| self.file_of(stage, part).id.parent()).collect()
     }
@@ -144,13 +146,21 @@ impl Pipeline {
 
     /// An error about something that an experiment names, with the file that names it.
     pub(crate) fn error_in_experiment(&self, name: &str, problem: &str) -> PipelineError {
-        let file = self.files.iter().find(|file| file.written.experiment.names(name)).unwrap_or(&self.files[0]);
+        let file = self
+            .files
+            .iter()
+            .find(|file| file.written.experiment.names(name))
+            .unwrap_or(&self.files[0]);
         file.error(&["experiment"], format!("experiment: {problem}"))
     }
 
     /// An error about what stands before the stages.
     pub fn error_in_default(&self, problem: String) -> PipelineError {
-        let file = self.files.iter().find(|file| !file.written.default.is_empty()).unwrap_or(&self.files[0]);
+        let file = self
+            .files
+            .iter()
+            .find(|file| !file.written.default.is_empty())
+            .unwrap_or(&self.files[0]);
         file.error(&["default"], problem)
     }
 }

@@ -22,7 +22,8 @@ use crate::stages::{Asking, Programs, StageProgram};
 pub struct Plan {
     /// The nodes.
     pub nodes: Vec<Node>,
-    /// Sinks that are wanted: name, program, parameters, and the nodes they show (with what those are made of).
+    /// Sinks that are wanted: name, program, parameters, and the nodes they show (with what those
+    /// are made of).
     pub sinks: Vec<Sink>,
     /// What to tell of the command line: what is overridden there, and what is given twice.
     pub notes: Vec<String>,
@@ -163,7 +164,8 @@ impl Node {
         }
     }
 
-    /// The parameters that the scene decides, with the values that a finished artifact records; null before that.
+    /// The parameters that the scene decides, with the values that a finished artifact records;
+    /// null before that.
     pub fn by_scene(&self, artifact: &Path) -> Map<String, Value> {
         let output = &self.program.description.output;
         if output.resolved.is_none() {
@@ -171,7 +173,10 @@ impl Node {
         }
         let mut recorded = output.resolved(artifact);
         let names = self.program.schema.by_scene(&self.parameters);
-        names.into_iter().map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default())).collect()
+        names
+            .into_iter()
+            .map(|name| (name.to_owned(), recorded.remove(name).unwrap_or_default()))
+            .collect()
     }
 
     /// The nodes it needs.
@@ -182,10 +187,17 @@ impl Node {
 
 impl Node {
     /// Its inputs as a record names them; `number` gives another node's place in the record.
-    pub fn run_inputs(&self, number: impl Fn(usize) -> Option<usize>) -> BTreeMap<String, RunInput> {
+    pub fn run_inputs(
+        &self,
+        number: impl Fn(usize) -> Option<usize>,
+    ) -> BTreeMap<String, RunInput> {
         let source = |from: &Origin| match from {
-            Origin::Node { index, subtree } => RunInput { node: number(*index), subtree: subtree.clone(), folder: None },
-            Origin::Folder(folder) => RunInput { folder: Some(folder.clone()), ..RunInput::default() },
+            Origin::Node { index, subtree } => {
+                RunInput { node: number(*index), subtree: subtree.clone(), folder: None }
+            }
+            Origin::Folder(folder) => {
+                RunInput { folder: Some(folder.clone()), ..RunInput::default() }
+            }
         };
         self.inputs.iter().map(|input| (input.name.clone(), source(&input.from))).collect()
     }
@@ -231,14 +243,19 @@ impl State {
 
 impl Plan {
     /// Checks the whole file, then expands what is asked for.
-    pub fn new(pipeline: &Pipeline, store: &Store, request: &Request, asking: Asking) -> Result<Self, PlanError> {
+    pub fn new(
+        pipeline: &Pipeline,
+        store: &Store,
+        request: &Request,
+        asking: Asking,
+    ) -> Result<Self, PlanError> {
         let goal = Goal::new(pipeline, request)?;
         let programs = Programs::ask(pipeline, store, &goal.needed, asking)?;
         goal.plan(pipeline, &programs, request)
     }
 
-    /// The plan where programs would describe themselves so: by the name of their file, or the path that `run` gives. Nothing is started and no
-    /// file is read.
+    /// The plan where programs would describe themselves so: by the name of their file, or the path
+    /// that `run` gives. Nothing is started and no file is read.
     pub fn from_descriptions(
         pipeline: &Pipeline,
         descriptions: &BTreeMap<String, Description>,
@@ -257,7 +274,8 @@ impl Plan {
     pub fn states(&self, store: &Store) -> Result<Vec<State>, PlanError> {
         let mut states: Vec<State> = Vec::with_capacity(self.nodes.len());
         for node in &self.nodes {
-            let on: BTreeSet<usize> = node.parents().filter(|&p| !matches!(states[p], State::Cached(_))).collect();
+            let on: BTreeSet<usize> =
+                node.parents().filter(|&p| !matches!(states[p], State::Cached(_))).collect();
             if !on.is_empty() {
                 states.push(State::Waits { on: on.into_iter().collect() });
                 continue;
@@ -296,23 +314,38 @@ impl<'a> Goal<'a> {
         Ok(Self { targets, needed })
     }
 
-    fn plan(&self, pipeline: &Pipeline, programs: &Programs, request: &Request) -> Result<Plan, PlanError> {
+    fn plan(
+        &self,
+        pipeline: &Pipeline,
+        programs: &Programs,
+        request: &Request,
+    ) -> Result<Plan, PlanError> {
         check::blocks(pipeline, programs)?;
         let order = check::order(pipeline)?;
         let (axes, mut notes) = Scope { pipeline, programs, needed: &self.needed }.axes(request)?;
-        let plan = Expansion::new(pipeline, programs, &axes, &request.choice)?.expand(&order, self.targets)?;
+        let plan = Expansion::new(pipeline, programs, &axes, &request.choice)?
+            .expand(&order, self.targets)?;
         notes.extend(plan.notes);
         let resources = self.needed.iter().map(|stage| (stage.clone(), pipeline.resources(stage)));
-        Ok(Plan { notes, resources: resources.filter(|(_, needs)| !needs.is_empty()).collect(), ..plan })
+        Ok(Plan {
+            notes,
+            resources: resources.filter(|(_, needs)| !needs.is_empty()).collect(),
+            ..plan
+        })
     }
 }
 
 /// Content hashes of a node's inputs, given its parents' outputs.
-pub fn input_hashes(node: &Node, store: &Store, output_of: impl Fn(usize) -> String) -> Result<Vec<(String, String)>, PlanError> {
+pub fn input_hashes(
+    node: &Node,
+    store: &Store,
+    output_of: impl Fn(usize) -> String,
+) -> Result<Vec<(String, String)>, PlanError> {
     let hash = |input: &NodeInput| match &input.from {
         Origin::Node { index, subtree: None } => Ok(output_of(*index)),
         Origin::Node { index, subtree: Some(folder) } => {
-            let manifest = store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
+            let manifest =
+                store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
             Ok(manifest.subtree(folder).identity())
         }
         Origin::Folder(folder) => source_hash(store, node, &input.name, folder),
@@ -321,7 +354,12 @@ pub fn input_hashes(node: &Node, store: &Store, output_of: impl Fn(usize) -> Str
 }
 
 /// Content hash of a folder outside the store, an input of a node.
-pub fn source_hash(store: &Store, node: &Node, input: &str, folder: &Path) -> Result<String, PlanError> {
+pub fn source_hash(
+    store: &Store,
+    node: &Node,
+    input: &str,
+    folder: &Path,
+) -> Result<String, PlanError> {
     let problem = |e| PlanError::Source(format!("stage {}: input {input}: {e}", node.stage));
     crate::sources::hash_source(store, folder).map_err(problem)
 }

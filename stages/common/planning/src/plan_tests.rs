@@ -31,7 +31,8 @@ fn descriptions() -> BTreeMap<String, Description> {
     let seed = json!({"type": "integer", "format": "uint64", "default": 0});
     let described = json!([
         {"name": "make", "output": {"kind": "data"}, "parameters": {"properties": {
-            "size": {"type": "integer", "format": "uint32", "minimum": 1, "default": 4}, "seed": seed}}},
+            "size": {"type": "integer", "format": "uint32", "minimum": 1, "default": 4},
+            "seed": seed}}},
         {"name": "prep", "output": {"kind": "scene", "subtrees": {"train": "scene/train"}},
          "inputs": {"data": {"kinds": ["data"], "summary": "images"}},
          "parameters": {"properties": {
@@ -39,20 +40,28 @@ fn descriptions() -> BTreeMap<String, Description> {
             "kernel": {"anyOf": [{"enum": ["box", "average"]}, {"type": "null"}], "default": null},
             "background": {"enum": ["white", "alpha"], "default": "white"},
             "place": {"type": "array", "items": {"type": "number"}, "default": []}}},
-         "rules": [{"when": {"kernel": {"const": "average"}}, "must": {"scale": {"multipleOf": 1}}, "message": "average needs a whole scale"}]},
+         "rules": [{"when": {"kernel": {"const": "average"}}, "must": {"scale": {"multipleOf": 1}},
+         "message": "average needs a whole scale"}]},
         {"name": "train", "output": {"kind": "field"},
          "inputs": {"scene": {"kinds": ["scene/train"], "summary": "scene"},
-                    "weights": {"kinds": ["weights", "field"], "optional": true, "summary": "weights"}},
+                    "weights": {"kinds": ["weights", "field"], "optional": true,
+                    "summary": "weights"}},
          "parameters": {"properties": {
-            "rays": {"type": ["integer", "null"], "format": "uint64", "minimum": 1, "default": null},
+            "rays": {"type": ["integer", "null"], "format": "uint64", "minimum": 1,
+            "default": null},
             "supersample": {"type": "number", "minimum": 1, "default": 2.0},
-            "method": {"enum": ["plain", "net"], "default": "plain"}, "open": {"type": "boolean", "default": false}, "seed": seed}},
+            "method": {"enum": ["plain", "net"], "default": "plain"},
+            "open": {"type": "boolean", "default": false}, "seed": seed}},
          "rules": [
-            {"when": {"method": {"const": "net"}}, "needs": ["weights"], "message": "input weights is missing: method net needs it"},
-            {"when": {"scene.background": {"const": "alpha"}}, "must": {"open": {"const": true}}, "message": "alpha needs open"}]},
+            {"when": {"method": {"const": "net"}}, "needs": ["weights"], "message": "input \
+                weights is missing: method net needs it"},
+            {"when": {"scene.background": {"const": "alpha"}}, "must": {"open": {"const": true}},
+                "message": "alpha needs open"}]},
         {"name": "score", "output": {"kind": "metrics"},
-         "inputs": {"field": {"kinds": ["field"], "summary": "field"}, "truth": {"kinds": ["scene"], "summary": "truth"}}},
-        {"name": "report", "output": {"kind": "page"}, "sink": true, "inputs": {"run": {"kinds": ["run"], "summary": "a run"}},
+         "inputs": {"field": {"kinds": ["field"], "summary": "field"},
+         "truth": {"kinds": ["scene"], "summary": "truth"}}},
+        {"name": "report", "output": {"kind": "page"}, "sink": true,
+            "inputs": {"run": {"kinds": ["run"], "summary": "a run"}},
          "parameters": {"properties": {"views": {"type": "integer", "default": 4}}}}
     ]);
     let whole = |mut one: Value| -> (String, Description) {
@@ -80,7 +89,11 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
             _ => request.targets.push(word),
         }
     }
-    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+    Plan::from_descriptions(
+        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
+        &descriptions(),
+        &request,
+    )
 }
 
 #[track_caller]
@@ -93,7 +106,10 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
     for (arguments, expected) in [
         (&[][..], &["make", "prep", "train", "score"][..]),
         (&["make"], &["make"]),
-        (&["again", "-p", "supersample=1,2"], &["make", "prep", "again [supersample=1]", "again [supersample=2]"]),
+        (
+            &["again", "-p", "supersample=1,2"],
+            &["make", "prep", "again [supersample=1]", "again [supersample=2]"],
+        ),
         (
             &["train", "-p", "prep.scale=2,3", "-p", "rays=5,6"],
             &[
@@ -107,13 +123,20 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
             ],
         ),
         // A folder in an input's place needs nothing; two are a sweep.
-        (&["train", "-i", "data=one,two"], &["prep [data=one]", "prep [data=two]", "train [data=one]", "train [data=two]"]),
+        (
+            &["train", "-i", "data=one,two"],
+            &["prep [data=one]", "prep [data=two]", "train [data=one]", "train [data=two]"],
+        ),
         (&["train", "-i", "train.scene=one"], &["train"]),
         // Which seed is meant follows from the target.
         (&["make", "-p", "seed=3"], &["make"]),
     ] {
         let plan = plan_of(PIPELINE, arguments).unwrap();
-        assert_eq!(plan.nodes.iter().map(Node::label).collect::<Vec<_>>(), expected, "{arguments:?}");
+        assert_eq!(
+            plan.nodes.iter().map(Node::label).collect::<Vec<_>>(),
+            expected,
+            "{arguments:?}"
+        );
     }
     let plan = plan_of(PIPELINE, &["-p", "supersample=1,2", "-p", "views=2"]).unwrap();
     assert_eq!((plan.sinks[0].stage.as_str(), &plan.sinks[0].shows[..]), ("report", &[4, 5][..]));
@@ -122,13 +145,15 @@ fn every_combination_that_reaches_a_stage_is_a_node() {
 
 #[test]
 fn a_block_follows_the_one_it_extends_save_in_what_it_says() {
-    let plan = plan_of(PIPELINE, &["again", "train", "-p", "train.rays=9", "-p", "supersample=3"]).unwrap();
+    let plan = plan_of(PIPELINE, &["again", "train", "-p", "train.rays=9", "-p", "supersample=3"])
+        .unwrap();
     let of = |stage: &str| &plan.nodes.iter().find(|n| n.stage == stage).unwrap().parameters;
     assert_eq!((&of("train")["rays"], &of("train")["supersample"]), (&json!(9), &json!(3.0)));
     assert_eq!((&of("again")["rays"], &of("again")["supersample"]), (&json!(7), &json!(3.0)));
 }
 
-/// What is equal is one key, however it is written and wherever it is said; a default is the same said and unsaid.
+/// What is equal is one key, however it is written and wherever it is said; a default is the same
+/// said and unsaid.
 #[test]
 fn equal_values_are_one_key() {
     let keys = |text: &str, arguments: &[&str]| -> Vec<String> {
@@ -193,14 +218,20 @@ fn the_last_one_wins() {
             "kernel",
             json!("box"),
         ),
-        (&["-i", "data=.,./,two"], &["-i data=.,./,two: ./ is . again; it is made once"], "kernel", json!(null)),
+        (
+            &["-i", "data=.,./,two"],
+            &["-i data=.,./,two: ./ is . again; it is made once"],
+            "kernel",
+            json!(null),
+        ),
     ] {
         let plan = plan_of(PIPELINE, &[&["prep"], arguments].concat()).unwrap();
         assert_eq!(plan.notes, notes);
         assert_eq!(plan.nodes.last().unwrap().parameters[name], value, "{arguments:?}");
     }
     let plan = plan_of(PIPELINE, &["prep", "-i", "data=one", "-i", "data=two"]).unwrap();
-    assert!(matches!(&plan.nodes[0].inputs[0].from, Origin::Folder(folder) if folder == Path::new("two")));
+    assert!(matches!(&plan.nodes[0].inputs[0].from,
+            Origin::Folder(folder) if folder == Path::new("two")));
 }
 
 #[test]
@@ -208,20 +239,31 @@ fn command_lines_that_cannot_be_meant() {
     for (arguments, words) in [
         (&["evla"][..], "no stage \"evla\"; known: again, make, prep, report, score, train"),
         (&["socre"], "no stage \"socre\"; did you mean score? known:"),
-        (&["-p", "kernal=box"], "-p kernal: no stage has such a parameter; did you mean kernel? see"),
+        (
+            &["-p", "kernal=box"],
+            "-p kernal: no stage has such a parameter; did you mean kernel? see",
+        ),
         (&["-i", "date=x"], "-i date: no stage has such an input; did you mean data?"),
         (&["-p", "kernel"], "-p kernel: expected NAME=VALUE"),
         (&["-p", "perp.kernel=box"], "-p perp.kernel: no stage \"perp\"; did you mean prep?"),
         (
             &["-p", "prep.kernle=box"],
-            "-p prep.kernle: prep has no such parameter; did you mean kernel? known: background, kernel, place, scale",
+            "-p prep.kernle: prep has no such parameter; did you mean kernel? known: background, \
+            kernel, place, scale",
         ),
         (
             &["-p", "kernel=bxo"],
-            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you mean \"box\"?",
+            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you \
+            mean \"box\"?",
         ),
-        (&["-p", "seed=1"], "-p seed: more than one stage has it; say which: make.seed, train.seed"),
-        (&["-p", "rays=1,,2"], "-p rays=1,,2: a value between commas is empty; leave the comma out, or write null"),
+        (
+            &["-p", "seed=1"],
+            "-p seed: more than one stage has it; say which: make.seed, train.seed",
+        ),
+        (
+            &["-p", "rays=1,,2"],
+            "-p rays=1,,2: a value between commas is empty; leave the comma out, or write null",
+        ),
         (&["-p", "rays=,"], "between commas is empty"),
         (&["-i", "data="], "-i data=: no folder is named"),
         (&["-i", "data=a,"], "-i data=a,: a folder's name between commas is empty"),
@@ -235,7 +277,10 @@ fn command_lines_that_cannot_be_meant() {
         (&["-p", "supersample="], "parameter supersample: null is not of type"),
         (&["-p", "views=1,2"], "report is a sink and shows all points of a sweep at once"),
         (&["-i", "report.run=x"], "report is a sink, which shows what the run made"),
-        (&["-p", "kernel=average", "-p", "prep.scale=2,2.7"], "stage prep [scale=2.7]: average needs a whole scale"),
+        (
+            &["-p", "kernel=average", "-p", "prep.scale=2,2.7"],
+            "stage prep [scale=2.7]: average needs a whole scale",
+        ),
         (&["-p", "method=net"], "stage train: input weights is missing: method net needs it"),
         (&["-p", "background=alpha"], "stage train: alpha needs open"),
         (&["-p", "method=plain,net"], "stage train [method=net]: input weights is missing"),
@@ -269,14 +314,34 @@ fn files_that_cannot_be_used() {
             3,
             "stage reprot: named in `default`, but there is no such stage; did you mean report?",
         ),
-        ("{data: make}", "{data: maek}", 5, "no stage \"maek\"; a folder begins with ./ or /; did you mean make?"),
+        (
+            "{data: make}",
+            "{data: maek}",
+            5,
+            "no stage \"maek\"; a folder begins with ./ or /; did you mean make?",
+        ),
         ("{data: make}", "{date: make}", 5, "it has no input \"date\"; did you mean data?"),
-        ("extends: train", "extends: trian", 11, "extends: there is no stage \"trian\"; did you mean train?"),
+        (
+            "extends: train",
+            "extends: trian",
+            11,
+            "extends: there is no stage \"trian\"; did you mean train?",
+        ),
         ("extends: train", "extends: train\n    run: x", 11, "give one of them"),
-        ("extends: train", "like: train", 11, "stage again: `like` is called `extends` now; write `extends:`"),
+        (
+            "extends: train",
+            "like: train",
+            11,
+            "stage again: `like` is called `extends` now; write `extends:`",
+        ),
         ("rays: 7", "rays: 0", 14, "parameter rays: 0 is less than the minimum"),
         ("rays: 7", "rayz: 7", 14, "parameter rayz: unknown; did you mean rays?"),
-        ("rays: 7", "rays: .nan", 14, "stages.again.parameters.rays: a number is neither NaN nor infinite"),
+        (
+            "rays: 7",
+            "rays: .nan",
+            14,
+            "stages.again.parameters.rays: a number is neither NaN nor infinite",
+        ),
         ("rays: 7", "rays: -.inf", 14, "neither NaN nor infinite"),
         ("rays: 7", "rays: 7\n    prameters: {}", 15, "unknown field `prameters`"),
         (
@@ -285,7 +350,12 @@ fn files_that_cannot_be_used() {
             15,
             "stages.again.parameters: duplicate entry with key \"rays\"; leave one of them",
         ),
-        ("      scene: prep/train", "      scene: prep/trian", 9, "prep has no folder \"trian\"; did you mean train?"),
+        (
+            "      scene: prep/train",
+            "      scene: prep/trian",
+            9,
+            "prep has no folder \"trian\"; did you mean train?",
+        ),
         ("truth: prep}", "truth: make}", 16, "input truth takes scene, but make is data"),
         (
             "{run: score}",
@@ -293,7 +363,12 @@ fn files_that_cannot_be_used() {
             19,
             "input run: report is a sink, which shows a run; nothing can be made of that",
         ),
-        ("{run: score}", "{run: score, more: ./x}", 18, "input more: a sink shows stages, and ./x is a folder"),
+        (
+            "{run: score}",
+            "{run: score, more: ./x}",
+            18,
+            "input more: a sink shows stages, and ./x is a folder",
+        ),
         ("{run: score}", "{}", 17, "input run is missing"),
         (
             "    inputs: {scene: prep/train}",
@@ -301,41 +376,68 @@ fn files_that_cannot_be_used() {
             10,
             "stage again: its inputs lead back to it",
         ),
-        ("  make: {}", "  ../make: {}", 3, "stage \"../make\": a stage's name begins with a letter"),
+        (
+            "  make: {}",
+            "  ../make: {}",
+            3,
+            "stage \"../make\": a stage's name begins with a letter",
+        ),
         ("  make: {}", "  a/b: {}", 3, "stage \"a/b\": a stage's name has no `/`"),
         ("  make: {}", "  a..b: {}", 3, "no `..`"),
         ("  make: {}", "  -x: {}", 3, "not with `.` or `-`"),
         ("  make: {}", "  '': {}", 3, "a stage's name is empty"),
-        ("  make: {}", "  \"a\\nb\": {}", 3, "stage \"a\\nb\": a stage's name has no white space and no control"),
+        (
+            "  make: {}",
+            "  \"a\\nb\": {}",
+            3,
+            "stage \"a\\nb\": a stage's name has no white space and no control",
+        ),
         ("  train:\n", "  train:\n    run: other\n", 8, "stage train: nothing describes other"),
     ] {
         let text = PIPELINE.replace(from, to);
         let problem = refused(&text, &[]).to_string();
-        assert!(problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words), "{to}: {problem}");
+        assert!(
+            problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words),
+            "{to}: {problem}"
+        );
     }
     // What isn't needed needn't be known.
     let unneeded = plan_of(&format!("{PIPELINE}  other: {{}}\n"), &[]).unwrap();
     assert_eq!(unneeded.nodes.len(), 4);
     let problem = refused(&format!("{PIPELINE}  other: {{}}\n"), &["-p", "nothing=1"]).to_string();
-    assert!(problem.contains("such a parameter") && problem.contains("other couldn't be asked"), "{problem}");
+    assert!(
+        problem.contains("such a parameter") && problem.contains("other couldn't be asked"),
+        "{problem}"
+    );
 }
 
 #[test]
 fn files_as_editors_write_them() {
-    let expected = plan_of(PIPELINE, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>();
+    let expected =
+        plan_of(PIPELINE, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>();
     let windows = format!("\u{feff}{}", PIPELINE.replace('\n', "\r\n"));
-    let merged = PIPELINE.replace("{scale: 2}", "&prep {scale: 2}").replace("rays: 7", "<<: *prep\n      rays: 7");
+    let merged = PIPELINE
+        .replace("{scale: 2}", "&prep {scale: 2}")
+        .replace("rays: 7", "<<: *prep\n      rays: 7");
     for text in [windows.as_str(), PIPELINE] {
-        assert_eq!(plan_of(text, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>(), expected);
+        assert_eq!(
+            plan_of(text, &[]).unwrap().nodes.iter().map(Node::label).collect::<Vec<_>>(),
+            expected
+        );
     }
     // A merged key is a key like others, right or wrong.
     let problem = refused(&merged, &[]).to_string();
-    assert!(problem.starts_with("dir/pipeline.yaml:13: ") && problem.contains("parameter scale: unknown"), "{problem}");
+    assert!(
+        problem.starts_with("dir/pipeline.yaml:13: ")
+            && problem.contains("parameter scale: unknown"),
+        "{problem}"
+    );
     let merged = PIPELINE
         .replace("      scene: prep/train", "      <<: &scene {scene: prep/train}")
         .replace("{scene: prep/train}\n    p", "*scene\n    p");
     assert_eq!(plan_of(&merged, &["again"]).unwrap().nodes.len(), 3);
-    let merged = merged.replace("rays: 7", "rays: {x: 7}").replace("extends: train", "extends: [train]");
+    let merged =
+        merged.replace("rays: 7", "rays: {x: 7}").replace("extends: train", "extends: [train]");
     let problem = refused(&merged, &["again"]).to_string();
     assert!(problem.starts_with("dir/pipeline.yaml:11: stages.again.extends"), "{problem}");
 }
@@ -349,7 +451,10 @@ fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
     let plan = plan_of(&text, &["again", "report"]).unwrap();
     let of = |stage: &str| serde_json::to_value(plan.resources.get(stage)).unwrap();
     assert_eq!([of("make"), of("prep")], [json!({"cpus": 2}), json!(null)]);
-    assert_eq!([of("train"), of("again")], [json!({"gpus": 1, "mem": "8G"}), json!({"gpus": 1, "mem": "4G"})]);
+    assert_eq!(
+        [of("train"), of("again")],
+        [json!({"gpus": 1, "mem": "8G"}), json!({"gpus": 1, "mem": "4G"})]
+    );
     for (by_resources, device) in [(false, "cpu"), (true, "cuda:0")] {
         let devices = Devices { given: "cpu".to_owned(), by_resources };
         let plan = Plan { devices, resources: plan.resources.clone(), ..Plan::default() };
@@ -368,14 +473,24 @@ fn a_frozen_plan_has_all_that_a_task_needs() {
     let frozen = Frozen::read(&folder.path().join("plan.json")).unwrap();
     let ancestors = |plan: &Plan, of: usize| {
         let mut wanted = BTreeSet::from([of]);
-        (0..=of).rev().filter(|&i| wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some()).count()
+        (0..=of)
+            .rev()
+            .filter(|&i| {
+                wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some()
+            })
+            .count()
     };
     for (index, node) in plan.nodes.iter().enumerate() {
         let part = frozen.part(index).unwrap();
         let last = part.nodes.last().unwrap();
         assert_eq!((last.label(), &last.parameters), (node.label(), &node.parameters));
-        let labels = |plan: &Plan, node: &Node| node.parents().map(|p| plan.nodes[p].label()).collect::<Vec<_>>();
-        assert_eq!((labels(&part, last), part.nodes.len()), (labels(&plan, node), ancestors(&plan, index)));
+        let labels = |plan: &Plan, node: &Node| {
+            node.parents().map(|p| plan.nodes[p].label()).collect::<Vec<_>>()
+        };
+        assert_eq!(
+            (labels(&part, last), part.nodes.len()),
+            (labels(&plan, node), ancestors(&plan, index))
+        );
     }
     let page = frozen.part(plan.nodes.len()).unwrap();
     assert_eq!((page.nodes.len(), page.sinks[0].shows.len()), (plan.nodes.len(), 2));

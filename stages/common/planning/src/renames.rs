@@ -1,4 +1,5 @@
-//! Names in pipeline files as they were, and what they are called now: whoever writes an old one is told the new one.
+//! Names in pipeline files as they were, and what they are called now: whoever writes an old one is
+//! told the new one.
 
 use artifact::known_names;
 
@@ -39,7 +40,11 @@ pub fn known_blocks<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) ->
 }
 
 /// What to say after the name of a folder that an artifact doesn't have.
-pub(crate) fn known_subtrees<'a>(program: &str, name: &str, known: impl IntoIterator<Item = &'a str>) -> String {
+pub(crate) fn known_subtrees<'a>(
+    program: &str,
+    name: &str,
+    known: impl IntoIterator<Item = &'a str>,
+) -> String {
     match SUBTREES.iter().find(|(of, old, _)| (*of, *old) == (program, name)) {
         Some((_, _, new)) => format!("it is called {new} now"),
         None => known_names(name, known),

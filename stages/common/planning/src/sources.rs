@@ -7,7 +7,8 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use artifact::{Store, hash_files, hash_json, list_files, write_atomically};
 use serde::{Deserialize, Serialize};
 
-/// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times stay.
+/// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times
+/// stay.
 #[derive(Default, Serialize, Deserialize)]
 struct HashCache(BTreeMap<String, Entry>);
 
@@ -20,14 +21,18 @@ struct Entry {
 /// The content hash of a folder outside the store.
 pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String> {
     let fail = |e: std::io::Error| format!("{folder:?}: {e}");
-    let absolute = folder.canonicalize().map_err(|e| format!("{}; name a folder that is there", fail(e)))?;
+    let absolute =
+        folder.canonicalize().map_err(|e| format!("{}; name a folder that is there", fail(e)))?;
     if !absolute.is_dir() {
         return Err(format!("{folder:?}: not a folder"));
     }
     let files = list_files(&absolute).map_err(fail)?;
     let (listing, newest) = listing(&files).map_err(fail)?;
     let cache_file = store.root().join("cache/sources.json");
-    let mut cache: HashCache = std::fs::read(&cache_file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+    let mut cache: HashCache = std::fs::read(&cache_file)
+        .ok()
+        .and_then(|b| serde_json::from_slice(&b).ok())
+        .unwrap_or_default();
     let place = name_of(&absolute);
     if let Some(entry) = cache.0.get(&place).filter(|e| e.listing == listing) {
         return Ok(entry.content.clone());
@@ -35,8 +40,9 @@ pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String
     let named = files.into_iter().map(|(relative, file)| (name_of(&relative), file)).collect();
     let content = hash_json(&hash_files(named).map_err(fail)?);
     // A file changed within the clock's grain could change again unseen; such a listing isn't kept.
-    let settled =
-        SystemTime::now().duration_since(UNIX_EPOCH).is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
+    let settled = SystemTime::now()
+        .duration_since(UNIX_EPOCH)
+        .is_ok_and(|now| now.as_nanos().saturating_sub(newest) > 2_000_000_000);
     if settled {
         cache.0.insert(place, Entry { listing, content: content.clone() });
         if let Ok(bytes) = serde_json::to_vec(&cache) {
@@ -59,10 +65,16 @@ fn listing(files: &[(PathBuf, PathBuf)]) -> std::io::Result<(String, u128)> {
     Ok((hash_json(&entries), newest))
 }
 
-/// A path as text, another for each path: names that aren't UTF-8 are written in hexadecimal after a NUL, which no name has.
+/// A path as text, another for each path: names that aren't UTF-8 are written in hexadecimal after
+/// a NUL, which no name has.
 fn name_of(path: &Path) -> String {
     path.to_str().map_or_else(
-        || path.as_os_str().as_encoded_bytes().iter().fold("\0".to_owned(), |text, byte| text + &format!("{byte:02x}")),
+        || {
+            path.as_os_str()
+                .as_encoded_bytes()
+                .iter()
+                .fold("\0".to_owned(), |text, byte| text + &format!("{byte:02x}"))
+        },
         str::to_owned,
     )
 }
@@ -77,9 +89,18 @@ mod tests {
     #[test]
     fn any_name_has_a_hash() {
         let dir = tempfile::tempdir().unwrap();
-        let (store, data) = (Store::open(&dir.path().join("store")).unwrap(), dir.path().join("data"));
+        let (store, data) =
+            (Store::open(&dir.path().join("store")).unwrap(), dir.path().join("data"));
         let mut seen = std::collections::BTreeSet::new();
-        for name in [&b"plain"[..], b"\xff", b"\xfe", b"new\nline", b"\x1b]0;title\x07", "übung 🎈".as_bytes(), b"ff"] {
+        for name in [
+            &b"plain"[..],
+            b"\xff",
+            b"\xfe",
+            b"new\nline",
+            b"\x1b]0;title\x07",
+            "übung 🎈".as_bytes(),
+            b"ff",
+        ] {
             std::fs::create_dir_all(&data).unwrap();
             std::fs::write(data.join(OsStr::from_bytes(name)), "x").unwrap();
             assert!(seen.insert(hash_source(&store, &data).unwrap()), "{name:?}");

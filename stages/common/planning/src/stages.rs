@@ -1,7 +1,9 @@
-//! Which program each stage is, and what it says of itself: asked once for each build, and kept in the store.
+//! Which program each stage is, and what it says of itself: asked once for each build, and kept in
+//! the store.
 //!
-//! Programs beside the runner are its own. Any other one is somebody's file that a pipeline.yaml names: `run` alone starts it, and only where it
-//! is needed; the other verbs know it by what it answered then, while its bytes are the same.
+//! Programs beside the runner are its own. Any other one is somebody's file that a pipeline.yaml
+//! names: `run` alone starts it, and only where it is needed; the other verbs know it by what it
+//! answered then, while its bytes are the same.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::Metadata;
@@ -32,7 +34,9 @@ pub struct StageProgram {
 impl StageProgram {
     /// A program by what it says; fails where that can't be used.
     pub fn new(path: &Path, description: Description) -> Result<Self, String> {
-        description.check().map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
+        description
+            .check()
+            .map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
         let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
     }
@@ -80,28 +84,42 @@ impl Programs {
     pub fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
         Self::new(pipeline, |stage| {
             let name = program_name(pipeline, stage);
-            let description = descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
+            let description =
+                descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
             description.and_then(|description| StageProgram::new(Path::new(name), description))
         })
     }
 
-    /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the stages that the targets come to.
-    pub fn ask(pipeline: &Pipeline, store: &Store, needed: &BTreeSet<String>, asking: Asking) -> Result<Self, Interrupted> {
+    /// Finds the programs of all stages and asks those that aren't known yet; `needed` are the
+    /// stages that the targets come to.
+    pub fn ask(
+        pipeline: &Pipeline,
+        store: &Store,
+        needed: &BTreeSet<String>,
+        asking: Asking,
+    ) -> Result<Self, Interrupted> {
         let file = store.root().join("cache/describe.json");
         // A cache that can't be read is an empty one.
-        let mut cache: DescriptionCache =
-            std::fs::read(&file).ok().and_then(|b| serde_json::from_slice(&b).ok()).unwrap_or_default();
+        let mut cache: DescriptionCache = std::fs::read(&file)
+            .ok()
+            .and_then(|b| serde_json::from_slice(&b).ok())
+            .unwrap_or_default();
         let (mut answers, mut unasked) = (Answers::new(), BTreeMap::new());
-        let paths: BTreeMap<&str, PathBuf> = pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
+        let paths: BTreeMap<&str, PathBuf> =
+            pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
-            let is_needed = paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
+            let is_needed =
+                paths.iter().any(|(stage, other)| other == path && needed.contains(*stage));
             match identify(path, program_name(pipeline, stage)) {
                 Err(problem) => _ = answers.insert(path.clone(), Err(problem)),
                 Ok(identity) => match cache.answer(path, &identity) {
                     Some(description) => _ = answers.insert(path.clone(), Ok(description)),
-                    None if identity.may_be_asked(asking, is_needed) => _ = unasked.insert(path.clone(), identity),
+                    None if identity.may_be_asked(asking, is_needed) => {
+                        _ = unasked.insert(path.clone(), identity)
+                    }
                     None => {
-                        let problem = "is no part of nerf-sr: `nerf-sr run` starts it; read it first";
+                        let problem =
+                            "is no part of nerf-sr: `nerf-sr run` starts it; read it first";
                         answers.insert(path.clone(), Err(format!("{} {problem}", path.display())));
                     }
                 },
@@ -114,7 +132,10 @@ impl Programs {
         answers.extend(ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?);
         for (path, identity) in &unasked {
             if let Ok(description) = &answers[path] {
-                cache.0.insert(id(path), Answer { identity: identity.clone(), description: description.clone() });
+                cache.0.insert(
+                    id(path),
+                    Answer { identity: identity.clone(), description: description.clone() },
+                );
             }
         }
         if !unasked.is_empty()
@@ -123,13 +144,17 @@ impl Programs {
             // Only a cache: without it the next start is slower.
             write_atomically(&file, &bytes).ok();
         }
-        Ok(Self::new(pipeline, |stage| StageProgram::new(&paths[stage], answers[&paths[stage]].clone()?)))
+        Ok(Self::new(pipeline, |stage| {
+            StageProgram::new(&paths[stage], answers[&paths[stage]].clone()?)
+        }))
     }
 
     /// What each stage's program turns out to be; what is wrong with it, is wrong with the block.
     fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, String>) -> Self {
         let programs = pipeline.stages.keys().map(|stage| {
-            let program = find(stage).map(Arc::new).map_err(|problem| pipeline.error(stage, Part::Field("run"), problem));
+            let program = find(stage)
+                .map(Arc::new)
+                .map_err(|problem| pipeline.error(stage, Part::Field("run"), problem));
             (stage.clone(), program)
         });
         Self(programs.collect())
@@ -159,7 +184,10 @@ struct Identity {
 
 impl DescriptionCache {
     fn answer(&self, path: &Path, identity: &Identity) -> Option<Description> {
-        self.0.get(&id(path)).filter(|answer| answer.identity == *identity).map(|answer| answer.description.clone())
+        self.0
+            .get(&id(path))
+            .filter(|answer| answer.identity == *identity)
+            .map(|answer| answer.description.clone())
     }
 }
 
@@ -208,15 +236,23 @@ fn identify(path: &Path, name: &str) -> Result<Identity, String> {
     });
     let is_own = path.parent() == Some(&own_folder());
     match meta {
-        Ok(meta) if is_own => Ok(Identity { size: meta.len(), modified: modified(&meta), blake3: None }),
+        Ok(meta) if is_own => {
+            Ok(Identity { size: meta.len(), modified: modified(&meta), blake3: None })
+        }
         Ok(meta) => {
             let hash = hash_file(path).map_err(|e| format!("{}: {e}", path.display()))?;
             Ok(Identity { size: meta.len(), modified: 0, blake3: Some(hash) })
         }
-        Err(e) if name.contains('/') => Err(format!("{}: {e}; set `run:` to the stage's executable", path.display())),
+        Err(e) if name.contains('/') => {
+            Err(format!("{}: {e}; set `run:` to the stage's executable", path.display()))
+        }
         Err(e) => {
-            let meant = neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
-            let build = format!("build it with `cargo build --release -p {name}` (`make build` builds all), or set `run:` to it");
+            let meant =
+                neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
+            let build = format!(
+                "build it with `cargo build --release -p {name}` (`make build` builds all), or \
+                set `run:` to it"
+            );
             Err(format!("{}: {e}; {meant}{build}", path.display()))
         }
     }
@@ -224,7 +260,10 @@ fn identify(path: &Path, name: &str) -> Result<Identity, String> {
 
 /// The program beside the runner whose name is meant by another.
 fn neighbour(name: &str) -> Option<String> {
-    let files = std::fs::read_dir(own_folder()).ok()?.flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    let files = std::fs::read_dir(own_folder())
+        .ok()?
+        .flatten()
+        .filter_map(|entry| entry.file_name().into_string().ok());
     let mut programs: Vec<String> = files.filter(|file| !file.contains('.')).collect();
     programs.sort_unstable();
     nearest(name, programs.iter().map(String::as_str)).map(str::to_owned)

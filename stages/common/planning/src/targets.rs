@@ -7,8 +7,8 @@ use crate::pipeline::{Part, Pipeline, SHELVES};
 use crate::plan::PlanError;
 use crate::renames::known_blocks;
 
-/// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the target NAME: its block of
-/// that name, or its default. A block of such a file is a target, too.
+/// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the
+/// target NAME: its block of that name, or its default. A block of such a file is a target, too.
 pub fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<String>), PlanError> {
     let (mut all, mut blocks): (Option<Pipeline>, Vec<String>) = (None, Vec::new());
     for target in targets {
@@ -18,7 +18,10 @@ pub fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<St
             on_shelf(pipeline, target)?
         };
         let apart = |problem: String| {
-            PlanError::Usage(format!("{target} can't be made together with {}: {problem}; make it by itself", blocks.join(", ")))
+            PlanError::Usage(format!(
+                "{target} can't be made together with {}: {problem}; make it by itself",
+                blocks.join(", ")
+            ))
         };
         all = Some(match all {
             None => found,
@@ -34,11 +37,16 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
     let files = shelf(pipeline);
     if let Some(path) = files.get(target) {
         let found = Pipeline::read(path)?;
-        let blocks = if found.stages.contains_key(target) { vec![target.to_owned()] } else { found.default.clone() };
+        let blocks = if found.stages.contains_key(target) {
+            vec![target.to_owned()]
+        } else {
+            found.default.clone()
+        };
         return Ok((found, blocks));
     }
     // A file that can't be used is reported when it is asked for.
-    let others: Vec<Pipeline> = files.values().filter_map(|path| Pipeline::read(path).ok()).collect();
+    let others: Vec<Pipeline> =
+        files.values().filter_map(|path| Pipeline::read(path).ok()).collect();
     if let Some(found) = others.iter().find(|other| other.files[0].says(target, Part::Block)) {
         return Ok((found.clone(), vec![target.to_owned()]));
     }
@@ -50,7 +58,10 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
 /// The files of `pipelines/` and `experiments/`, by name; the former win.
 fn shelf(pipeline: &Pipeline) -> BTreeMap<String, PathBuf> {
     let folders = SHELVES.iter().rev().map(|shelf| pipeline.home().join(shelf));
-    let entries = folders.flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
-    let paths = entries.map(|entry| entry.path()).filter(|path| path.extension().is_some_and(|e| e == "yaml"));
+    let entries =
+        folders.flat_map(|folder| std::fs::read_dir(folder).into_iter().flatten().flatten());
+    let paths = entries
+        .map(|entry| entry.path())
+        .filter(|path| path.extension().is_some_and(|e| e == "yaml"));
     paths.filter_map(|path| Some((path.file_stem()?.to_str()?.to_owned(), path))).collect()
 }

@@ -1,4 +1,5 @@
-//! Parameters of a stage whose `field` selects a variant, in every form in which files and command lines give them: with train-ss's own.
+//! Parameters of a stage whose `field` selects a variant, in every form in which files and command
+//! lines give them: with train-ss's own.
 
 use std::path::Path;
 
@@ -22,35 +23,56 @@ stages:
 ";
 
 fn descriptions() -> BTreeMap<String, Description> {
-    let parameters: Value = serde_json::from_str(include_str!("../../../../schemas/parameters/train-ss.json")).unwrap();
+    let parameters: Value =
+        serde_json::from_str(include_str!("../../../../schemas/parameters/train-ss.json")).unwrap();
     let described = [
-        json!({"name": "scene", "version": "", "code": "", "summary": "", "parameters": {}, "inputs": {}, "output": {"kind": "scene"}}),
-        json!({"name": "train-ss", "version": "", "code": "", "summary": "", "parameters": parameters,
+        json!({"name": "scene", "version": "", "code": "", "summary": "", "parameters": {},
+            "inputs": {}, "output": {"kind": "scene"}}),
+        json!({"name": "train-ss", "version": "", "code": "", "summary": "",
+            "parameters": parameters,
                "inputs": {"scene": {"kinds": ["scene"], "summary": ""}},
                "output": {"kind": "field", "resolved": "training.json"}}),
     ];
-    let named = |one: Value| (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap());
+    let named = |one: Value| {
+        (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+    };
     described.into_iter().map(named).collect()
 }
 
 fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
-    let request = Request { parameters: arguments.iter().map(|word| (*word).to_owned()).collect(), ..Request::default() };
-    Plan::from_descriptions(&Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?, &descriptions(), &request)
+    let request = Request {
+        parameters: arguments.iter().map(|word| (*word).to_owned()).collect(),
+        ..Request::default()
+    };
+    Plan::from_descriptions(
+        &Pipeline::parse(text.as_bytes(), Path::new("dir/pipeline.yaml"))?,
+        &descriptions(),
+        &request,
+    )
 }
 
 /// The trainings of a plan: point and some parameters.
 fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec<Value>)> {
     let plan = plan_of(text, arguments).unwrap();
     let nodes = plan.nodes.iter().filter(|node| node.stage == "train-ss");
-    let values = |node: &Node| names.iter().map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent"))).collect();
+    let values = |node: &Node| {
+        names
+            .iter()
+            .map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent")))
+            .collect()
+    };
     nodes.map(|node| (node.point.clone(), values(node))).collect()
 }
 
 #[test]
 fn every_form_reaches_a_parameter_of_a_variant() {
     let names = ["field", "rays", "n_levels", "layers", "hidden_dim"];
-    let grid = |rays: u64, n_levels: u32| vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)];
-    let mlp = |rays: Value, layers: u32| vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)];
+    let grid = |rays: u64, n_levels: u32| {
+        vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)]
+    };
+    let mlp = |rays: Value, layers: u32| {
+        vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)]
+    };
     let one = |values: Vec<Value>| vec![(String::new(), values)];
     let pointed = |points: &[(&str, Vec<Value>)]| -> Vec<(String, Vec<Value>)> {
         points.iter().map(|(point, values)| ((*point).to_owned(), values.clone())).collect()
@@ -71,16 +93,32 @@ fn every_form_reaches_a_parameter_of_a_variant() {
         (PIPELINE, &["layers=4", "field=mlp"], one(mlp(json!(all), 4))),
         (PIPELINE, &["field=mlp", "rays="], one(mlp(json!(null), 8))),
         (PIPELINE, &["field={\"mlp\":{\"layers\":4}}"], one(mlp(json!(all), 4))),
-        (PIPELINE, &["n_levels=4,8"], pointed(&[("n_levels=4", grid(all, 4)), ("n_levels=8", grid(all, 8))])),
-        (PIPELINE, &["field=grid,mlp"], pointed(&[("field=grid", grid(all, 8)), ("field=mlp", mlp(json!(all), 8))])),
-        (PIPELINE, &["field=mlp", "layers=2,4"], pointed(&[("layers=2", mlp(json!(all), 2)), ("layers=4", mlp(json!(all), 4))])),
+        (
+            PIPELINE,
+            &["n_levels=4,8"],
+            pointed(&[("n_levels=4", grid(all, 4)), ("n_levels=8", grid(all, 8))]),
+        ),
+        (
+            PIPELINE,
+            &["field=grid,mlp"],
+            pointed(&[("field=grid", grid(all, 8)), ("field=mlp", mlp(json!(all), 8))]),
+        ),
+        (
+            PIPELINE,
+            &["field=mlp", "layers=2,4"],
+            pointed(&[("layers=2", mlp(json!(all), 2)), ("layers=4", mlp(json!(all), 4))]),
+        ),
         (nested, &[], one(grid(30_000_000, 4))),
         (nested, &["n_levels=6"], one(grid(30_000_000, 6))),
         (beside, &[], one(grid(all, 4))),
         // The variant comes with its own defaults: what the file says for another one isn't meant.
         (nested, &["field=mlp"], one(mlp(json!(null), 8))),
         (beside, &["field=mlp"], one(mlp(json!(all), 8))),
-        (beside, &["field=grid,mlp"], pointed(&[("field=grid", grid(all, 4)), ("field=mlp", mlp(json!(all), 8))])),
+        (
+            beside,
+            &["field=grid,mlp"],
+            pointed(&[("field=grid", grid(all, 4)), ("field=mlp", mlp(json!(all), 8))]),
+        ),
         (paper, &[], one(mlp(json!(null), 4))),
         (paper, &["layers=6"], one(mlp(json!(null), 6))),
         (paper, &["field=grid"], one(grid(30_000_000, 8))),
@@ -114,7 +152,11 @@ fn a_block_that_extends_follows_the_choice() {
 #[test]
 fn wrong_foreign_and_old_names_are_refused() {
     for (arguments, words) in [
-        (&["layers=4"][..], "stage train-ss: parameter layers: belongs to field: mlp; leave it out, or choose field: mlp"),
+        (
+            &["layers=4"][..],
+            "stage train-ss: parameter layers: belongs to field: mlp; leave it out, or choose \
+            field: mlp",
+        ),
         (&["train-ss.layers=4"], "parameter layers: belongs to field: mlp"),
         (&["field=mlp", "n_levels=4"], "parameter n_levels: belongs to field: grid"),
         (&["field=grid,mlp", "n_levels=4,8"], "parameter n_levels: belongs to field: grid"),
@@ -146,14 +188,30 @@ fn wrong_foreign_and_old_names_are_refused() {
 fn files_with_wrong_variants() {
     for (from, to, line, words) in [
         ("rays: 12000000", "layers: 4", 7, "parameter layers: belongs to field: mlp"),
-        ("rays: 12000000", "field: {grid: {layers: 4}}", 6, "parameter layers: belongs to field: mlp"),
+        (
+            "rays: 12000000",
+            "field: {grid: {layers: 4}}",
+            6,
+            "parameter layers: belongs to field: mlp",
+        ),
         ("rays: 12000000", "levels: 4", 7, "parameter levels: is called n_levels now"),
-        ("rays: 12000000", "field: {grid: {levels: 4}}", 6, "parameter levels: is called n_levels now"),
+        (
+            "rays: 12000000",
+            "field: {grid: {levels: 4}}",
+            6,
+            "parameter levels: is called n_levels now",
+        ),
         ("rays: 12000000", "field: {grid: 4}", 7, "parameter field: {\"grid\":4} is not one of"),
         ("ensemble: 2", "layers: 2", 12, "stage other: parameter layers: belongs to field: mlp"),
     ] {
-        let problem = plan_of(&PIPELINE.replace(from, to), &[]).map(|plan| plan.nodes.len()).unwrap_err().to_string();
-        assert!(problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words), "{to}: {problem}");
+        let problem = plan_of(&PIPELINE.replace(from, to), &[])
+            .map(|plan| plan.nodes.len())
+            .unwrap_err()
+            .to_string();
+        assert!(
+            problem.starts_with(&format!("dir/pipeline.yaml:{line}: ")) && problem.contains(words),
+            "{to}: {problem}"
+        );
     }
 }
 
@@ -170,5 +228,8 @@ fn one_choice_is_one_key() {
     assert_ne!(key(PIPELINE, &["field=mlp"]), key(PIPELINE, &[]));
     let plan = plan_of(PIPELINE, &[]).unwrap();
     let open: Vec<String> = plan.nodes[1].by_scene(Path::new("")).keys().cloned().collect();
-    assert!(["march_steps", "supervision"].iter().all(|name| open.contains(&(*name).to_owned())), "{open:?}");
+    assert!(
+        ["march_steps", "supervision"].iter().all(|name| open.contains(&(*name).to_owned())),
+        "{open:?}"
+    );
 }

@@ -1,16 +1,22 @@
 //! Pose refinement: moves cameras until what a field renders meets their photographs.
 //!
-//! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say where it was taken from.
-//! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's damping.
-//! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that was for the better.
-//! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that photographs could tell.
+//! * [`Pyramid`]: a photograph at its own and at smaller sizes, with the pixels of each that say
+//!   where it was taken from.
+//! * [`refine`]: one camera, at one size, by Gauss and Newton with Levenberg's and Marquardt's
+//!   damping.
+//! * [`Moved`]: how far cameras have gone, in words for a log; [`photometric_error`]: whether that
+//!   was for the better.
+//! * [`take_back_common_motion`]: what all cameras share is the scene's motion, and nothing that
+//!   photographs could tell.
 //!
-//! A photograph's own gradient says how each of its pixels would change if what it shows moved in the image, and the rendered
-//! depth how that moves with the camera (Lucas and Kanade 1981; the template's gradient, as in Baker and Matthews 2004). So a
-//! step takes one rendering of some thousand pixels, and any field will do that renders colour and depth: nothing is
-//! differentiated but photographs.
+//! A photograph's own gradient says how each of its pixels would change if what it shows moved in
+//! the image, and the rendered depth how that moves with the camera (Lucas and Kanade 1981; the
+//! template's gradient, as in Baker and Matthews 2004). So a step takes one rendering of some
+//! thousand pixels, and any field will do that renders colour and depth: nothing is differentiated
+//! but photographs.
 //!
-//! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up, looking along -z).
+//! Lengths are in scene units, angles in radians, camera axes as `scene` has them (x right, y up,
+//! looking along -z).
 //!
 //! ```
 //! use poses::{Pyramid, Refinement, refine};
@@ -74,18 +80,23 @@ const LEAST: usize = 24;
 const STEEP: f32 = 3.0 / 255.0;
 
 impl Pyramid {
-    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the width of the one before it;
-    /// there are at most `smaller` below the image itself.
+    /// Of an RGB image over its background; NaN where nothing is known. Each level has half the
+    /// width of the one before it; there are at most `smaller` below the image itself.
     ///
     /// # Panics
     /// When the image has other than three channels.
     pub fn new(photograph: &Image, smaller: u32) -> Self {
         assert_eq!(photograph.channels, 3, "a photograph over its background");
-        let size = |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
+        let size =
+            |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
         let is_large = |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= SMALLEST);
         let level = |level: u32| {
             let [width, height] = size(level);
-            let shrink = Resampling::new(Filter::Box, (photograph.width, photograph.height), (width, height));
+            let shrink = Resampling::new(
+                Filter::Box,
+                (photograph.width, photograph.height),
+                (width, height),
+            );
             PyramidLevel::new(&shrink.apply(photograph))
         };
         Self { levels: (0..=smaller).take_while(is_large).map(level).collect() }
@@ -103,14 +114,18 @@ impl PyramidLevel {
         let colour = |x: usize, y: usize| [0, 1, 2].map(|c| image.data[(y * width + x) * 3 + c]);
         let inner = |n: usize| 1..n.saturating_sub(1);
         let telling = |(x, y): (usize, usize)| {
-            let [left, right, up, down] = [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
+            let [left, right, up, down] =
+                [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
             let gradient = [0, 1, 2].map(|c| [0.5 * (right[c] - left[c]), 0.5 * (down[c] - up[c])]);
             let pixel = Telling { x, y, colour: colour(x, y), gradient };
             let numbers = gradient.as_flattened();
             let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
             (is_known && numbers.iter().any(|g| g.abs() > STEEP)).then_some(pixel)
         };
-        let all: Vec<Telling> = inner(height).flat_map(|y| inner(width).map(move |x| (x, y))).filter_map(telling).collect();
+        let all: Vec<Telling> = inner(height)
+            .flat_map(|y| inner(width).map(move |x| (x, y)))
+            .filter_map(telling)
+            .collect();
         let every = all.len().div_ceil(MOST).max(1);
         Self { width, height, telling: all.into_iter().step_by(every).collect() }
     }
@@ -146,8 +161,8 @@ pub struct Refinement {
     pub depth: Option<f64>,
 }
 
-/// Moves a camera, whose intrinsics have any size, to where a pyramid's level is met best. It stays where that says too little, and never ends
-/// where it is met worse.
+/// Moves a camera, whose intrinsics have any size, to where a pyramid's level is met best. It stays
+/// where that says too little, and never ends where it is met worse.
 pub fn refine(
     field: &dyn RayField,
     camera: &Camera,
@@ -176,8 +191,9 @@ pub fn refine(
 const DAMPING: f64 = 1e-3;
 /// Errors of colours beyond this are outliers: what moved, or was never learnt.
 const HUBER: f64 = 0.1;
-/// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to pull from both sides: their inner halves
-/// alone would make everything too large, and cameras back away.
+/// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to
+/// pull from both sides: their inner halves alone would make everything too large, and cameras back
+/// away.
 const THIN: f32 = 0.02;
 
 /// Least squares for a small motion of the camera, linear about where it is.
@@ -200,7 +216,9 @@ impl Equations {
         options: &Options,
     ) -> Result<Self, Box<dyn Error + Send + Sync>> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let cast = |pixel: &Telling| cast(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], options.background);
+        let cast = |pixel: &Telling| {
+            cast(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], options.background)
+        };
         let rays: Vec<Ray> = level.telling.iter().map(|pixel| cast(pixel).1).collect();
         let rendered = field.render(&rays)?;
         let depths: Vec<Option<f64>> = (level.telling.iter().zip(&rendered))
@@ -214,13 +232,22 @@ impl Equations {
         sorted.sort_unstable_by(f64::total_cmp);
         let depth = sorted.get(sorted.len() / 2).copied();
         let unit = depth.unwrap_or(1.0);
-        let mut sums = Self { matrix: Matrix6::zeros(), right: Vector6::zeros(), depth, unit, error: 0.0, pixels: 0 };
+        let mut sums = Self {
+            matrix: Matrix6::zeros(),
+            right: Vector6::zeros(),
+            depth,
+            unit,
+            error: 0.0,
+            pixels: 0,
+        };
         for ((pixel, seen), depth) in level.telling.iter().zip(&rendered).zip(&depths) {
-            let errors = [0, 1, 2].map(|c| f64::from(pixel.colour[c] * options.exposure[c] - seen.colour[c]));
+            let errors = [0, 1, 2]
+                .map(|c| f64::from(pixel.colour[c] * options.exposure[c] - seen.colour[c]));
             sums.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
             let Some(depth) = *depth else { continue };
             sums.pixels += 1;
-            let motion = image_motion(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], depth, unit);
+            let motion =
+                image_motion(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], depth, unit);
             for (c, error) in errors.into_iter().enumerate() {
                 let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
                 // What is seen would have to move by the opposite of the error over the gradient.
@@ -263,8 +290,8 @@ fn huber(error: f64) -> f64 {
     if size > HUBER { HUBER * (2.0 * size - HUBER) } else { size * size }
 }
 
-/// How far what is seen at an image position moves to the right and down when the camera turns about its axes and shifts along them, by a radian
-/// and by so many scene units.
+/// How far what is seen at an image position moves to the right and down when the camera turns
+/// about its axes and shifts along them, by a radian and by so many scene units.
 fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [Vector6<f64>; 2] {
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
@@ -347,10 +374,15 @@ impl Moved {
             sum.pixels += depth.map_or(0.0, |depth| from.intrinsics.fx * distance / depth);
         }
         let count = count.max(1.0);
-        Self { angle: sum.angle / count, distance: sum.distance / count, pixels: sum.pixels / count }
+        Self {
+            angle: sum.angle / count,
+            distance: sum.distance / count,
+            pixels: sum.pixels / count,
+        }
     }
 
-    /// Whether that is farther than given poses are commonly off: by more than 1°, or by more than 3 pixels of the photographs.
+    /// Whether that is farther than given poses are commonly off: by more than 1°, or by more than
+    /// 3 pixels of the photographs.
     pub fn is_far(&self) -> bool {
         self.angle.to_degrees() > FAR_TURN || self.pixels > FAR_PIXELS
     }
@@ -359,12 +391,17 @@ impl Moved {
 impl fmt::Display for Moved {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { angle, distance, pixels } = self;
-        write!(f, "turned by {:.3}° and moved by {distance:.4} ({pixels:.1} LR pixels) in the mean", angle.to_degrees())
+        write!(
+            f,
+            "turned by {:.3}° and moved by {distance:.4} ({pixels:.1} LR pixels) in the mean",
+            angle.to_degrees()
+        )
     }
 }
 
-/// Moves all cameras back together so that in the mean they have neither turned nor shifted nor spread from where they were: a motion that all
-/// share could as well be the scene's, which would leave its bounds, and test views would miss it.
+/// Moves all cameras back together so that in the mean they have neither turned nor shifted nor
+/// spread from where they were: a motion that all share could as well be the scene's, which would
+/// leave its bounds, and test views would miss it.
 pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
     let share = 1.0 / cameras.len().max(1) as f64;
     let turns = cameras.iter().zip(were).map(|(camera, was)| {
@@ -374,12 +411,18 @@ pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
     });
     let back = DQuat::from_scaled_axis(-share * turns.sum::<DVec3>());
     let middle = |cameras: &[Camera]| share * cameras.iter().map(Camera::centre).sum::<DVec3>();
-    let spread = |cameras: &[Camera], middle: DVec3| cameras.iter().map(|c| c.centre().distance_squared(middle)).sum::<f64>();
+    let spread = |cameras: &[Camera], middle: DVec3| {
+        cameras.iter().map(|c| c.centre().distance_squared(middle)).sum::<f64>()
+    };
     let (now, before) = (middle(cameras), middle(were));
     let (wide, was_wide) = (spread(cameras, now), spread(were, before));
     let narrower = if wide > 0.0 && was_wide > 0.0 { (was_wide / wide).sqrt() } else { 1.0 };
     for camera in cameras {
-        *camera = placed(camera, back * rotation(camera), before + narrower * (back * (camera.centre() - now)));
+        *camera = placed(
+            camera,
+            back * rotation(camera),
+            before + narrower * (back * (camera.centre() - now)),
+        );
     }
 }
 

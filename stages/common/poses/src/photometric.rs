@@ -29,11 +29,13 @@ const SURFACE: f32 = 0.5;
 /// Two distances of one surface differ by at most this share of them.
 const SAME: f64 = 0.02;
 
-/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of colours) between what one shows
-/// and what its neighbours show there, where the field says that they see it, too. None where it says so nowhere.
+/// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of
+/// colours) between what one shows and what its neighbours show there, where the field says that
+/// they see it, too. None where it says so nowhere.
 ///
-/// The field only says where surfaces are. So this tells good poses from bad ones even by fields that learnt both photograph by photograph:
-/// such a field renders every photograph well, but its surfaces lie where no two of them see the same.
+/// The field only says where surfaces are. So this tells good poses from bad ones even by fields
+/// that learnt both photograph by photograph: such a field renders every photograph well, but its
+/// surfaces lie where no two of them see the same.
 pub fn photometric_error(
     field: &dyn RayField,
     shots: &[Shot<'_>],
@@ -58,12 +60,17 @@ struct Place {
 }
 
 /// Where a photograph's telling pixels show surfaces.
-fn surfaces(field: &dyn RayField, shot: &Shot<'_>, background: f32) -> Result<Vec<Place>, Box<dyn Error + Send + Sync>> {
+fn surfaces(
+    field: &dyn RayField,
+    shot: &Shot<'_>,
+    background: f32,
+) -> Result<Vec<Place>, Box<dyn Error + Send + Sync>> {
     let telling = PyramidLevel::new(shot.photograph).telling;
     let every = telling.len().div_ceil(PIXELS).max(1);
     let pixels: Vec<_> = telling.into_iter().step_by(every).collect();
     let places = pixels.iter().map(|pixel| [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5]);
-    let (lines, rays): (Vec<_>, Vec<_>) = places.map(|place| cast(shot.camera, place, background)).unzip();
+    let (lines, rays): (Vec<_>, Vec<_>) =
+        places.map(|place| cast(shot.camera, place, background)).unzip();
     let seen = pixels.iter().zip(lines).zip(field.render(&rays)?);
     Ok(seen
         .filter(|(_, seen)| seen.opacity > SURFACE && seen.median_depth.is_finite())
@@ -90,9 +97,14 @@ fn errors(
     background: f32,
 ) -> Result<Vec<f64>, Box<dyn Error + Send + Sync>> {
     let (camera, k) = (shot.camera, &shot.camera.intrinsics);
-    let is_inside = |x: f64, y: f64| (0.0..f64::from(k.width)).contains(&x) && (0.0..f64::from(k.height)).contains(&y);
-    let looked_at = |place: &Place| camera.project(place.at).map(|(x, y, _)| [x, y]).filter(|[x, y]| is_inside(*x, *y));
-    let (inside, at): (Vec<&Place>, Vec<[f64; 2]>) = places.iter().filter_map(|place| Some((place, looked_at(place)?))).unzip();
+    let is_inside = |x: f64, y: f64| {
+        (0.0..f64::from(k.width)).contains(&x) && (0.0..f64::from(k.height)).contains(&y)
+    };
+    let looked_at = |place: &Place| {
+        camera.project(place.at).map(|(x, y, _)| [x, y]).filter(|[x, y]| is_inside(*x, *y))
+    };
+    let (inside, at): (Vec<&Place>, Vec<[f64; 2]>) =
+        places.iter().filter_map(|place| Some((place, looked_at(place)?))).unzip();
     let rays: Vec<_> = at.iter().map(|&at| cast(camera, at, background).1).collect();
     let mut found = Vec::with_capacity(3 * rays.len());
     for ((place, [x, y]), seen) in inside.into_iter().zip(at).zip(field.render(&rays)?) {

@@ -16,7 +16,8 @@ impl BallAndWall {
     fn paint(at: DVec3) -> [f32; 3] {
         [0, 1, 2].map(|c| {
             let (f, c) = (2.0 + f64::from(c), f64::from(c));
-            (0.5 + 0.2 * (f * at.x + c).sin() + 0.2 * (f * at.y - 0.5 * c + 1.3 * at.z).cos()) as f32
+            (0.5 + 0.2 * (f * at.x + c).sin() + 0.2 * (f * at.y - 0.5 * c + 1.3 * at.z).cos())
+                as f32
         })
     }
 }
@@ -24,8 +25,10 @@ impl BallAndWall {
 impl RayField for BallAndWall {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
         let pixel = |ray: &Ray| {
-            let (origin, direction) =
-                (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)).normalize());
+            let (origin, direction) = (
+                DVec3::from(ray.origin.map(f64::from)),
+                DVec3::from(ray.direction.map(f64::from)).normalize(),
+            );
             let distance = Self::hit(origin, direction);
             let colour = Self::paint(origin + distance * direction);
             let depth = distance as f32;
@@ -37,11 +40,24 @@ impl RayField for BallAndWall {
 
 fn camera(i: usize) -> Camera {
     let angle = 0.5 * i as f64;
-    let rotation = DQuat::from_euler(glam::EulerRot::YXZ, 0.12 * angle.sin(), 0.1 * angle.cos(), 0.05 * i as f64);
+    let rotation = DQuat::from_euler(
+        glam::EulerRot::YXZ,
+        0.12 * angle.sin(),
+        0.1 * angle.cos(),
+        0.05 * i as f64,
+    );
     let distortion = Distortion { radial: [-0.1, 0.03, 0.0], tangential: [0.002, -0.004] };
     let bare = Camera {
         name: format!("r_{i}"),
-        intrinsics: Intrinsics { width: 64, height: 48, fx: 70.0, fy: 72.0, cx: 31.0, cy: 25.0, distortion },
+        intrinsics: Intrinsics {
+            width: 64,
+            height: 48,
+            fx: 70.0,
+            fy: 72.0,
+            cx: 31.0,
+            cy: 25.0,
+            distortion,
+        },
         camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]],
     };
     placed(&bare, rotation, DVec3::new(0.5 * angle.sin(), 0.4 * angle.cos(), 4.0))
@@ -55,7 +71,11 @@ fn photograph(camera: &Camera) -> Image {
             let (pixel, sub) = (i / 9, i % 9);
             let at = |whole: usize, part: usize| whole as f64 + (part as f64 + 0.5) / 3.0;
             let ray = camera.ray(at(pixel % width, sub % 3), at(pixel / width, sub / 3));
-            Ray { origin: ray.origin.as_vec3().to_array(), direction: ray.direction.as_vec3().to_array(), background: [1.0; 3] }
+            Ray {
+                origin: ray.origin.as_vec3().to_array(),
+                direction: ray.direction.as_vec3().to_array(),
+                background: [1.0; 3],
+            }
         })
         .collect();
     let subs = BallAndWall.render(&rays).unwrap();
@@ -65,8 +85,9 @@ fn photograph(camera: &Camera) -> Image {
 
 /// Mean distance in pixels at which two cameras see the same places.
 fn pixels_apart(a: &Camera, b: &Camera) -> f64 {
-    let places: Vec<(f64, f64)> =
-        (0..6).flat_map(|x| (0..5).map(move |y| (4.0 + 11.0 * f64::from(x), 4.0 + 10.0 * f64::from(y)))).collect();
+    let places: Vec<(f64, f64)> = (0..6)
+        .flat_map(|x| (0..5).map(move |y| (4.0 + 11.0 * f64::from(x), 4.0 + 10.0 * f64::from(y))))
+        .collect();
     let distance = |&(x, y): &(f64, f64)| {
         let ray = a.ray(x, y);
         let (u, v, _) = b.project(ray.at(BallAndWall::hit(ray.origin, ray.direction))).unwrap();
@@ -92,12 +113,17 @@ fn image_motion_is_that_of_a_moved_camera() {
         let moved = motion(one(0, step), one(3, unit * step)).applied_to(&camera);
         let (u, v, _) = moved.project(ray.at(distance)).unwrap();
         for (predicted, seen) in [(predicted[0][i], u - at[0]), (predicted[1][i], v - at[1])] {
-            assert!((predicted - seen / step).abs() < 1e-3 * predicted.abs().max(1.0), "{i}: {predicted} {}", seen / step);
+            assert!(
+                (predicted - seen / step).abs() < 1e-3 * predicted.abs().max(1.0),
+                "{i}: {predicted} {}",
+                seen / step
+            );
         }
     }
 }
 
-/// From some pixels off, coarse to fine, to a tenth of a pixel (silhouettes are what keeps them from more: one ray shows no mean there); with another exposure, too, where that is known.
+/// From some pixels off, coarse to fine, to a tenth of a pixel (silhouettes are what keeps them
+/// from more: one ray shows no mean there); with another exposure, too, where that is known.
 #[test]
 fn moved_cameras_come_back() {
     for (i, (turn, shift)) in [
@@ -114,16 +140,23 @@ fn moved_cameras_come_back() {
         let mut taken = photograph(&truth);
         taken.data.chunks_exact_mut(3).for_each(|p| (0..3).for_each(|c| p[c] /= exposure[c]));
         // What isn't known says nothing: a person in the corner.
-        (0..20 * 64).filter(|i| i % 64 < 15).for_each(|i| taken.data[3 * i..3 * i + 3].fill(f32::NAN));
+        (0..20 * 64)
+            .filter(|i| i % 64 < 15)
+            .for_each(|i| taken.data[3 * i..3 * i + 3].fill(f32::NAN));
         let pyramid = Pyramid::new(&taken, 5);
         assert_eq!(pyramid.smaller(), 2);
         let mut found = motion(turn, shift).applied_to(&truth);
         let was = pixels_apart(&truth, &found);
         assert!(was > 1.5, "{i}: {was} pixels");
         for level in (0..3).rev() {
-            let refined =
-                refine(&BallAndWall, &found, &pyramid, level, &Options { renderings: 6, exposure, ..Options::default() })
-                    .unwrap();
+            let refined = refine(
+                &BallAndWall,
+                &found,
+                &pyramid,
+                level,
+                &Options { renderings: 6, exposure, ..Options::default() },
+            )
+            .unwrap();
             assert!(refined.after <= refined.before);
             found = refined.camera;
         }
@@ -133,7 +166,8 @@ fn moved_cameras_come_back() {
     }
 }
 
-/// What says nothing moves nothing: grey walls, unknown pixels, a semi-transparent field, numbers that aren't.
+/// What says nothing moves nothing: grey walls, unknown pixels, a semi-transparent field, numbers
+/// that aren't.
 #[test]
 fn what_says_nothing_moves_nothing() {
     struct Everywhere(Pixel);
@@ -148,14 +182,21 @@ fn what_says_nothing_moves_nothing() {
     let unknown = Image { data: vec![f32::NAN; whole.data.len()], ..whole.clone() };
     let one_row = Image::new(64, 1, 3, vec![0.3; 192]);
     let nothing = Pixel { median_depth: f32::INFINITY, ..Pixel::default() };
-    let wrong = Pixel { colour: [f32::NAN; 3], opacity: 1.0, median_depth: 3.0, ..Pixel::default() };
+    let wrong =
+        Pixel { colour: [f32::NAN; 3], opacity: 1.0, median_depth: 3.0, ..Pixel::default() };
     for image in [&grey, &unknown, &one_row, &whole] {
         let pyramid = Pyramid::new(image, 2);
         for field in [&Everywhere(nothing) as &dyn RayField, &Everywhere(wrong)] {
-            assert_eq!(refine(field, &camera, &pyramid, 1, &Options::default()).unwrap().camera, camera);
+            assert_eq!(
+                refine(field, &camera, &pyramid, 1, &Options::default()).unwrap().camera,
+                camera
+            );
         }
         if !std::ptr::eq(image, &raw const whole) {
-            assert_eq!(refine(&BallAndWall, &camera, &pyramid, 7, &Options::default()).unwrap().camera, camera);
+            assert_eq!(
+                refine(&BallAndWall, &camera, &pyramid, 7, &Options::default()).unwrap().camera,
+                camera
+            );
         }
     }
 }
@@ -169,9 +210,16 @@ fn motions_are_told() {
     assert!((told.angle - 0.005).abs() < 1e-6 && (told.distance - 0.25).abs() < 1e-9, "{told:?}");
     // Half of a focal length of 70 pixels times 0.5 / 4.
     assert!((told.pixels - 4.375).abs() < 1e-9, "{told:?}");
-    assert_eq!(told.to_string(), "turned by 0.286° and moved by 0.2500 (4.4 LR pixels) in the mean");
+    assert_eq!(
+        told.to_string(),
+        "turned by 0.286° and moved by 0.2500 (4.4 LR pixels) in the mean"
+    );
     for (angle, pixels, is_far) in [(0.9f64, 2.9, false), (1.1, 0.0, true), (0.0, 3.1, true)] {
-        assert_eq!(Moved { angle: angle.to_radians(), pixels, distance: 0.0 }.is_far(), is_far, "{angle}° {pixels}");
+        assert_eq!(
+            Moved { angle: angle.to_radians(), pixels, distance: 0.0 }.is_far(),
+            is_far,
+            "{angle}° {pixels}"
+        );
     }
     assert_eq!(Moved::between(std::iter::empty()).distance, 0.0);
 }
@@ -179,9 +227,12 @@ fn motions_are_told() {
 #[test]
 fn common_motion_is_taken_back() {
     let were: Vec<Camera> = (0..7).map(camera).collect();
-    let (turn, shift) = (DQuat::from_scaled_axis(DVec3::new(0.1, -0.05, 0.07)), DVec3::new(0.3, -0.2, 0.1));
-    let mut cameras: Vec<Camera> =
-        were.iter().map(|c| placed(c, turn * rotation(c), 1.1 * (turn * c.centre()) + shift)).collect();
+    let (turn, shift) =
+        (DQuat::from_scaled_axis(DVec3::new(0.1, -0.05, 0.07)), DVec3::new(0.3, -0.2, 0.1));
+    let mut cameras: Vec<Camera> = were
+        .iter()
+        .map(|c| placed(c, turn * rotation(c), 1.1 * (turn * c.centre()) + shift))
+        .collect();
     take_back_common_motion(&mut cameras, &were);
     for (camera, was) in cameras.iter().zip(&were) {
         assert!(pixels_apart(camera, was) < 1e-9, "{}", pixels_apart(camera, was));
@@ -199,8 +250,8 @@ fn common_motion_is_taken_back() {
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
 }
 
-/// By the true surfaces the photometric error is small from where photographs were taken, and not from beside; exposures that
-/// are known are no difference.
+/// By the true surfaces the photometric error is small from where photographs were taken, and not
+/// from beside; exposures that are known are no difference.
 #[test]
 fn photometric_error_is_least_from_where_photographs_were_taken() {
     let cameras: Vec<Camera> = (0..6).map(camera).collect();
@@ -210,14 +261,18 @@ fn photometric_error_is_least_from_where_photographs_were_taken() {
     let exposure = |i: usize| if i == 2 { [2.0; 3] } else { [1.0; 3] };
     let judged = |cameras: &[Camera], exposure: &dyn Fn(usize) -> [f32; 3]| {
         let shots = cameras.iter().zip(&photographs).enumerate();
-        let shots: Vec<Shot> =
-            shots.map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) }).collect();
+        let shots: Vec<Shot> = shots
+            .map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) })
+            .collect();
         photometric_error(&BallAndWall, &shots, 1.0).unwrap()
     };
     let right = judged(&cameras, &exposure).unwrap();
     assert!(right < 3e-4, "{right}");
     let off: Vec<Camera> = (0..6)
-        .map(|i| motion([0.01 * (i as f64).sin(), 0.01 * (i as f64).cos(), 0.0], [0.0; 3]).applied_to(&cameras[i]))
+        .map(|i| {
+            motion([0.01 * (i as f64).sin(), 0.01 * (i as f64).cos(), 0.0], [0.0; 3])
+                .applied_to(&cameras[i])
+        })
         .collect();
     let wrong = judged(&off, &exposure).unwrap();
     assert!(wrong > 5.0 * right, "{wrong} {right}");

@@ -13,25 +13,36 @@ pub(crate) struct AdamStep {
 }
 
 impl AdamStep {
-    /// Adam (Kingma and Ba 2015) at step 1, 2, …, with the two bias corrections folded into the rate.
+    /// Adam (Kingma and Ba 2015) at step 1, 2, …, with the two bias corrections folded into the
+    /// rate.
     pub(crate) fn new(step: u64, rate: f64, decay: f32) -> Self {
         let (beta1, beta2) = (0.9f64, 0.99f64);
         let t = step.min(100_000) as i32;
         let corrected = rate * (1.0 - beta2.powi(t)).sqrt() / (1.0 - beta1.powi(t));
-        Self { rate: corrected as f32, beta1: beta1 as f32, beta2: beta2 as f32, epsilon: 1e-15, decay }
+        Self {
+            rate: corrected as f32,
+            beta1: beta1 as f32,
+            beta2: beta2 as f32,
+            epsilon: 1e-15,
+            decay,
+        }
     }
 }
 
-/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read before it is set.
+/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read
+/// before it is set.
 pub(crate) type Touched = [u8];
 
 kernel! {
-    /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came near learns nothing from
-    /// it). Looks only at the blocks that were touched, and clears their gradients and marks. Lengths are equal multiples of 16.
+    /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came
+    /// near learns nothing from it). Looks only at the blocks that were touched, and clears their
+    /// gradients and marks. Lengths are equal multiples of 16.
     pub(crate) fn adam<L>(
-        step: &AdamStep, touched: &mut Touched, weights: &mut [f32], gradients: &mut [f32], first: &mut [f32], second: &mut [f32],
+        step: &AdamStep, touched: &mut Touched, weights: &mut [f32], gradients: &mut [f32],
+        first: &mut [f32], second: &mut [f32],
     ) {
-        let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0, gradients.as_chunks_mut::<LANES>().0);
+        let (weights, gradients) = (weights.as_chunks_mut::<LANES>().0,
+            gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
         let most = touched.len().min(weights.len());
         for start in (0..most).step_by(64) {
@@ -43,7 +54,8 @@ kernel! {
                 if std::mem::take(mark) == 0 {
                     continue;
                 }
-                let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block], &mut second[block]);
+                let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block],
+                    &mut second[block]);
                 for i in 0..LANES {
                     let touched = g[i] != 0.0;
                     let gradient = step.decay.mul_add(w[i], g[i]);
@@ -72,13 +84,17 @@ mod tests {
         let (mut m, mut v) = (vec![0.0f32; n], vec![0.0f32; n]);
         let mut exact: Vec<[f64; 3]> = w.iter().map(|&w| [f64::from(w), 0.0, 0.0]).collect();
         for t in 1..=3 {
-            let mut g: Vec<f32> = (0..n).map(|i| if i % 3 == 0 { 0.0 } else { ((i * t) as f32).sin() }).collect();
+            let mut g: Vec<f32> =
+                (0..n).map(|i| if i % 3 == 0 { 0.0 } else { ((i * t) as f32).sin() }).collect();
             for (e, &g) in exact.iter_mut().zip(&g) {
                 if g != 0.0 {
                     let g = f64::from(g);
                     e[1] = 0.9 * e[1] + 0.1 * g;
                     e[2] = 0.99 * e[2] + 0.01 * g * g;
-                    let (mh, vh) = (e[1] / (1.0 - 0.9f64.powi(t as i32)), e[2] / (1.0 - 0.99f64.powi(t as i32)));
+                    let (mh, vh) = (
+                        e[1] / (1.0 - 0.9f64.powi(t as i32)),
+                        e[2] / (1.0 - 0.99f64.powi(t as i32)),
+                    );
                     e[0] -= 0.01 * mh / (vh.sqrt() + 1e-15);
                 }
             }

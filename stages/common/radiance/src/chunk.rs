@@ -1,4 +1,5 @@
-//! A few rays at a time through the whole field and back, in buffers that are reused: nothing is allocated once they have grown.
+//! A few rays at a time through the whole field and back, in buffers that are reused: nothing is
+//! allocated once they have grown.
 
 use crate::field::Field;
 use crate::mlp::After;
@@ -24,11 +25,13 @@ impl FeatureGradients {
     }
 }
 
-/// Which samples a backward pass takes through the density network and to the grid: Russian roulette.
+/// Which samples a backward pass takes through the density network and to the grid: Russian
+/// roulette.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Roulette {
-    /// Samples whose gradient by the density network's outputs is shorter than so many times the chunk's mean are kept as often as their
-    /// share of that length says, with a gradient as long; 0 keeps all. The expected gradient stays.
+    /// Samples whose gradient by the density network's outputs is shorter than so many times the
+    /// chunk's mean are kept as often as their share of that length says, with a gradient as long;
+    /// 0 keeps all. The expected gradient stays.
     pub(crate) limit: f32,
     /// Where the draw begins, from 0 to 1: samples are drawn evenly along the sum of their shares.
     pub(crate) draw: f32,
@@ -71,7 +74,8 @@ impl Back {
     fn choose(&mut self, samples: &Samples, counted: &Counted, roulette: Roulette) {
         let count = counted.sample.len();
         lengths_of(&self.gradients, fit(&mut self.lengths, count));
-        let limit = roulette.limit * self.lengths[..count].iter().sum::<f32>() / count.max(1) as f32;
+        let limit =
+            roulette.limit * self.lengths[..count].iter().sum::<f32>() / count.max(1) as f32;
         let mut sum = roulette.draw;
         self.chosen.clear();
         self.rounds.clear();
@@ -95,7 +99,13 @@ impl Back {
     }
 
     /// Goes on from the chosen samples' gradients to the density network and the grid's features.
-    fn run(&mut self, field: &Field, samples: &Samples, network: &mut NetworkGradients<'_>, into: &mut FeatureGradients) {
+    fn run(
+        &mut self,
+        field: &Field,
+        samples: &Samples,
+        network: &mut NetworkGradients<'_>,
+        into: &mut FeatureGradients,
+    ) {
         let count = self.chosen.len();
         if count == 0 {
             return;
@@ -119,23 +129,33 @@ impl Back {
         into.positions.extend(self.chosen.iter().map(|&i| samples.marched.positions[i as usize]));
         into.levels.resize_with(field.levels.len(), Vec::new);
         for (list, rows) in into.levels.iter_mut().zip(a.chunks_exact(FEATURES * m)) {
-            list.extend((0..count).map(|k| -> [f32; FEATURES] { std::array::from_fn(|f| rows[f * m + k]) }));
+            list.extend(
+                (0..count).map(|k| -> [f32; FEATURES] { std::array::from_fn(|f| rows[f * m + k]) }),
+            );
         }
     }
 }
 
 impl Chunk {
     /// Renders rays into [`Chunk::sums`]. `offsets` shift each ray's samples by a share of a step.
-    pub(crate) fn forward(&mut self, field: &Field, rays: &[NormalizedRay], offsets: &[f32], strides: Strides) {
+    pub(crate) fn forward(
+        &mut self,
+        field: &Field,
+        rays: &[NormalizedRay],
+        offsets: &[f32],
+        strides: Strides,
+    ) {
         self.sums.clear();
         self.sums.resize(rays.len(), RaySum { transmittance: 1.0, ..RaySum::default() });
-        let march = March { occupancy: &field.occupancy, rays, offsets, step: field.step(), strides };
+        let march =
+            March { occupancy: &field.occupancy, rays, offsets, step: field.step(), strides };
         self.samples.march(field, &march, &mut self.counted, &mut self.sums);
         self.counted.collect(&self.samples, rays.len());
         self.shading.forward(field, rays, &self.samples, &self.counted, &mut self.sums);
     }
 
-    /// Goes back from the rays of the last forward pass: adds to the networks' gradients and appends to the grid's.
+    /// Goes back from the rays of the last forward pass: adds to the networks' gradients and
+    /// appends to the grid's.
     pub(crate) fn backward(
         &mut self,
         field: &Field,
@@ -168,7 +188,10 @@ impl Chunk {
 impl Chunk {
     /// Positions of each ray's samples that count, from front to back.
     pub(crate) fn kept_positions(&self) -> Vec<Vec<[f32; 3]>> {
-        let at = |&k: &u32| self.samples.marched.positions[self.counted.sample[k as usize] as usize];
-        (0..self.sums.len() as u32).map(|r| self.counted.of_ray(r).iter().map(at).collect()).collect()
+        let at =
+            |&k: &u32| self.samples.marched.positions[self.counted.sample[k as usize] as usize];
+        (0..self.sums.len() as u32)
+            .map(|r| self.counted.of_ray(r).iter().map(at).collect())
+            .collect()
     }
 }

@@ -1,4 +1,5 @@
-//! Volume rendering in optical depth: T = e^(-Σ τ) and w = T·(1 - e^(-τ)), so that no product of (1-α) can round to 0.
+//! Volume rendering in optical depth: T = e^(-Σ τ) and w = T·(1 - e^(-τ)), so that no product of
+//! (1-α) can round to 0.
 
 use crate::math::{exp, one_minus_exp_neg};
 use crate::simd::kernel;
@@ -14,8 +15,10 @@ kernel! {
 }
 
 kernel! {
-    /// Transmittance before each sample and its weight, from the optical depth before it and its own.
-    pub(crate) fn weights<L>(before: &[f32], tau: &[f32], transmittance: &mut [f32], weight: &mut [f32]) {
+    /// Transmittance before each sample and its weight, from the optical depth before it and its
+    /// own.
+    pub(crate) fn weights<L>(before: &[f32], tau: &[f32], transmittance: &mut [f32],
+        weight: &mut [f32]) {
         for i in 0..before.len().min(tau.len()).min(transmittance.len()).min(weight.len()) {
             let t = exp(-before[i]);
             transmittance[i] = t;
@@ -26,8 +29,15 @@ kernel! {
 
 /// Gradient of a loss by each sample's optical depth, along one ray from back to front.
 ///
-/// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) - T_end·(g·b).
-pub(crate) fn optical_depth_gradients(shade: &[f32], transmittance: &[f32], weight: &[f32], behind: f32, gradient: &mut [f32]) {
+/// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) -
+/// T_end·(g·b).
+pub(crate) fn optical_depth_gradients(
+    shade: &[f32],
+    transmittance: &[f32],
+    weight: &[f32],
+    behind: f32,
+    gradient: &mut [f32],
+) {
     let mut suffix = behind;
     for i in (0..shade.len()).rev() {
         gradient[i] = (transmittance[i] - weight[i]).mul_add(shade[i], -suffix);
@@ -40,32 +50,42 @@ pub(crate) fn optical_depth_gradients(shade: &[f32], transmittance: &[f32], weig
 pub(crate) struct Regularisers {
     /// Of the distortion loss.
     pub(crate) distortion: f32,
-    /// Of the floater loss: T·Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which would make floaters darker
-    /// instead of thinner, or by the ray's transmittance T. What stops a ray is paint of the background's colour, no floater:
-    /// it would become thin and darker, and look the same.
+    /// Of the floater loss: T·Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which
+    /// would make floaters darker instead of thinner, or by the ray's transmittance T. What stops a
+    /// ray is paint of the background's colour, no floater: it would become thin and darker, and
+    /// look the same.
     pub(crate) floater_loss: f32,
 }
 
 /// How far apart colours at most are for matter to pass for the background.
 pub const LIKE_BACKGROUND: f32 = 0.1;
 
-/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from [`LIKE_BACKGROUND`] on. Whether
-/// it is there no image tells that sees it before the background alone.
+/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from
+/// [`LIKE_BACKGROUND`] on. Whether it is there no image tells that sees it before the background
+/// alone.
 pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
     let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();
     (1.0 - squared / (LIKE_BACKGROUND * LIKE_BACKGROUND)).max(0.0)
 }
 
-/// Adds to `shade`, the gradient of a loss by each weight of a ray, that of the distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq.
-/// 15) times `factor`: Σ_ij w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i². It draws a ray's weights together. `t` rises.
-pub(crate) fn add_distortion_gradients(t: &[f32], weight: &[f32], step: f32, factor: f32, shade: &mut [f32]) {
+/// Adds to `shade`, the gradient of a loss by each weight of a ray, that of the distortion loss
+/// (Barron et al. 2022, "Mip-NeRF 360", eq. 15) times `factor`: Σ_ij w_i·w_j·|t_i - t_j| +
+/// ⅓·step·Σ_i w_i². It draws a ray's weights together. `t` rises.
+pub(crate) fn add_distortion_gradients(
+    t: &[f32],
+    weight: &[f32],
+    step: f32,
+    factor: f32,
+    shade: &mut [f32],
+) {
     let whole: f32 = weight.iter().sum();
     // Measured from the mean, so that nothing cancels.
     let mean = weight.iter().zip(t).map(|(w, t)| w * t).sum::<f32>() / whole.max(f32::MIN_POSITIVE);
     let (mut before, mut moment) = (0.0, 0.0);
     for ((shade, &w), &t) in shade.iter_mut().zip(weight).zip(t) {
         let t = t - mean;
-        // Σ_j w_j·|t - t_j|: what lies before with +, what lies behind with -; all moments add up to 0.
+        // Σ_j w_j·|t - t_j|: what lies before with +, what lies behind with -; all moments add up
+        // to 0.
         let apart = t * (2.0 * before + w - whole) - (2.0 * moment + w * t);
         *shade += 2.0 * factor * (apart + step * w / 3.0);
         before += w;
@@ -104,7 +124,8 @@ mod tests {
 
         #[test]
         fn gradients_equal_f64_differences(
-            samples in prop::collection::vec((-8.0f32..3.0, -1.0f32..1.0), 1..40), behind in -1.0f32..1.0,
+            samples in prop::collection::vec((-8.0f32..3.0, -1.0f32..1.0), 1..40),
+            behind in -1.0f32..1.0,
         ) {
             let tau: Vec<f32> = samples.iter().map(|(e, _)| e.exp2()).collect();
             let shade: Vec<f32> = samples.iter().map(|(_, s)| *s).collect();
@@ -126,7 +147,8 @@ mod tests {
                 let up = loss(&wide);
                 wide[i] -= 2.0 * h;
                 let numeric = (up - loss(&wide)) / (2.0 * h);
-                prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}", gradient[i]);
+                prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} \
+                    {numeric}", gradient[i]);
             }
         }
     }
@@ -134,7 +156,8 @@ mod tests {
     proptest! {
         #[test]
         fn distortion_gradients_equal_f64_differences(
-            samples in prop::collection::vec((0.001f32..0.2, 1e-4f32..0.5), 1..40), factor in 0.01f32..2.0,
+            samples in prop::collection::vec((0.001f32..0.2, 1e-4f32..0.5), 1..40),
+            factor in 0.01f32..2.0,
         ) {
             let mut t: Vec<f32> = samples.iter().map(|(gap, _)| *gap).collect();
             (1..t.len()).for_each(|i| t[i] += t[i - 1]);
@@ -145,7 +168,8 @@ mod tests {
                 let apart: f64 = (0..t.len()).map(|j| f64::from(weight[j]) * (f64::from(t[i]) - f64::from(t[j])).abs()).sum();
                 2.0 * f64::from(factor) * (apart + 0.003 / 3.0 * f64::from(weight[i]))
             };
-            // Distances are differences of f32 numbers: known to a few parts in 10^7 of how far along the ray they lie.
+            // Distances are differences of f32 numbers: known to a few parts in 10^7 of how far
+            // along the ray they lie.
             let whole: f32 = weight.iter().sum();
             let rounding = 4e-7 * f64::from(factor * whole * t[t.len() - 1]);
             let largest = (0..t.len()).map(exact).fold(1e-3, f64::max);

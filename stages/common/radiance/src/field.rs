@@ -26,7 +26,8 @@ pub struct Architecture {
     pub coarsest: u32,
     /// Cells along an axis of the finest level.
     pub finest: u32,
-    /// Cells along z at most, of any level: in NDC rays run along z, and cells that lie closer than their samples learn little each.
+    /// Cells along z at most, of any level: in NDC rays run along z, and cells that lie closer than
+    /// their samples learn little each.
     pub finest_z: u32,
     /// Base-2 logarithm of the most entries a level may have; finer levels are hashed.
     pub log2_entries: u32,
@@ -41,7 +42,15 @@ const MOST_CELLS: u32 = 4096;
 
 impl Default for Architecture {
     fn default() -> Self {
-        Self { levels: 8, coarsest: 16, finest: 256, finest_z: MOST_CELLS, log2_entries: 17, hidden: 64, steps: 512 }
+        Self {
+            levels: 8,
+            coarsest: 16,
+            finest: 256,
+            finest_z: MOST_CELLS,
+            log2_entries: 17,
+            hidden: 64,
+            steps: 512,
+        }
     }
 }
 
@@ -65,7 +74,8 @@ impl Architecture {
         levels(self).last().map_or(0, |level| level.range().end)
     }
 
-    /// Samples of a ray through all of the cube, more or less: what a training expects before it has seen any.
+    /// Samples of a ray through all of the cube, more or less: what a training expects before it
+    /// has seen any.
     pub fn full_ray(&self) -> f64 {
         f64::from(self.steps) * 0.6
     }
@@ -85,8 +95,9 @@ pub struct Field {
     pub(crate) occupancy: Occupancy,
 }
 
-/// The five layers of the two networks: a sample's features → raw density, raw colour and view features; a ray's composited view features
-/// and direction → what is added to the raw colours of its samples.
+/// The five layers of the two networks: a sample's features → raw density, raw colour and view
+/// features; a ray's composited view features and direction → what is added to the raw colours of
+/// its samples.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Layers {
     pub(crate) density: [Layer; 2],
@@ -206,7 +217,8 @@ impl Field {
         3.0f32.sqrt() / self.architecture.steps as f32
     }
 
-    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number of threads.
+    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number
+    /// of threads.
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
         rays.par_chunks(CHUNK_RAYS)
             .map_init(Chunk::default, |chunk, rays| {
@@ -221,7 +233,9 @@ impl Field {
                     };
                     let opacity = 1.0 - sum.transmittance;
                     Pixel {
-                        colour: std::array::from_fn(|c| sum.transmittance.mul_add(ray.background[c], sum.colour[c])),
+                        colour: std::array::from_fn(|c| {
+                            sum.transmittance.mul_add(ray.background[c], sum.colour[c])
+                        }),
                         premultiplied: sum.colour,
                         opacity,
                         depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
@@ -244,8 +258,9 @@ impl Field {
         self.grid.len()
     }
 
-    /// The grid's entries, level by level; the networks' weights, layer by layer, each input by input, filled up with 0 to whole vectors;
-    /// and where there may be something: for whoever renders or trains them elsewhere.
+    /// The grid's entries, level by level; the networks' weights, layer by layer, each input by
+    /// input, filled up with 0 to whole vectors; and where there may be something: for whoever
+    /// renders or trains them elsewhere.
     pub fn parts(&self) -> (&[f32], &[f32], &Occupancy) {
         (&self.grid, &self.network, &self.occupancy)
     }
@@ -255,26 +270,31 @@ impl Field {
         (&mut self.grid, &mut self.network, &mut self.occupancy)
     }
 
-    /// Multiplications of the density network for one sample, forward; backward takes twice as many.
+    /// Multiplications of the density network for one sample, forward; backward takes twice as
+    /// many.
     pub fn network_multiplications(&self) -> usize {
         self.layers.density.iter().map(|l| l.inputs * l.outputs).sum()
     }
 
-    /// Makes every parameter the mean of its own and of another field's of the same architecture. Where one was trained on from the other, that is nearly
-    /// what the mean of both's colours is (Wortsman et al. 2022, "Robust fine-tuning"). Where there may be something stays as it is.
+    /// Makes every parameter the mean of its own and of another field's of the same architecture.
+    /// Where one was trained on from the other, that is nearly what the mean of both's colours is
+    /// (Wortsman et al. 2022, "Robust fine-tuning"). Where there may be something stays as it is.
     pub fn average_with(&mut self, other: &Self) {
         let own = self.grid.iter_mut().chain(&mut self.network);
-        own.zip(other.grid.iter().chain(&other.network)).for_each(|(own, other)| *own = 0.5 * (*own + other));
+        own.zip(other.grid.iter().chain(&other.network))
+            .for_each(|(own, other)| *own = 0.5 * (*own + other));
     }
 
-    /// Keeps a training that goes on from this field to the cells that may hold something, and those around them. Elsewhere no
-    /// image says anything, or that there is nothing: opened again, it would fill with what is as bright as the background,
-    /// which images taken before it don't show.
+    /// Keeps a training that goes on from this field to the cells that may hold something, and
+    /// those around them. Elsewhere no image says anything, or that there is nothing: opened again,
+    /// it would fill with what is as bright as the background, which images taken before it don't
+    /// show.
     pub fn limit_to_occupied(&mut self) {
         self.occupancy.limit_to_occupied();
     }
 
-    /// Keeps a training that starts from this field to some cells of the occupancy, 128³ over the unit cube, x fastest.
+    /// Keeps a training that starts from this field to some cells of the occupancy, 128³ over the
+    /// unit cube, x fastest.
     ///
     /// # Panics
     /// When there aren't so many.
@@ -288,23 +308,33 @@ impl Field {
         self.grid.iter().chain(&self.network).all(|x| x.is_finite())
     }
 
-    /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest: 0 empty, 1 thin, 2 dense). No metadata, so bytes repeat.
+    /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest: 0
+    /// empty, 1 thin, 2 dense). No metadata, so bytes repeat.
     pub fn write(&self, path: &Path) -> Result<(), FieldError> {
         let occupancy = self.occupancy.to_bytes();
         write_tensors(
             path,
-            &[("grid", Tensor::F32(&self.grid)), ("network", Tensor::F32(&self.network)), ("occupancy", Tensor::U8(&occupancy))],
+            &[
+                ("grid", Tensor::F32(&self.grid)),
+                ("network", Tensor::F32(&self.network)),
+                ("occupancy", Tensor::U8(&occupancy)),
+            ],
         )
     }
 
     /// Reads what [`Field::write`] wrote; sizes must fit the architecture and numbers be finite.
-    pub fn read(path: &Path, architecture: Architecture, bounds: Bounds) -> Result<Self, FieldError> {
+    pub fn read(
+        path: &Path,
+        architecture: Architecture,
+        bounds: Bounds,
+    ) -> Result<Self, FieldError> {
         let format = |reason: String| FieldError::Format { path: path.to_path_buf(), reason };
         architecture.check().map_err(format)?;
         if !bounds.is_valid() {
             return Err(format(format!("the box {bounds:?} has no inside")));
         }
-        let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+        let bytes = std::fs::read(path)
+            .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
         let mut field = Self::empty(architecture, bounds);
         read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
@@ -324,7 +354,8 @@ pub(crate) enum Tensor<'a> {
     U8(&'a [u8]),
 }
 
-/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest tensor at a time.
+/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest
+/// tensor at a time.
 struct Written<'a>(&'a Tensor<'a>, [usize; 1]);
 
 impl View for Written<'_> {
@@ -341,7 +372,9 @@ impl View for Written<'_> {
 
     fn data(&self) -> Cow<'_, [u8]> {
         match self.0 {
-            Tensor::F32(numbers) => Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect()),
+            Tensor::F32(numbers) => {
+                Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect())
+            }
             Tensor::U8(bytes) => Cow::Borrowed(bytes),
         }
     }
@@ -366,15 +399,25 @@ impl Tensor<'_> {
 pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
     let views = tensors.iter().map(|(name, tensor)| (*name, Written(tensor, [tensor.len()])));
     let io = |source| FieldError::Io { path: path.to_path_buf(), source };
-    let whole = safetensors::serialize(views, None).map_err(|e| io(std::io::Error::other(e.to_string())))?;
+    let whole = safetensors::serialize(views, None)
+        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
     std::fs::write(path, whole).map_err(io)
 }
 
-pub(crate) fn read_f32(tensors: &SafeTensors<'_>, name: &str, into: &mut [f32]) -> Result<(), String> {
+pub(crate) fn read_f32(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    into: &mut [f32],
+) -> Result<(), String> {
     let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
     let (data, rest) = tensor.data().as_chunks::<4>();
     if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(format!("tensor {name}: {:?} {:?} where {} f32 are expected", tensor.dtype(), tensor.shape(), into.len()));
+        return Err(format!(
+            "tensor {name}: {:?} {:?} where {} f32 are expected",
+            tensor.dtype(),
+            tensor.shape(),
+            into.len()
+        ));
     }
     for (value, bytes) in into.iter_mut().zip(data) {
         *value = f32::from_le_bytes(*bytes);
@@ -382,10 +425,18 @@ pub(crate) fn read_f32(tensors: &SafeTensors<'_>, name: &str, into: &mut [f32]) 
     Ok(())
 }
 
-pub(crate) fn read_u8(tensors: &SafeTensors<'_>, name: &str, len: usize) -> Result<Vec<u8>, String> {
+pub(crate) fn read_u8(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    len: usize,
+) -> Result<Vec<u8>, String> {
     let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
     if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(format!("tensor {name}: {:?} {:?} where {len} u8 are expected", tensor.dtype(), tensor.shape()));
+        return Err(format!(
+            "tensor {name}: {:?} {:?} where {len} u8 are expected",
+            tensor.dtype(),
+            tensor.shape()
+        ));
     }
     Ok(tensor.data().to_vec())
 }
@@ -394,15 +445,26 @@ pub(crate) fn read_u8(tensors: &SafeTensors<'_>, name: &str, len: usize) -> Resu
 mod tests {
     use super::*;
 
-    /// Every parameter is the mean of both fields', and rays are stopped where the field's own were.
+    /// Every parameter is the mean of both fields', and rays are stopped where the field's own
+    /// were.
     #[test]
     fn fields_are_averaged() {
-        let architecture = Architecture { finest: 32, levels: 4, log2_entries: 10, steps: 64, ..Architecture::default() };
-        let [mut mean, own, other] = [3, 3, 4].map(|seed| Field::new(architecture, Bounds::default(), seed));
+        let architecture = Architecture {
+            finest: 32,
+            levels: 4,
+            log2_entries: 10,
+            steps: 64,
+            ..Architecture::default()
+        };
+        let [mut mean, own, other] =
+            [3, 3, 4].map(|seed| Field::new(architecture, Bounds::default(), seed));
         mean.occupancy.set(|cell| if cell % 3 == 0 { Cell::Thin } else { Cell::Empty });
         mean.average_with(&other);
-        let all = |field: &Field| -> Vec<f32> { field.grid.iter().chain(&field.network).copied().collect() };
-        let expected = all(&own).into_iter().zip(all(&other)).map(|(own, other)| 0.5 * (own + other));
+        let all = |field: &Field| -> Vec<f32> {
+            field.grid.iter().chain(&field.network).copied().collect()
+        };
+        let expected =
+            all(&own).into_iter().zip(all(&other)).map(|(own, other)| 0.5 * (own + other));
         assert!(all(&mean).into_iter().eq(expected) && all(&own) != all(&other));
         assert!(mean.occupancy.cells().all(|cell| cell % 3 == 0));
     }

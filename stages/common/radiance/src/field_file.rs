@@ -5,18 +5,20 @@ use scene::Bounds;
 
 use crate::Architecture;
 
-/// Name of the description in a field's artifact; the weights lie beside it, each member's in [`FieldFile::member`].
+/// Name of the description in a field's artifact; the weights lie beside it, each member's in
+/// [`FieldFile::member`].
 pub const FIELD_FILE: &str = "field.json";
 
-/// Format of the weights that this build writes: grid fields of another one it can't read, since their networks and the order of their
-/// entries differ. The paper's field has had one format.
+/// Format of the weights that this build writes: grid fields of another one it can't read, since
+/// their networks and the order of their entries differ. The paper's field has had one format.
 pub const FIELD_FORMAT: u32 = 2;
 
 /// `field.json`: what a reader of the weights must know.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct FieldFile {
-    /// [`FIELD_FORMAT`] of the build that trained it; files from before there was such a number have none, and format 1.
+    /// [`FIELD_FORMAT`] of the build that trained it; files from before there was such a number
+    /// have none, and format 1.
     #[serde(default = "first_format")]
     pub format: u32,
     /// Which field, and what it is made of.
@@ -48,7 +50,8 @@ impl FieldFile {
         }
         match self.field {
             FieldModel::Grid(_) if self.format != FIELD_FORMAT => Err(format!(
-                "another build trained this field, in format {}; this build reads format {FIELD_FORMAT}: train it again",
+                "another build trained this field, in format {}; this build reads format \
+                {FIELD_FORMAT}: train it again",
                 self.format
             )),
             FieldModel::Grid(architecture) => architecture.check(),
@@ -83,8 +86,8 @@ pub struct MlpArchitecture {
     pub coarse_samples: u32,
     /// Samples that the fine network has besides those.
     pub fine_samples: u32,
-    /// In NDC: colours depend on the ray's direction there, from the near to the far plane and not of unit length, as the reference's code has
-    /// it; without it on its direction in the world.
+    /// In NDC: colours depend on the ray's direction there, from the near to the far plane and not
+    /// of unit length, as the reference's code has it; without it on its direction in the world.
     pub ndc_directions: bool,
 }
 
@@ -120,6 +123,10 @@ impl MlpArchitecture {
 /// Says which of some named numbers isn't between its bounds.
 pub(crate) fn in_ranges(ranges: &[(&str, u32, u32, u32)]) -> Result<(), String> {
     ranges.iter().try_for_each(|(name, value, low, high)| {
-        if (low..=high).contains(&value) { Ok(()) } else { Err(format!("{name} = {value} is not in {low}..={high}")) }
+        if (low..=high).contains(&value) {
+            Ok(())
+        } else {
+            Err(format!("{name} = {value} is not in {low}..={high}"))
+        }
     })
 }

@@ -1,8 +1,9 @@
-//! The multi-resolution grid: levels of growing resolution, four features a vertex, trilinear interpolation.
+//! The multi-resolution grid: levels of growing resolution, four features a vertex, trilinear
+//! interpolation.
 //!
-//! Vertices lie in bricks of 2³, so that the eight corners of a cell touch few cache lines. A level whose bricks fit its table is stored
-//! densely; of a finer one the bricks are hashed (Müller et al. 2022, "Instant neural graphics primitives", eq. 4), and collisions are
-//! left to the networks.
+//! Vertices lie in bricks of 2³, so that the eight corners of a cell touch few cache lines. A level
+//! whose bricks fit its table is stored densely; of a finer one the bricks are hashed (Müller et
+//! al. 2022, "Instant neural graphics primitives", eq. 4), and collisions are left to the networks.
 
 use crate::adam::Touched;
 use crate::field::Architecture;
@@ -39,9 +40,11 @@ impl Level {
     }
 }
 
-/// Levels from `coarsest` to `finest` cells in equal ratios, no more than `finest_z` along z, at most 2^`log2_entries` entries each.
+/// Levels from `coarsest` to `finest` cells in equal ratios, no more than `finest_z` along z, at
+/// most 2^`log2_entries` entries each.
 pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
-    let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } = *architecture;
+    let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } =
+        *architecture;
     let ratio = (f64::from(finest) / f64::from(coarsest)).powf(1.0 / f64::from(count.max(2) - 1));
     let mut offset = 0;
     (0..count)
@@ -52,7 +55,8 @@ pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
             let vertices = bricks.iter().map(|n| u64::from(*n)).product::<u64>() * BRICK as u64;
             let hashed = vertices > 1 << log2_entries;
             let entries = if hashed { 1usize << log2_entries } else { vertices as usize };
-            let level = Level { resolution, entries, bricks: [bricks[0], bricks[1]], hashed, offset };
+            let level =
+                Level { resolution, entries, bricks: [bricks[0], bricks[1]], hashed, offset };
             offset += entries * FEATURES;
             level
         })
@@ -94,7 +98,8 @@ fn corners(level: &Level, p: [&[f32; LANES]; 3], out: &mut Corners) {
             };
             index[l] = brick << 3 | (z & 1) << 2 | (y & 1) << 1 | x & 1;
             let share = |f: f32, d: u32| if d == 1 { f } else { 1.0 - f };
-            weight[l] = share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
+            weight[l] =
+                share(fraction[0][l], dx) * share(fraction[1][l], dy) * share(fraction[2][l], dz);
         }
     }
 }
@@ -108,7 +113,8 @@ impl Corners {
 
 kernel! {
     /// Interpolated features of `n` positions (three rows, unit cube): four rows of `n`.
-    pub(crate) fn encode<L>(level: &Level, table: &[f32], positions: &[f32], features: &mut [f32], n: usize) {
+    pub(crate) fn encode<L>(level: &Level, table: &[f32], positions: &[f32], features: &mut [f32],
+        n: usize) {
         let (table, _) = table.as_chunks::<FEATURES>();
         let mut around = Corners::new();
         let mut s = 0;
@@ -134,9 +140,11 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each sample's feature gradient to the eight entries it came from, in sample order, and marks what it touched.
+    /// Adds each sample's feature gradient to the eight entries it came from, in sample order, and
+    /// marks what it touched.
     pub(crate) fn scatter<L>(
-        level: &Level, gradient: &mut [f32], touched: &mut Touched, positions: &[[f32; 3]], feature_gradients: &[[f32; FEATURES]],
+        level: &Level, gradient: &mut [f32], touched: &mut Touched, positions: &[[f32; 3]],
+        feature_gradients: &[[f32; FEATURES]],
     ) {
         let (gradient, _) = gradient.as_chunks_mut::<FEATURES>();
         let mut around = Corners::new();
@@ -154,7 +162,8 @@ kernel! {
                     let index = around.index[c][l] as usize;
                     touched[index / PER_BLOCK] = 1;
                     let entry = &mut gradient[index];
-                    d.mul_add(L::Quad::splat(around.weight[c][l]), L::Quad::load(entry)).store(entry);
+                    d.mul_add(L::Quad::splat(around.weight[c][l]),
+                        L::Quad::load(entry)).store(entry);
                 }
             }
         }
@@ -167,7 +176,8 @@ mod tests {
     use counter_rng::uniform;
 
     fn positions(n: usize) -> Vec<[f32; 3]> {
-        let mut p: Vec<[f32; 3]> = (0..n as u64).map(|i| [0, 1, 2].map(|a| uniform(5, a, i))).collect();
+        let mut p: Vec<[f32; 3]> =
+            (0..n as u64).map(|i| [0, 1, 2].map(|a| uniform(5, a, i))).collect();
         // Corners, faces and just outside.
         p[0] = [0.0; 3];
         p[1] = [1.0; 3];
@@ -182,7 +192,9 @@ mod tests {
 
     #[test]
     fn a_linear_function_is_interpolated_exactly() {
-        let level = levels(&Architecture { levels: 1, finest: 16, finest_z: 8, ..Architecture::default() })[0];
+        let level =
+            levels(&Architecture { levels: 1, finest: 16, finest_z: 8, ..Architecture::default() })
+                [0];
         let mut table = vec![0.0; level.entries * FEATURES];
         for z in 0..9 {
             for y in 0..17 {
@@ -205,11 +217,21 @@ mod tests {
     /// Scattering is the adjoint of encoding: <encode(t), d> = <t, scatter(d)>.
     #[test]
     fn scatter_is_the_adjoint_of_encode() {
-        let small = Architecture { levels: 4, coarsest: 8, finest: 128, log2_entries: 10, ..Architecture::default() };
-        for level in [4096, 12].into_iter().flat_map(|finest_z| levels(&Architecture { finest_z, ..small })) {
+        let small = Architecture {
+            levels: 4,
+            coarsest: 8,
+            finest: 128,
+            log2_entries: 10,
+            ..Architecture::default()
+        };
+        for level in
+            [4096, 12].into_iter().flat_map(|finest_z| levels(&Architecture { finest_z, ..small }))
+        {
             let n = 48;
-            let table: Vec<f32> = (0..level.entries * FEATURES).map(|i| uniform(1, 0, i as u64) - 0.5).collect();
-            let d: Vec<[f32; 4]> = (0..n as u64).map(|i| [0, 1, 2, 3].map(|k| uniform(2, k, i) - 0.5)).collect();
+            let table: Vec<f32> =
+                (0..level.entries * FEATURES).map(|i| uniform(1, 0, i as u64) - 0.5).collect();
+            let d: Vec<[f32; 4]> =
+                (0..n as u64).map(|i| [0, 1, 2, 3].map(|k| uniform(2, k, i) - 0.5)).collect();
             let p = positions(n);
             let mut out = vec![0.0; FEATURES * n];
             encode(&level, &table, &rows(&p), &mut out, n);
@@ -224,7 +246,8 @@ mod tests {
                 .flat_map(|s| (0..4).map(move |k| (s, k)))
                 .map(|(s, k)| f64::from(out[k * n + s]) * f64::from(d[s][k]))
                 .sum();
-            let right: f64 = table.iter().zip(&gradient).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
+            let right: f64 =
+                table.iter().zip(&gradient).map(|(&a, &b)| f64::from(a) * f64::from(b)).sum();
             assert!((left - right).abs() < 1e-5 * left.abs().max(1.0), "{left} {right} {level:?}");
         }
     }

@@ -1,23 +1,30 @@
-//! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No autograd, no torch.
+//! The fast radiance field: a multi-resolution grid with small MLPs, written for the CPU. No
+//! autograd, no torch.
 //!
 //! * [`RayField`]: whatever rays can be cast through; [`FieldFile`] says what an artifact holds.
-//! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of rays.
-//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that casts rays and judges colours.
-//! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere (`torch-field`) shares: how far it has come, where there
-//!   may be something, how rays run through the unit cube.
+//! * [`Field`]: parameters and occupancy; [`Field::render`] gives colour, opacity and depth of
+//!   rays.
+//! * [`Trainer`]: fused forward and backward passes and lazy Adam, driven by a [`Supervisor`] that
+//!   casts rays and judges colours.
+//! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere
+//!   (`torch-field`) shares: how far it has come, where there may be something, how rays run
+//!   through the unit cube.
 //! * [`spec`]: the constants that the libtorch twin shares.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
 //! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
 //!
-//! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view features. A ray composites its samples' view features,
-//! and the view network makes of them and the direction a raw colour that is added to those of all its samples.
+//! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view
+//! features. A ray composites its samples' view features, and the view network makes of them and
+//! the direction a raw colour that is added to those of all its samples.
 //!
-//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding, density, compositing, shading
-//! and back in chunks that stay in the cache; gradients of the grid are kept and added level by level, in sample order. So
-//! sums have one order, and results are equal bits at any thread count. Kernels work on 16 logical lanes whatever the machine
-//! has, and multiply-adds are fused everywhere, so AVX-512, AVX2 and portable code give equal bits, too.
+//! Layout of the work: rays are cut into shards by index; a shard's samples go through encoding,
+//! density, compositing, shading and back in chunks that stay in the cache; gradients of the grid
+//! are kept and added level by level, in sample order. So sums have one order, and results are
+//! equal bits at any thread count. Kernels work on 16 logical lanes whatever the machine has, and
+//! multiply-adds are fused everywhere, so AVX-512, AVX2 and portable code give equal bits, too.
 //!
-//! Units: rays and depths are in scene units; inside, the scene's box is scaled to the unit cube. Colours are display-encoded sRGB.
+//! Units: rays and depths are in scene units; inside, the scene's box is scaled to the unit cube.
+//! Colours are display-encoded sRGB.
 //!
 //! ```
 //! use radiance::{Architecture, Field, Ray};

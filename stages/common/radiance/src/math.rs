@@ -3,7 +3,8 @@
 /// e^x for finite x; saturates at about e^±87. Relative error below 2e-7.
 #[inline(always)]
 pub(crate) fn exp(x: f32) -> f32 {
-    // max before min, so that NaN becomes a number here; NaNs are looked for in sums, not in every exponent.
+    // max before min, so that NaN becomes a number here; NaNs are looked for in sums, not in every
+    // exponent.
     let x = x.max(-87.0).min(87.0);
     // Adding and taking away 1.5·2^23 rounds to the nearest whole number.
     const ROUND: f32 = 12_582_912.0;
@@ -22,7 +23,8 @@ pub(crate) fn exp(x: f32) -> f32 {
     e * f32::from_bits(rounded.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23)
 }
 
-/// The whole number not above x, for x in 0..=2^22, as a number and as an integer. A cast would saturate, and so not vectorise.
+/// The whole number not above x, for x in 0..=2^22, as a number and as an integer. A cast would
+/// saturate, and so not vectorise.
 #[inline(always)]
 pub(crate) fn floor(x: f32) -> (f32, u32) {
     const ROUND: f32 = 8_388_608.0;
@@ -60,7 +62,15 @@ mod tests {
 
     #[test]
     fn floor_is_the_whole_part() {
-        for x in (0..200_000).map(|i| i as f32 * 0.021).chain([0.0, 0.5, 1.0, 1.5, 2.5, 4096.0, 4_194_303.5]) {
+        for x in (0..200_000).map(|i| i as f32 * 0.021).chain([
+            0.0,
+            0.5,
+            1.0,
+            1.5,
+            2.5,
+            4096.0,
+            4_194_303.5,
+        ]) {
             assert_eq!(floor(x), (x.floor(), x as u32), "{x}");
         }
     }
@@ -69,7 +79,8 @@ mod tests {
         #[test]
         fn close_to_f64(x in -86.0f32..86.0) {
             let exact = f64::from(x).exp();
-            prop_assert!(((f64::from(exp(x)) - exact) / exact).abs() < 2e-7, "{} {}", exp(x), exact);
+            prop_assert!(((f64::from(exp(x)) - exact) / exact).abs() < 2e-7, "{} \
+                {}", exp(x), exact);
         }
 
         #[test]

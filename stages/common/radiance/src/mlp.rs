@@ -1,5 +1,6 @@
-//! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16); weights are stored input by
-//! input (`w[i·outputs + j]`). There are no biases: the first spherical harmonic is a constant input already.
+//! Matrix kernels of the small networks. Activations are rows of `n` samples (a multiple of 16);
+//! weights are stored input by input (`w[i·outputs + j]`). There are no biases: the first spherical
+//! harmonic is a constant input already.
 
 use crate::simd::{LANES, Lanes, kernel};
 
@@ -24,7 +25,8 @@ pub(crate) enum After<'a> {
     Gate(&'a [f32]),
 }
 
-/// TO outputs of TV vectors of samples, all in registers. The sum over inputs has one order, whatever the tile.
+/// TO outputs of TV vectors of samples, all in registers. The sum over inputs has one order,
+/// whatever the tile.
 #[inline(always)]
 fn tile<L: Lanes, const TO: usize, const TV: usize>(
     w: &[f32],
@@ -38,7 +40,8 @@ fn tile<L: Lanes, const TO: usize, const TV: usize>(
     let mut acc = [[L::splat(0.0); TV]; TO];
     for i in 0..inputs {
         let xs: [L; TV] = std::array::from_fn(|v| row(x, i * n + s + v * LANES));
-        let ws: &[f32; TO] = w[i * outputs + j..i * outputs + j + TO].try_into().expect("a tile of weights");
+        let ws: &[f32; TO] =
+            w[i * outputs + j..i * outputs + j + TO].try_into().expect("a tile of weights");
         for o in 0..TO {
             let b = L::splat(ws[o]);
             for v in 0..TV {
@@ -81,8 +84,10 @@ fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(
 }
 
 kernel! {
-    /// y = after(wᵀ·x): `inputs` rows of `n` samples to `outputs` rows. With the transposed weights it is the backward pass.
-    pub(crate) fn multiply<L>(w: &[f32], x: &[f32], y: &mut [f32], inputs: usize, outputs: usize, n: usize, after: After<'_>) {
+    /// y = after(wᵀ·x): `inputs` rows of `n` samples to `outputs` rows. With the transposed weights
+    /// it is the backward pass.
+    pub(crate) fn multiply<L>(w: &[f32], x: &[f32], y: &mut [f32], inputs: usize, outputs: usize,
+        n: usize, after: After<'_>) {
         let shape = (inputs, outputs, n);
         let mut s = 0;
         if L::WIDE {
@@ -151,8 +156,10 @@ fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(
 }
 
 kernel! {
-    /// Adds x·dyᵀ, the gradient of the weights, to 16 partial sums a weight (`lanes[(i·outputs + j)·16..]`).
-    pub(crate) fn add_outer<L>(x: &[f32], dy: &[f32], lanes: &mut [f32], inputs: usize, outputs: usize, n: usize) {
+    /// Adds x·dyᵀ, the gradient of the weights, to 16 partial sums a weight (`lanes[(i·outputs +
+    /// j)·16..]`).
+    pub(crate) fn add_outer<L>(x: &[f32], dy: &[f32], lanes: &mut [f32], inputs: usize,
+        outputs: usize, n: usize) {
         let shape = (outputs, n);
         let mut i = 0;
         if L::WIDE {
@@ -223,18 +230,22 @@ mod tests {
     }
 
     /// Shapes that use every remainder of the tiling.
-    const SHAPES: [(usize, usize, usize); 5] = [(32, 32, 64), (24, 16, 48), (32, 3, 16), (3, 5, 80), (7, 9, 16)];
+    const SHAPES: [(usize, usize, usize); 5] =
+        [(32, 32, 64), (24, 16, 48), (32, 3, 16), (3, 5, 80), (7, 9, 16)];
 
     #[test]
     fn products_agree_with_f64() {
         for (inputs, outputs, n) in SHAPES {
-            let (w, x, gate) = (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(3, outputs * n));
+            let (w, x, gate) =
+                (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(3, outputs * n));
             let mut y = vec![0.0; outputs * n];
             for after in [After::Linear, After::Relu, After::Gate(&gate)] {
                 multiply(&w, &x, &mut y, inputs, outputs, n, after);
                 for j in 0..outputs {
                     for s in 0..n {
-                        let sum: f64 = (0..inputs).map(|i| f64::from(w[i * outputs + j]) * f64::from(x[i * n + s])).sum();
+                        let sum: f64 = (0..inputs)
+                            .map(|i| f64::from(w[i * outputs + j]) * f64::from(x[i * n + s]))
+                            .sum();
                         let expected = match after {
                             After::Linear => sum,
                             After::Relu => sum.max(0.0),
@@ -257,7 +268,8 @@ mod tests {
             drain_lanes(&mut lanes, &mut sums);
             for i in 0..inputs {
                 for j in 0..outputs {
-                    let sum: f64 = (0..n).map(|s| f64::from(x[i * n + s]) * f64::from(dy[j * n + s])).sum();
+                    let sum: f64 =
+                        (0..n).map(|s| f64::from(x[i * n + s]) * f64::from(dy[j * n + s])).sum();
                     assert!((f64::from(sums[i * outputs + j]) - 1.0 - sum).abs() < 1e-5);
                 }
             }
@@ -270,7 +282,8 @@ mod tests {
         let outcome = || -> Vec<u32> {
             let mut bits = Vec::new();
             for (inputs, outputs, n) in SHAPES {
-                let (w, x, dy) = (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
+                let (w, x, dy) =
+                    (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
                 let mut y = vec![0.0; outputs * n];
                 multiply(&w, &x, &mut y, inputs, outputs, n, After::Relu);
                 let mut lanes = vec![0.0; inputs * outputs * LANES];

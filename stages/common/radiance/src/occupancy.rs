@@ -1,4 +1,5 @@
-//! Which cells of the unit cube may hold something: what rays skip by, and where they take fewer samples.
+//! Which cells of the unit cube may hold something: what rays skip by, and where they take fewer
+//! samples.
 
 use counter_rng::CounterRng;
 use rayon::prelude::*;
@@ -71,7 +72,8 @@ impl Cell {
     }
 }
 
-/// A slowly decaying maximum of the density seen in each cell, and what it makes of the cell: 128³ over the unit cube, x fastest.
+/// A slowly decaying maximum of the density seen in each cell, and what it makes of the cell: 128³
+/// over the unit cube, x fastest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Occupancy {
     density: Vec<f32>,
@@ -87,18 +89,26 @@ pub struct Occupancy {
 impl Occupancy {
     /// Everything may be occupied.
     pub fn full() -> Self {
-        let mut full =
-            Self { density: vec![UNKNOWN; CELLS], allowed: None, bricks: Vec::new(), blocks: Vec::new(), dense: Vec::new() };
+        let mut full = Self {
+            density: vec![UNKNOWN; CELLS],
+            allowed: None,
+            bricks: Vec::new(),
+            blocks: Vec::new(),
+            dense: Vec::new(),
+        };
         full.set(|_| Cell::Dense);
         full
     }
 
-    /// Limits it to the cells that are occupied and those around them: for a training that goes on where the rest is known to be empty.
+    /// Limits it to the cells that are occupied and those around them: for a training that goes on
+    /// where the rest is known to be empty.
     pub(crate) fn limit_to_occupied(&mut self) {
         let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
         let kept = |cell: usize| {
             let [x, y, z] = corner(cell);
-            around(z).any(|k| around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k)))))
+            around(z).any(|k| {
+                around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k))))
+            })
         };
         let mask = (0..CELLS).into_par_iter().map(kept).collect();
         self.limit_to(mask);
@@ -123,7 +133,11 @@ impl Occupancy {
             let cell = cell as usize;
             let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
             let [.., z] = corner(cell);
-            let turns = if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
+            let turns = if step <= WARM_UP || self.is_occupied(cell) {
+                OCCUPIED_TURNS
+            } else {
+                EMPTY_TURNS
+            };
             let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
             allowed && wanted
         };
@@ -136,7 +150,8 @@ impl Occupancy {
         corner(cell as usize).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
-    /// Takes the densities that were found in cells, and decides anew what every cell holds, for rays with samples so far apart in the cube.
+    /// Takes the densities that were found in cells, and decides anew what every cell holds, for
+    /// rays with samples so far apart in the cube.
     pub fn update(&mut self, cells: &[u32], densities: &[f32], step: f32) {
         if cells.is_empty() {
             return;
@@ -148,7 +163,8 @@ impl Occupancy {
         let known = self.density.iter().filter(|d| **d >= 0.0);
         let (sum, count) = known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1));
         let mean = (sum / f64::from(count.max(1))) as f32;
-        // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what is denser than the mean.
+        // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what
+        // is denser than the mean.
         let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
         let allowed = |cell: usize| self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
         let held = |(cell, &density): (usize, &f32)| match density {
@@ -266,10 +282,12 @@ impl Marched {
 }
 
 kernel! {
-    /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies at t = enter + (k + offset)·step. An
-    /// occupied cell gives a sample there; by [`Strides::ByCell`], a thin one gives a sample of two steps where k is even, in the middle of
-    /// both. `next` is each ray's k, from 0 to [`DONE`].
-    pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32], samples: &mut Marched) {
+    /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies
+    /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; by
+    /// [`Strides::ByCell`], a thin one gives a sample of two steps where k is even, in the middle
+    /// of both. `next` is each ray's k, from 0 to [`DONE`].
+    pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
+        samples: &mut Marched) {
         let last = GRID as f32 - 1.0;
         let March { occupancy, rays, offsets, step, strides } = *march;
         let always = u64::from(strides == Strides::Even);
@@ -325,7 +343,8 @@ kernel! {
                 } else {
                     // No sooner than the nearest face can be reached.
                     for i in 0..3 {
-                        let (below, above) = (low[i] as f32 / GRID as f32, (low[i] + size) as f32 / GRID as f32);
+                        let (below, above) = (low[i] as f32 / GRID as f32,
+                            (low[i] + size) as f32 / GRID as f32);
                         exit = exit.min((p[i] - below).min(above - p[i]));
                     }
                     exit = (1.0 / FASTEST).mul_add(exit, at);
@@ -363,14 +382,22 @@ mod tests {
             let direction = d.map(|x| x / length);
             let leave = (0..3)
                 .filter(|&i| direction[i] != 0.0)
-                .map(|i| (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i])
+                .map(|i| {
+                    (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i]
+                })
                 .fold(f32::INFINITY, f32::min);
             let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
             // In parts, as the renderer does.
             let (mut next, mut found) = ([0], Marched::default());
             while next[0] != DONE {
                 march(
-                    &March { occupancy: &occupancy, rays: &[ray], offsets: &[0.3], step, strides: Strides::ByCell },
+                    &March {
+                        occupancy: &occupancy,
+                        rays: &[ray],
+                        offsets: &[0.3],
+                        step,
+                        strides: Strides::ByCell,
+                    },
                     5,
                     &[0],
                     &mut next,
@@ -380,7 +407,9 @@ mod tests {
             let found: Vec<(f32, f32)> = found.t.into_iter().zip(found.lengths).collect();
             let sample = |k: u32| {
                 let t = (k as f32 + 0.3).mul_add(step, 0.0);
-                let c = [0, 1, 2].map(|i| (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize);
+                let c = [0, 1, 2].map(|i| {
+                    (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize
+                });
                 let middle = (k as f32 + 0.3 + 0.5).mul_add(step, 0.0);
                 match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
                     Cell::Dense if t < leave => Some((t, 1.0)),
@@ -396,7 +425,8 @@ mod tests {
         }
     }
 
-    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is found elsewhere, and within a mask.
+    /// What goes on stays in the cells that were occupied and their neighbours, whatever density is
+    /// found elsewhere, and within a mask.
     #[test]
     fn going_on_stays_where_something_was() {
         let mut occupancy = Occupancy::full();
@@ -410,7 +440,8 @@ mod tests {
         occupancy.limit_to(mask);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        let updates = (1..=OCCUPIED_TURNS as u64).map(|turn| occupancy.cells_to_update(turn * EVERY).len());
+        let updates =
+            (1..=OCCUPIED_TURNS as u64).map(|turn| occupancy.cells_to_update(turn * EVERY).len());
         assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);

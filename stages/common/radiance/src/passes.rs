@@ -6,8 +6,8 @@ use crate::ray::{Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 
-/// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what another reading of the field is
-/// compared with.
+/// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what
+/// another reading of the field is compared with.
 #[derive(Debug)]
 pub struct Passes {
     chunk: Chunk,
@@ -24,11 +24,18 @@ impl Passes {
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
         let lanes = vec![0.0; field.network.len() * LANES];
         let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
-        Self { chunk: Chunk::default(), transposed, lanes, into: FeatureGradients::default(), touched: vec![0; blocks] }
+        Self {
+            chunk: Chunk::default(),
+            transposed,
+            lanes,
+            into: FeatureGradients::default(),
+            touched: vec![0; blocks],
+        }
     }
 
-    /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every colour, as far as the list that
-    /// a trainer scatters. Returns the samples marched and those that got a colour.
+    /// Renders rays in this thread and, where asked for, goes back from a gradient of 1 by every
+    /// colour, as far as the list that a trainer scatters. Returns the samples marched and those
+    /// that got a colour.
     pub fn run(&mut self, field: &Field, rays: &[Ray], backward: bool) -> [usize; 2] {
         let mut samples = [0; 2];
         self.into.clear();
@@ -39,9 +46,20 @@ impl Passes {
             samples[1] += self.chunk.coloured();
             if backward {
                 let ones = [[1.0; 3]; CHUNK_RAYS];
-                let towards = RayGradients { colours: &ones, backgrounds: &ones, regularisers: Regularisers::default() };
-                let mut network = NetworkGradients { transposed: &self.transposed, lanes: &mut self.lanes };
-                self.chunk.backward(field, towards, Roulette::default(), &mut network, &mut self.into);
+                let towards = RayGradients {
+                    colours: &ones,
+                    backgrounds: &ones,
+                    regularisers: Regularisers::default(),
+                };
+                let mut network =
+                    NetworkGradients { transposed: &self.transposed, lanes: &mut self.lanes };
+                self.chunk.backward(
+                    field,
+                    towards,
+                    Roulette::default(),
+                    &mut network,
+                    &mut self.into,
+                );
             }
         }
         samples
@@ -54,11 +72,18 @@ impl Passes {
     pub fn scatter(&mut self, field: &Field, table: &mut [f32]) {
         for (level, gradients) in field.levels.iter().zip(&self.into.levels) {
             let touched = &mut self.touched[..level.blocks()];
-            crate::grid::scatter(level, &mut table[level.range()], touched, &self.into.positions, gradients);
+            crate::grid::scatter(
+                level,
+                &mut table[level.range()],
+                touched,
+                &self.into.positions,
+                gradients,
+            );
         }
     }
 
-    /// Gradient by the networks, layer after layer, each input by input, summed over all backward passes so far.
+    /// Gradient by the networks, layer after layer, each input by input, summed over all backward
+    /// passes so far.
     pub fn network_gradient(&mut self, field: &Field) -> Vec<f32> {
         let mut gradient = vec![0.0; field.network.len()];
         crate::mlp::drain_lanes(&mut self.lanes, &mut gradient);

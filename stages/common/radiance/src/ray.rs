@@ -14,7 +14,8 @@ pub struct Ray {
     pub background: [f32; 3],
 }
 
-/// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in cube sides.
+/// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in
+/// cube sides.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NormalizedRay {
     /// Where t is 0.
@@ -34,8 +35,8 @@ pub struct NormalizedRay {
 /// Maps the parameter t of a ray to its place in the unit cube and its distance in scene units.
 #[derive(Clone, Copy, Debug)]
 pub enum RayMap {
-    /// Position origin + t·direction, distance start + t·scale / (1 - t·perspective): a perspective map keeps lines straight and moves
-    /// along them as a Möbius map does; a box has `perspective` 0.
+    /// Position origin + t·direction, distance start + t·scale / (1 - t·perspective): a perspective
+    /// map keeps lines straight and moves along them as a Möbius map does; a box has `perspective` 0.
     Straight {
         /// Distance where t is 0.
         start: f32,
@@ -44,9 +45,9 @@ pub enum RayMap {
         /// How fast that itself grows.
         perspective: f32,
     },
-    /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's radius; from there it is
-    /// `radii`·sinh(4t) to the point, whose steps thereby grow as fast as the contraction shrinks them. The distance is
-    /// start + scale·sinh(4t).
+    /// Through the contraction: `origin` is the point nearest to the centre, in units of the ball's
+    /// radius; from there it is `radii`·sinh(4t) to the point, whose steps thereby grow as fast as
+    /// the contraction shrinks them. The distance is start + scale·sinh(4t).
     Contracted {
         /// Distance of the point nearest to the centre.
         start: f32,
@@ -66,7 +67,8 @@ impl Default for RayMap {
 /// Most that a contracted ray moves through the cube for each unit of t.
 pub(crate) const FASTEST: f32 = 2.0;
 
-/// sinh(4t). Near 0 it has the absolute error of a difference of two numbers near 1, which is that of a position.
+/// sinh(4t). Near 0 it has the absolute error of a difference of two numbers near 1, which is that
+/// of a position.
 #[inline(always)]
 fn sinh4(t: f32) -> f32 {
     let e = exp(4.0 * t);
@@ -78,10 +80,13 @@ impl NormalizedRay {
     #[inline(always)]
     pub fn position(&self, t: f32) -> [f32; 3] {
         match self.map {
-            RayMap::Straight { .. } => std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i])),
+            RayMap::Straight { .. } => {
+                std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i]))
+            }
             RayMap::Contracted { radii, .. } => {
                 let along = radii * sinh4(t);
-                let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
+                let u: [f32; 3] =
+                    std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
                 let length = u.iter().map(|x| x * x).sum::<f32>().sqrt();
                 let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
                 u.map(|x| (0.25 * factor).mul_add(x, 0.5))
@@ -93,7 +98,9 @@ impl NormalizedRay {
     #[inline(always)]
     pub fn distance(&self, t: f32) -> f32 {
         match self.map {
-            RayMap::Straight { start, scale, perspective } => t * scale / perspective.mul_add(-t, 1.0) + start,
+            RayMap::Straight { start, scale, perspective } => {
+                t * scale / perspective.mul_add(-t, 1.0) + start
+            }
             RayMap::Contracted { start, scale, .. } => scale.mul_add(sinh4(t), start),
         }
     }
@@ -104,20 +111,25 @@ impl NormalizedRay {
     }
 }
 
-/// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64, so that scenes of 1e-6 and 1e6
-/// units lose nothing.
+/// Clips a ray to what a field sees of the world, and to the range of distances. Computed in f64,
+/// so that scenes of 1e-6 and 1e6 units lose nothing.
 pub fn clip(bounds: &Bounds, ray: &Ray) -> NormalizedRay {
     // A NaN or a zero direction anywhere ends here.
-    if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite()) {
+    if ray.direction == [0.0; 3] || !ray.direction.iter().chain(&ray.origin).all(|x| x.is_finite())
+    {
         return NormalizedRay::miss(ray);
     }
-    let (origin, direction) = (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let (origin, direction) =
+        (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
     let clipped = match &bounds.space {
         Space::Box => through_box(bounds, origin, direction),
         Space::Ndc(frustum) => through_frustum(frustum, bounds.near, origin, direction),
         Space::Contraction => through_contraction(bounds, origin, direction),
     };
-    clipped.map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay { view: ray.direction, ..clipped })
+    clipped.map_or(NormalizedRay::miss(ray), |clipped| NormalizedRay {
+        view: ray.direction,
+        ..clipped
+    })
 }
 
 fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
@@ -125,15 +137,29 @@ fn through_box(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Option<Norma
     let origin = (origin - DVec3::from(bounds.min)) / side;
     let extent = (DVec3::from(bounds.max) - DVec3::from(bounds.min)) / side;
     // On the inner side of a face: offset + slope·t >= 0.
-    let faces = (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
+    let faces =
+        (0..3).flat_map(|i| [(origin[i], direction[i]), (extent[i] - origin[i], -direction[i])]);
     let (enter, leave) = clip_to(faces, [bounds.near / side, bounds.far / side])?;
     let map = RayMap::Straight { start: 0.0, scale: side as f32, perspective: 0.0 };
     let (origin, direction) = (origin.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(NormalizedRay { origin, direction, enter: enter as f32, leave: leave as f32, map, view: [0.0; 3] })
+    Some(NormalizedRay {
+        origin,
+        direction,
+        enter: enter as f32,
+        leave: leave as f32,
+        map,
+        view: [0.0; 3],
+    })
 }
 
-/// Between the frustum's planes, from a distance on; its far plane lies behind all that is known, so the range's far end says no more.
-fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3) -> Option<NormalizedRay> {
+/// Between the frustum's planes, from a distance on; its far plane lies behind all that is known,
+/// so the range's far end says no more.
+fn through_frustum(
+    frustum: &Frustum,
+    near: f64,
+    origin: DVec3,
+    direction: DVec3,
+) -> Option<NormalizedRay> {
     let (o, d) = (frustum.to_camera(origin), frustum.turn(direction));
     let depths = [(o.z - frustum.near, d.z), (frustum.far - o.z, -d.z)];
     let sides = (0..2).flat_map(|i| {
@@ -148,9 +174,14 @@ fn through_frustum(frustum: &Frustum, near: f64, origin: DVec3, direction: DVec3
     if !length.is_finite() || length <= 0.0 {
         return None;
     }
-    // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from the far end.
+    // x = distance - enter and t are a projective map of each other: t = c·x / (Z + x·dZ), c from
+    // the far end.
     let c = length * to.z / (leave - enter);
-    let map = RayMap::Straight { start: enter as f32, scale: (from.z / c) as f32, perspective: (d.z / c) as f32 };
+    let map = RayMap::Straight {
+        start: enter as f32,
+        scale: (from.z / c) as f32,
+        perspective: (d.z / c) as f32,
+    };
     let direction = (end - start) / length;
     let (origin, direction) = (start.as_vec3().to_array(), direction.as_vec3().to_array());
     Some(NormalizedRay { origin, direction, enter: 0.0, leave: length as f32, map, view: [0.0; 3] })
@@ -164,13 +195,28 @@ fn through_contraction(bounds: &Bounds, origin: DVec3, direction: DVec3) -> Opti
     let nearest = from + to_nearest * direction;
     let radii = nearest.length().max(1.0);
     let t = |distance: f64| 0.25 * ((distance / radius - to_nearest) / radii).asinh();
-    let map = RayMap::Contracted { start: (to_nearest * radius) as f32, scale: (radii * radius) as f32, radii: radii as f32 };
+    let map = RayMap::Contracted {
+        start: (to_nearest * radius) as f32,
+        scale: (radii * radius) as f32,
+        radii: radii as f32,
+    };
     let (origin, direction) = (nearest.as_vec3().to_array(), direction.as_vec3().to_array());
-    Some(NormalizedRay { origin, direction, enter: t(bounds.near) as f32, leave: t(bounds.far) as f32, map, view: [0.0; 3] })
+    Some(NormalizedRay {
+        origin,
+        direction,
+        enter: t(bounds.near) as f32,
+        leave: t(bounds.far) as f32,
+        map,
+        view: [0.0; 3],
+    })
 }
 
-/// The part of a range of x in which all of some functions offset + slope·x aren't negative; `None` where there is none.
-fn clip_to(functions: impl Iterator<Item = (f64, f64)>, [low, high]: [f64; 2]) -> Option<(f64, f64)> {
+/// The part of a range of x in which all of some functions offset + slope·x aren't negative; `None`
+/// where there is none.
+fn clip_to(
+    functions: impl Iterator<Item = (f64, f64)>,
+    [low, high]: [f64; 2],
+) -> Option<(f64, f64)> {
     let (mut low, mut high) = (low, high);
     for (offset, slope) in functions {
         if slope > 0.0 {
@@ -196,11 +242,18 @@ mod tests {
     fn rays_meet_the_box_or_not() {
         for scale in [1e-6, 1.0, 1e6f64] {
             let s = scale as f32;
-            let bounds = Bounds { min: [-scale; 3], max: [scale; 3], near: 0.0, far: 100.0 * scale, ..Default::default() };
+            let bounds = Bounds {
+                min: [-scale; 3],
+                max: [scale; 3],
+                near: 0.0,
+                far: 100.0 * scale,
+                ..Default::default()
+            };
             let hit = clip(&bounds, &ray([0., 0., 4. * s], [0., 0., -1.]));
             assert!((hit.enter - 1.5).abs() < 1e-5 && (hit.leave - 2.5).abs() < 1e-5, "{hit:?}");
             assert!((hit.distance(hit.enter) - 3.0 * s).abs() < 1e-5 * s);
-            // Starting inside, missing, parallel to a face inside and outside, behind, zero length, NaN.
+            // Starting inside, missing, parallel to a face inside and outside, behind, zero length,
+            // NaN.
             assert_eq!(clip(&bounds, &ray([0.; 3], [1., 0., 0.])).enter, 0.0);
             for (o, d) in [
                 ([0., 3., 4.], [0., 0., -1.]),
@@ -219,8 +272,8 @@ mod tests {
         DVec3::from(v).normalize()
     }
 
-    /// In every space the place at t is the mapped world point at the distance that t stands for, in the cube all the way, and t
-    /// grows with the distance.
+    /// In every space the place at t is the mapped world point at the distance that t stands for,
+    /// in the cube all the way, and t grows with the distance.
     #[test]
     fn places_and_distances_agree_in_every_space() {
         let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
@@ -228,8 +281,13 @@ mod tests {
             let centre = scale * DVec3::new(0.1, 0.2, 0.3);
             let row = |i: usize| [turned.x_axis[i], turned.y_axis[i], turned.z_axis[i], centre[i]];
             let pose = [row(0), row(1), row(2)];
-            let frustum =
-                Frustum { camera_to_world: pose, min: [-0.9, -0.6], max: [0.8, 0.7], near: 0.8 * scale, far: 50.0 * scale };
+            let frustum = Frustum {
+                camera_to_world: pose,
+                min: [-0.9, -0.6],
+                max: [0.8, 0.7],
+                near: 0.8 * scale,
+                far: 50.0 * scale,
+            };
             let (near, far) = (0.1 * scale, 90.0 * scale);
             let bounds = |space| Bounds { min: [-scale; 3], max: [scale; 3], near, far, space };
             let contract = |p: DVec3| {
@@ -242,9 +300,11 @@ mod tests {
                 let mut rng = counter_rng::CounterRng::new(5, 0, k);
                 let mut draw = || f64::from(rng.uniform()) - 0.5;
                 let from = centre + scale * DVec3::new(draw(), draw(), draw());
-                let direction = (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
+                let direction =
+                    (-turned.z_axis + 0.8 * DVec3::new(draw(), draw(), draw())).normalize();
                 let ray = ray(from.as_vec3().to_array(), direction.as_vec3().to_array());
-                for (i, space) in [Space::Ndc(frustum), Space::Contraction].into_iter().enumerate() {
+                for (i, space) in [Space::Ndc(frustum), Space::Contraction].into_iter().enumerate()
+                {
                     let seen = clip(&bounds(space), &ray);
                     if seen.enter >= seen.leave {
                         continue;
@@ -271,10 +331,17 @@ mod tests {
         }
     }
 
-    /// Steps of a contracted ray are never longer than twice those of t, however it passes: what leaping relies on.
+    /// Steps of a contracted ray are never longer than twice those of t, however it passes: what
+    /// leaping relies on.
     #[test]
     fn contracted_rays_move_at_most_twice_as_fast_as_t() {
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e4, space: Space::Contraction };
+        let bounds = Bounds {
+            min: [-1.0; 3],
+            max: [1.0; 3],
+            near: 0.0,
+            far: 1e4,
+            space: Space::Contraction,
+        };
         for k in 0..300 {
             let mut rng = counter_rng::CounterRng::new(6, 0, k);
             let mut draw = || 2.0 * rng.uniform() - 1.0;

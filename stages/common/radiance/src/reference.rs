@@ -12,7 +12,9 @@ use crate::occupancy::{Cell, March, Marched, Strides, march};
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
-use crate::spec::{BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS};
+use crate::spec::{
+    BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
+};
 use crate::spherical::spherical_harmonics;
 
 /// Parameters in f64.
@@ -24,7 +26,8 @@ struct Judge<'a> {
 
 impl Judge<'_> {
     fn interpolate(&self, level: &Level, p: [f64; 3]) -> [f64; FEATURES] {
-        let at: [f64; 3] = std::array::from_fn(|i| p[i].clamp(0.0, 1.0) * f64::from(level.resolution[i]));
+        let at: [f64; 3] =
+            std::array::from_fn(|i| p[i].clamp(0.0, 1.0) * f64::from(level.resolution[i]));
         let cell: [u32; 3] = std::array::from_fn(|i| (at[i] as u32).min(level.resolution[i] - 1));
         let mut sum = [0.0; FEATURES];
         for corner in 0..8u32 {
@@ -39,7 +42,8 @@ impl Judge<'_> {
             let [across, down, _] = level.resolution.map(|n| n / 2 + 1);
             let [x, y, z] = v.map(|n| n / 2);
             let brick = if level.hashed {
-                (x ^ y.wrapping_mul(HASH_FACTORS[0]) ^ z.wrapping_mul(HASH_FACTORS[1])) as usize % (level.entries / BRICK)
+                (x ^ y.wrapping_mul(HASH_FACTORS[0]) ^ z.wrapping_mul(HASH_FACTORS[1])) as usize
+                    % (level.entries / BRICK)
             } else {
                 (x + across * (y + down * z)) as usize
             };
@@ -63,7 +67,8 @@ impl Judge<'_> {
 
     /// Outputs of the density network.
     fn density(&self, p: [f64; 3]) -> Vec<f64> {
-        let features: Vec<f64> = self.field.levels.iter().flat_map(|l| self.interpolate(l, p)).collect();
+        let features: Vec<f64> =
+            self.field.levels.iter().flat_map(|l| self.interpolate(l, p)).collect();
         let [first, second] = self.field.layers.density;
         self.layer(second, &self.layer(first, &features, true), false)
     }
@@ -71,14 +76,15 @@ impl Judge<'_> {
     /// What is added to the raw colours of a ray's samples, by their composited outputs.
     fn added(&self, composited: &[f64], direction: [f32; 3]) -> Vec<f64> {
         let features = composited[VIEW_FEATURE..].iter().copied();
-        let input: Vec<f64> = features.chain(spherical_harmonics(direction).map(f64::from)).collect();
+        let input: Vec<f64> =
+            features.chain(spherical_harmonics(direction).map(f64::from)).collect();
         assert_eq!((composited.len(), input.len()), (DENSITY_OUTPUTS, VIEW_INPUTS));
         let [first, second, third] = self.field.layers.view;
         self.layer(third, &self.layer(second, &self.layer(first, &input, true), true), false)
     }
 
-    /// Weight and colour of a ray's samples that count, and the light that comes through. Without those that don't count, it is what the fused
-    /// pass sees.
+    /// Weight and colour of a ray's samples that count, and the light that comes through. Without
+    /// those that don't count, it is what the fused pass sees.
     fn shaded(&self, ray: &Ray, samples: &[Sample]) -> (Vec<(f64, [f64; 3])>, f64) {
         let step = f64::from(self.field.step());
         let (mut depth, mut counted) = (0.0f64, Vec::new());
@@ -94,8 +100,13 @@ impl Judge<'_> {
             depth += tau;
         }
         let added = self.added(&composited, ray.direction);
-        let colour = |outputs: &[f64]| [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()));
-        (counted.iter().map(|(weight, outputs)| (*weight, colour(outputs))).collect(), (-depth).exp())
+        let colour = |outputs: &[f64]| {
+            [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()))
+        };
+        (
+            counted.iter().map(|(weight, outputs)| (*weight, colour(outputs))).collect(),
+            (-depth).exp(),
+        )
     }
 
     /// Colour of a ray over its background.
@@ -117,10 +128,21 @@ struct Sample {
 }
 
 /// All samples of each ray, marched at once.
-fn samples(field: &Field, rays: &[NormalizedRay], offsets: &[f32], strides: Strides) -> Vec<Vec<Sample>> {
+fn samples(
+    field: &Field,
+    rays: &[NormalizedRay],
+    offsets: &[f32],
+    strides: Strides,
+) -> Vec<Vec<Sample>> {
     let rays_alone = rays.iter().zip(offsets).map(|(&ray, &offset)| {
         let mut marched = Marched::default();
-        let one = March { occupancy: &field.occupancy, rays: &[ray], offsets: &[offset], step: field.step(), strides };
+        let one = March {
+            occupancy: &field.occupancy,
+            rays: &[ray],
+            offsets: &[offset],
+            step: field.step(),
+            strides,
+        };
         march(&one, 9999, &[0], &mut [0], &mut marched);
         let samples = marched.positions.into_iter().zip(marched.lengths);
         samples.map(|(position, length)| Sample { position, length, counts: true }).collect()
@@ -139,20 +161,43 @@ fn fused_gradients(
     field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
     let mut lanes = vec![0.0; field.network.len() * LANES];
     let mut features = FeatureGradients::default();
-    chunk.backward(field, towards, roulette, &mut NetworkGradients { transposed: &transposed, lanes: &mut lanes }, &mut features);
+    chunk.backward(
+        field,
+        towards,
+        roulette,
+        &mut NetworkGradients { transposed: &transposed, lanes: &mut lanes },
+        &mut features,
+    );
     let mut network = vec![0.0; field.network.len()];
     drain_lanes(&mut lanes, &mut network);
     let mut grid = vec![0.0f32; field.grid.len()];
     for (level, gradients) in field.levels.iter().zip(&features.levels) {
-        scatter(level, &mut grid[level.range()], &mut vec![0; level.blocks()], &features.positions, gradients);
+        scatter(
+            level,
+            &mut grid[level.range()],
+            &mut vec![0; level.blocks()],
+            &features.positions,
+            gradients,
+        );
     }
     (grid, network, features.positions.len())
 }
 
 fn example() -> (Field, Vec<Ray>) {
-    let architecture = Architecture { levels: 5, coarsest: 4, finest: 48, finest_z: 20, log2_entries: 9, hidden: 16, steps: 24 };
-    let mut field =
-        Field::new(architecture, Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() }, 3);
+    let architecture = Architecture {
+        levels: 5,
+        coarsest: 4,
+        finest: 48,
+        finest_z: 20,
+        log2_entries: 9,
+        hidden: 16,
+        steps: 24,
+    };
+    let mut field = Field::new(
+        architecture,
+        Bounds { min: [-1.0; 3], max: [1.0, 1.2, 1.0], near: 0.5, far: 9.0, ..Default::default() },
+        3,
+    );
     let mut rng = CounterRng::new(8, 8, 8);
     // Features of the size that training reaches, and density high enough that every sample counts.
     field.grid.iter_mut().for_each(|g| *g = rng.uniform() - 0.5);
@@ -180,8 +225,14 @@ fn fused_passes_equal_the_plain_ones() {
     for (all, kept) in samples.iter_mut().zip(chunk.kept_positions()) {
         all.iter_mut().for_each(|sample| sample.counts = kept.contains(&sample.position));
     }
-    let of_length = |length: f32| samples.iter().flatten().filter(|s| s.length == length && s.counts).count();
-    assert!(of_length(1.0) > 100 && of_length(2.0) > 20, "{} and {}", of_length(1.0), of_length(2.0));
+    let of_length =
+        |length: f32| samples.iter().flatten().filter(|s| s.length == length && s.counts).count();
+    assert!(
+        of_length(1.0) > 100 && of_length(2.0) > 20,
+        "{} and {}",
+        of_length(1.0),
+        of_length(2.0)
+    );
     let wide = |v: &[f32]| v.iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
     let mut judge = Judge { field: &field, grid: wide(&field.grid), network: wide(&field.network) };
     // Each ray's background is like one of its samples.
@@ -192,13 +243,15 @@ fn fused_passes_equal_the_plain_ones() {
         }
     }
 
-    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater loss, where neither likeness
-    // to the background nor what comes through to it is learnt from.
+    // The loss is Σ g·C with random g, so that its gradient by the colours is g; and the floater
+    // loss, where neither likeness to the background nor what comes through to it is learnt from.
     let regularisers = Regularisers { floater_loss: 0.3, ..Regularisers::default() };
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
             let (shaded, through) = judge.shaded(&rays[i], &samples[i]);
-            let like = |colour: &[f64; 3]| f64::from(likeness(colour.map(|c| c as f32), rays[i].background));
+            let like = |colour: &[f64; 3]| {
+                f64::from(likeness(colour.map(|c| c as f32), rays[i].background))
+            };
             shaded.iter().map(|(_, colour)| through * like(colour)).collect()
         })
         .collect();
@@ -210,7 +263,11 @@ fn fused_passes_equal_the_plain_ones() {
     let loss = |judge: &Judge<'_>| -> f64 {
         let dot = |i: usize| -> f64 {
             let (shaded, _) = judge.shaded(&rays[i], &samples[i]);
-            let floaters: f64 = shaded.iter().zip(&likenesses[i]).map(|((weight, _), likeness)| weight * likeness).sum();
+            let floaters: f64 = shaded
+                .iter()
+                .zip(&likenesses[i])
+                .map(|((weight, _), likeness)| weight * likeness)
+                .sum();
             let colour = judge.ray(&rays[i], &samples[i]);
             colour.iter().zip(&g[i]).map(|(c, g)| c * f64::from(*g)).sum::<f64>()
                 + f64::from(regularisers.floater_loss) * floaters
@@ -242,7 +299,9 @@ fn fused_passes_equal_the_plain_ones() {
     for (which, gradients) in [(0, &grid), (1, &network)] {
         let (mut error, mut norm, mut checked) = (0.0, 0.0, 0);
         let stride = gradients.iter().filter(|g| **g != 0.0).count() / 150 + 1;
-        for (i, &gradient) in gradients.iter().enumerate().filter(|(_, g)| **g != 0.0).step_by(stride) {
+        for (i, &gradient) in
+            gradients.iter().enumerate().filter(|(_, g)| **g != 0.0).step_by(stride)
+        {
             let exact = difference(which, i);
             error += (f64::from(gradient) - exact).powi(2);
             norm += exact.powi(2);
@@ -257,38 +316,49 @@ fn fused_passes_equal_the_plain_ones() {
     }
 }
 
-/// Samples with short gradients are drawn, and the mean over evenly spaced draws is the gradient of all of them.
+/// Samples with short gradients are drawn, and the mean over evenly spaced draws is the gradient of
+/// all of them.
 #[test]
 fn roulette_keeps_the_expected_gradient() {
     let (field, rays) = example();
     let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
     let mut rng = CounterRng::new(2, 1, 1);
-    let colours: Vec<[f32; 3]> = rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
+    let colours: Vec<[f32; 3]> =
+        rays.iter().map(|_| [0, 1, 2].map(|_| rng.uniform() - 0.5)).collect();
     let backgrounds = [[0.5; 3]; 20];
-    let towards = RayGradients { colours: &colours, backgrounds: &backgrounds, regularisers: Regularisers::default() };
+    let towards = RayGradients {
+        colours: &colours,
+        backgrounds: &backgrounds,
+        regularisers: Regularisers::default(),
+    };
     let gradients = |roulette: Roulette| {
         let mut chunk = Chunk::default();
         chunk.forward(&field, &clipped, &[0.5; 20], Strides::ByCell);
         fused_gradients(&field, &mut chunk, towards, roulette)
     };
     let (all_grid, all_network, all) = gradients(Roulette::default());
-    let all_gradients: Vec<f64> = all_grid.iter().chain(&all_network).map(|&g| f64::from(g)).collect();
+    let all_gradients: Vec<f64> =
+        all_grid.iter().chain(&all_network).map(|&g| f64::from(g)).collect();
     const DRAWS: usize = 400;
     let (mut mean, mut kept) = (vec![0.0f64; all_gradients.len()], 0);
     for draw in 0..DRAWS {
         let draw = (draw as f32 + 0.5) / DRAWS as f32;
         let (grid, network, chosen) = gradients(Roulette { limit: 1.0, draw });
         kept += chosen;
-        mean.iter_mut().zip(grid.iter().chain(&network)).for_each(|(sum, &g)| *sum += f64::from(g) / DRAWS as f64);
+        mean.iter_mut()
+            .zip(grid.iter().chain(&network))
+            .for_each(|(sum, &g)| *sum += f64::from(g) / DRAWS as f64);
     }
     let norm = |of: &mut dyn Iterator<Item = f64>| of.map(|x| x * x).sum::<f64>().sqrt();
-    let error = norm(&mut mean.iter().zip(&all_gradients).map(|(a, b)| a - b)) / norm(&mut all_gradients.iter().copied());
+    let error = norm(&mut mean.iter().zip(&all_gradients).map(|(a, b)| a - b))
+        / norm(&mut all_gradients.iter().copied());
     let share = kept as f64 / (DRAWS * all) as f64;
     println!("{share} of {all} samples are kept; the mean gradient is off by {error}");
     assert!((0.1..0.8).contains(&share) && error < 0.01, "{share} {error}");
 }
 
-/// Rays that end where it is dark see what the whole rays would, but for the share of light that was left.
+/// Rays that end where it is dark see what the whole rays would, but for the share of light that
+/// was left.
 #[test]
 fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     let (mut field, rays) = example();
@@ -321,9 +391,14 @@ fn every_family_renders_and_trains_to_equal_bits() {
         let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
         let mut chunk = Chunk::default();
         chunk.forward(&field, &clipped, &[0.25; 20], Strides::ByCell);
-        let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
+        let mut bits: Vec<u32> =
+            chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
         let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
-        let towards = RayGradients { colours: &[[0.3, -0.2, 0.1]; 20], backgrounds: &[[0.5; 3]; 20], regularisers };
+        let towards = RayGradients {
+            colours: &[[0.3, -0.2, 0.1]; 20],
+            backgrounds: &[[0.5; 3]; 20],
+            regularisers,
+        };
         let roulette = Roulette { limit: 1.0, draw: 0.7 };
         let (grid, network, _) = fused_gradients(&field, &mut chunk, towards, roulette);
         bits.extend(grid.iter().chain(&network).map(|x| x.to_bits()));
@@ -352,19 +427,42 @@ fn extremes_stay_finite() {
             };
             let mut field = Field::new(
                 architecture,
-                Bounds { min: [-scale; 3], max: [scale; 3], near: 0.1 * scale, far: 20.0 * scale, ..Default::default() },
+                Bounds {
+                    min: [-scale; 3],
+                    max: [scale; 3],
+                    near: 0.1 * scale,
+                    far: 20.0 * scale,
+                    ..Default::default()
+                },
                 3,
             );
             field.grid.fill(1.0);
             field.network.fill(raw / 1e3);
             let s = scale as f32;
-            let directions = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [0.0; 3], [f32::NAN, 0.0, 1.0], [0.577, 0.577, 0.577]];
+            let directions = [
+                [0.0, 0.0, -1.0],
+                [0.0, 1.0, 0.0],
+                [0.0; 3],
+                [f32::NAN, 0.0, 1.0],
+                [0.577, 0.577, 0.577],
+            ];
             let rays: Vec<Ray> = directions
                 .iter()
-                .map(|&direction| Ray { origin: [0.0, 0.0, 4.0 * s], direction, background: [1.0; 3] })
+                .map(|&direction| Ray {
+                    origin: [0.0, 0.0, 4.0 * s],
+                    direction,
+                    background: [1.0; 3],
+                })
                 .collect();
             for (pixel, ray) in field.render(&rays).iter().zip(&rays) {
-                let numbers = [pixel.colour[0], pixel.colour[1], pixel.colour[2], pixel.opacity, pixel.depth, pixel.median_depth];
+                let numbers = [
+                    pixel.colour[0],
+                    pixel.colour[1],
+                    pixel.colour[2],
+                    pixel.opacity,
+                    pixel.depth,
+                    pixel.median_depth,
+                ];
                 assert!(numbers.iter().all(|x| x.is_finite()), "{raw} {scale} {ray:?}: {pixel:?}");
                 assert!((0.0..=1.0).contains(&pixel.opacity));
                 if pixel.opacity == 0.0 {

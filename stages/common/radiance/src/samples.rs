@@ -22,7 +22,8 @@ pub(crate) struct RaySum {
     pub(crate) median: Option<f32>,
 }
 
-/// Samples of each ray in the first rounds and in all later ones: few while a surface may stop the ray, then more.
+/// Samples of each ray in the first rounds and in all later ones: few while a surface may stop the
+/// ray, then more.
 const ROUNDS: [usize; 4] = [8, 8, 16, 32];
 
 /// Samples that were marched together. Their rows have a length of `n`, whole vectors.
@@ -67,9 +68,11 @@ impl DensityRows {
             return;
         }
         let [first, second] = field.layers.density;
-        for (buffer, rows) in
-            [(&mut self.features, first.inputs), (&mut self.hidden, first.outputs), (&mut self.outputs, second.outputs)]
-        {
+        for (buffer, rows) in [
+            (&mut self.features, first.inputs),
+            (&mut self.hidden, first.outputs),
+            (&mut self.outputs, second.outputs),
+        ] {
             fit(buffer, round.range(rows).end);
         }
         let features = &mut self.features[round.range(first.inputs)];
@@ -77,13 +80,35 @@ impl DensityRows {
             encode(level, &field.grid[level.range()], &self.positions[..3 * n], rows, n);
         }
         let hidden = &mut self.hidden[round.range(first.outputs)];
-        multiply(&field.network[first.range()], features, hidden, first.inputs, first.outputs, n, After::Relu);
+        multiply(
+            &field.network[first.range()],
+            features,
+            hidden,
+            first.inputs,
+            first.outputs,
+            n,
+            After::Relu,
+        );
         let outputs = &mut self.outputs[round.range(second.outputs)];
-        multiply(&field.network[second.range()], hidden, outputs, second.inputs, second.outputs, n, After::Linear);
+        multiply(
+            &field.network[second.range()],
+            hidden,
+            outputs,
+            second.inputs,
+            second.outputs,
+            n,
+            After::Linear,
+        );
     }
 
     /// Density of `n` positions (three rows): for the occupancy.
-    pub(crate) fn densities(&mut self, field: &Field, positions: &[f32], n: usize, densities: &mut [f32]) {
+    pub(crate) fn densities(
+        &mut self,
+        field: &Field,
+        positions: &[f32],
+        n: usize,
+        densities: &mut [f32],
+    ) {
         fit(&mut self.positions, 3 * n).copy_from_slice(positions);
         self.run(field, Round { start: 0, n, first: 0 });
         optical_depths(&self.outputs[..n], 1.0, densities);
@@ -112,7 +137,13 @@ pub(crate) struct Samples {
 
 impl Samples {
     /// Marches rays to their ends, and lists in `counted` the samples that count.
-    pub(crate) fn march(&mut self, field: &Field, rays: &March<'_>, counted: &mut Counted, sums: &mut [RaySum]) {
+    pub(crate) fn march(
+        &mut self,
+        field: &Field,
+        rays: &March<'_>,
+        counted: &mut Counted,
+        sums: &mut [RaySum],
+    ) {
         self.rounds.clear();
         self.marched.t.clear();
         self.marched.lengths.clear();
@@ -137,7 +168,13 @@ impl Samples {
     }
 
     /// Takes every active ray some samples further, and drops those that end.
-    fn round(&mut self, field: &Field, rays: &March<'_>, counted: &mut Counted, sums: &mut [RaySum]) {
+    fn round(
+        &mut self,
+        field: &Field,
+        rays: &March<'_>,
+        counted: &mut Counted,
+        sums: &mut [RaySum],
+    ) {
         let most = ROUNDS[self.rounds.len().min(ROUNDS.len() - 1)];
         let start = self.marched.t.len();
         self.marched.starts.clear();
@@ -163,7 +200,9 @@ impl Samples {
         let tau = &mut self.tau[whole.clone()];
         if n > 0 {
             optical_depths(&self.rows.outputs[DENSITY_OUTPUTS * start..][..n], rays.step, tau);
-            tau.iter_mut().zip(&self.marched.lengths[start..]).for_each(|(tau, length)| *tau *= length);
+            tau.iter_mut()
+                .zip(&self.marched.lengths[start..])
+                .for_each(|(tau, length)| *tau *= length);
         }
         let before = &mut self.before[whole.clone()];
         for (&r, range) in self.active.iter().zip(self.marched.starts.windows(2)) {
@@ -209,7 +248,8 @@ pub(crate) struct Counted {
     ray_starts: Vec<usize>,
     /// Rays that have any.
     pub(crate) rays: Vec<u32>,
-    /// Outputs of the density network, sample by sample; instead of the raw density its slope: dτ/d(raw).
+    /// Outputs of the density network, sample by sample; instead of the raw density its slope:
+    /// dτ/d(raw).
     pub(crate) outputs: Vec<[f32; DENSITY_OUTPUTS]>,
 }
 
@@ -235,7 +275,10 @@ impl Counted {
             self.ray_starts[r + 1] += self.ray_starts[r];
         }
         self.rays.clear();
-        self.rays.extend((0..rays as u32).filter(|&r| self.ray_starts[r as usize] < self.ray_starts[r as usize + 1]));
+        self.rays.extend(
+            (0..rays as u32)
+                .filter(|&r| self.ray_starts[r as usize] < self.ray_starts[r as usize + 1]),
+        );
         self.along.clear();
         self.along.resize(self.sample.len(), 0);
         // Filled from each ray's start, which thereby becomes its end: the next ray's start.
@@ -249,10 +292,12 @@ impl Counted {
 
         self.outputs.clear();
         for (round, range) in rounds_of(&samples.rounds, self.sample.len()) {
-            let rows = &samples.rows.outputs[DENSITY_OUTPUTS * round.start..][..DENSITY_OUTPUTS * round.n];
+            let rows =
+                &samples.rows.outputs[DENSITY_OUTPUTS * round.start..][..DENSITY_OUTPUTS * round.n];
             for &i in &self.sample[range] {
                 let column = i as usize - round.start;
-                let mut outputs: [f32; DENSITY_OUTPUTS] = std::array::from_fn(|o| rows[o * round.n + column]);
+                let mut outputs: [f32; DENSITY_OUTPUTS] =
+                    std::array::from_fn(|o| rows[o * round.n + column]);
                 outputs[0] = samples.slope(i as usize, outputs[0]);
                 self.outputs.push(outputs);
             }
@@ -261,13 +306,24 @@ impl Counted {
 }
 
 /// Each round and the places of its samples in a list of so many.
-pub(crate) fn rounds_of(rounds: &[Round], count: usize) -> impl Iterator<Item = (&Round, std::ops::Range<usize>)> {
+pub(crate) fn rounds_of(
+    rounds: &[Round],
+    count: usize,
+) -> impl Iterator<Item = (&Round, std::ops::Range<usize>)> {
     let ends = rounds.iter().skip(1).map(|r| r.first).chain([count]);
     rounds.iter().zip(ends).map(|(round, end)| (round, round.first..end))
 }
 
-/// Copies the columns of a list of samples out of the rounds, whose `rows` rows lie in `from`, to rows of stride `m`; what pads the result is 0.
-pub(crate) fn gather(rounds: &[Round], list: &[u32], from: &[f32], rows: usize, to: &mut [f32], m: usize) {
+/// Copies the columns of a list of samples out of the rounds, whose `rows` rows lie in `from`, to
+/// rows of stride `m`; what pads the result is 0.
+pub(crate) fn gather(
+    rounds: &[Round],
+    list: &[u32],
+    from: &[f32],
+    rows: usize,
+    to: &mut [f32],
+    m: usize,
+) {
     for (round, range) in rounds_of(rounds, list.len()) {
         for (row, target) in to.chunks_exact_mut(m.max(1)).enumerate() {
             let source = &from[rows * round.start + row * round.n..][..round.n];

@@ -1,5 +1,6 @@
-//! Deferred shading (Hedman et al. 2021, "Baking neural radiance fields", SNeRG): view features are composited along a ray, one small
-//! network makes of them and the direction what is added to the raw colours of all the ray's samples. So colours cost a network a ray.
+//! Deferred shading (Hedman et al. 2021, "Baking neural radiance fields", SNeRG): view features are
+//! composited along a ray, one small network makes of them and the direction what is added to the
+//! raw colours of all the ray's samples. So colours cost a network a ray.
 
 use crate::composite::{Regularisers, add_distortion_gradients, likeness, optical_depth_gradients};
 use crate::field::{Field, Layers};
@@ -43,7 +44,8 @@ pub(crate) struct RayGradients<'a> {
     pub(crate) regularisers: Regularisers,
 }
 
-/// The networks' weights output by output, and where their gradients are added: 16 partial sums a weight.
+/// The networks' weights output by output, and where their gradients are added: 16 partial sums a
+/// weight.
 pub(crate) struct NetworkGradients<'a> {
     pub(crate) transposed: &'a [f32],
     pub(crate) lanes: &'a mut [f32],
@@ -51,11 +53,27 @@ pub(crate) struct NetworkGradients<'a> {
 
 impl NetworkGradients<'_> {
     /// Goes back through a layer from `dy`, whose input was `x`, to `dx`: rows of n.
-    pub(crate) fn back(&mut self, layer: Layer, x: &[f32], after: After<'_>, n: usize, dy: &[f32], dx: &mut [f32]) {
+    pub(crate) fn back(
+        &mut self,
+        layer: Layer,
+        x: &[f32],
+        after: After<'_>,
+        n: usize,
+        dy: &[f32],
+        dx: &mut [f32],
+    ) {
         let dy = &dy[..layer.outputs * n];
         let lanes = &mut self.lanes[layer.offset * LANES..layer.range().end * LANES];
         add_outer(x, dy, lanes, layer.inputs, layer.outputs, n);
-        multiply(&self.transposed[layer.range()], dy, &mut dx[..layer.inputs * n], layer.outputs, layer.inputs, n, after);
+        multiply(
+            &self.transposed[layer.range()],
+            dy,
+            &mut dx[..layer.inputs * n],
+            layer.outputs,
+            layer.inputs,
+            n,
+            after,
+        );
     }
 }
 
@@ -68,8 +86,10 @@ kernel! {
 }
 
 kernel! {
-    /// Composites view features into the view network's `input`, a column a ray, and adds weights and distances to the rays' sums.
-    fn composite<L>(samples: &Samples, counted: &Counted, rays: &[NormalizedRay], sums: &mut [RaySum], input: &mut [f32], n: usize) {
+    /// Composites view features into the view network's `input`, a column a ray, and adds weights
+    /// and distances to the rays' sums.
+    fn composite<L>(samples: &Samples, counted: &Counted, rays: &[NormalizedRay],
+        sums: &mut [RaySum], input: &mut [f32], n: usize) {
         for (column, &r) in counted.rays.iter().enumerate() {
             let (ray, sum) = (&rays[r as usize], &mut sums[r as usize]);
             let mut outputs = [0.0f32; DENSITY_OUTPUTS];
@@ -91,7 +111,8 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each ray's part to its samples' raw colours: `colour` has three rows of m, `added` three of n.
+    /// Adds each ray's part to its samples' raw colours: `colour` has three rows of m, `added`
+    /// three of n.
     fn raw_colours<L>(counted: &Counted, added: &[f32], n: usize, colour: &mut [f32], m: usize) {
         for (column, &r) in counted.rays.iter().enumerate() {
             let added = [0, 1, 2].map(|c| added[c * n + column]);
@@ -107,7 +128,8 @@ kernel! {
 
 kernel! {
     /// Adds the samples' colours to their rays'.
-    fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], m: usize, sums: &mut [RaySum]) {
+    fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], m: usize,
+        sums: &mut [RaySum]) {
         for &r in &counted.rays {
             let sum = &mut sums[r as usize].colour;
             for &k in counted.of_ray(r) {
@@ -123,7 +145,8 @@ kernel! {
 kernel! {
     /// Gradient by what was added to each ray's raw colours: `gradient` has three rows of n.
     fn gradients_by_added<L>(
-        samples: &Samples, counted: &Counted, colour: &[f32], m: usize, colours: &[[f32; 3]], gradient: &mut [f32], n: usize,
+        samples: &Samples, counted: &Counted, colour: &[f32], m: usize, colours: &[[f32; 3]],
+        gradient: &mut [f32], n: usize,
     ) {
         for (column, &r) in counted.rays.iter().enumerate() {
             let g = colours[r as usize];
@@ -157,16 +180,18 @@ pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32
 }
 
 kernel! {
-    /// Gradients of one ray's samples by the density network's outputs, but for that by the raw density; `along` gets transmittances,
-    /// weights, places and the gradient by each weight.
+    /// Gradients of one ray's samples by the density network's outputs, but for that by the raw
+    /// density; `along` gets transmittances, weights, places and the gradient by each weight.
     fn gradients_along<L>(
         samples: &Samples, counted: &Counted, places: &[u32], colour: &[f32], m: usize, g: [f32; 3],
-        composited: &[f32; DENSITY_OUTPUTS], along: &mut AlongRay, gradients: &mut [[f32; DENSITY_OUTPUTS]],
+        composited: &[f32; DENSITY_OUTPUTS], along: &mut AlongRay,
+        gradients: &mut [[f32; DENSITY_OUTPUTS]],
     ) {
         for (j, &k) in places.iter().enumerate() {
             let (k, i) = (k as usize, counted.sample[k as usize] as usize);
             let w = samples.weight[i];
-            (along.transmittance[j], along.weight[j], along.t[j]) = (samples.transmittance[i], w, samples.marched.t[i]);
+            (along.transmittance[j], along.weight[j], along.t[j]) = (samples.transmittance[i], w,
+                samples.marched.t[i]);
             let mut by_weight = dot(composited, &counted.outputs[k]);
             let gradient = &mut gradients[k];
             *gradient = composited.map(|c| w * c);
@@ -182,7 +207,13 @@ kernel! {
 
 impl AlongRay {
     fn fit(&mut self, longest: usize) {
-        for buffer in [&mut self.transmittance, &mut self.weight, &mut self.t, &mut self.by_weight, &mut self.by_depth] {
+        for buffer in [
+            &mut self.transmittance,
+            &mut self.weight,
+            &mut self.t,
+            &mut self.by_weight,
+            &mut self.by_depth,
+        ] {
             fit(buffer, longest);
         }
     }
@@ -206,18 +237,44 @@ impl Shading {
         composite(samples, counted, rays, sums, input, n);
         let Layers { view: [first, second, third], .. } = field.layers;
         let [hidden1, hidden2] = &mut self.hidden;
-        let (hidden1, hidden2) = (fit(hidden1, first.outputs * n), fit(hidden2, second.outputs * n));
-        multiply(&field.network[first.range()], input, hidden1, first.inputs, first.outputs, n, After::Relu);
-        multiply(&field.network[second.range()], hidden1, hidden2, second.inputs, second.outputs, n, After::Relu);
+        let (hidden1, hidden2) =
+            (fit(hidden1, first.outputs * n), fit(hidden2, second.outputs * n));
+        multiply(
+            &field.network[first.range()],
+            input,
+            hidden1,
+            first.inputs,
+            first.outputs,
+            n,
+            After::Relu,
+        );
+        multiply(
+            &field.network[second.range()],
+            hidden1,
+            hidden2,
+            second.inputs,
+            second.outputs,
+            n,
+            After::Relu,
+        );
         let added = fit(&mut self.added, third.outputs * n);
-        multiply(&field.network[third.range()], hidden2, added, third.inputs, third.outputs, n, After::Linear);
+        multiply(
+            &field.network[third.range()],
+            hidden2,
+            added,
+            third.inputs,
+            third.outputs,
+            n,
+            After::Linear,
+        );
         let colour = fit(&mut self.colour, 3 * m);
         raw_colours(counted, added, n, colour, m);
         sigmoids(colour);
         sum_colours(samples, counted, colour, m, sums);
     }
 
-    /// Goes back from rays to the density network's outputs of every sample that counts, and adds the view network's gradients.
+    /// Goes back from rays to the density network's outputs of every sample that counts, and adds
+    /// the view network's gradients.
     pub(crate) fn backward(
         &mut self,
         field: &Field,
@@ -260,12 +317,25 @@ impl Shading {
                     *by_weight = floater.mul_add(likeness(colour, background), *by_weight);
                 }
             }
-            let (t, weight, by_weight) = (&along.t[..len], &along.weight[..len], &mut along.by_weight[..len]);
+            let (t, weight, by_weight) =
+                (&along.t[..len], &along.weight[..len], &mut along.by_weight[..len]);
             if towards.regularisers.distortion > 0.0 {
-                add_distortion_gradients(t, weight, field.step(), towards.regularisers.distortion, by_weight);
+                add_distortion_gradients(
+                    t,
+                    weight,
+                    field.step(),
+                    towards.regularisers.distortion,
+                    by_weight,
+                );
             }
             let behind = transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>();
-            optical_depth_gradients(by_weight, &along.transmittance[..len], weight, behind, &mut along.by_depth[..len]);
+            optical_depth_gradients(
+                by_weight,
+                &along.transmittance[..len],
+                weight,
+                behind,
+                &mut along.by_depth[..len],
+            );
             for (&k, &by_depth) in places.iter().zip(&along.by_depth) {
                 gradients[k as usize][0] = by_depth * counted.outputs[k as usize][0];
             }

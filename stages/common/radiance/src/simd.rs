@@ -1,6 +1,7 @@
 //! Sixteen logical lanes on any machine, and the choice of machine code at run time.
 //!
-//! Every family does the same operations on the same lanes in the same order, so all give equal bits; a test compares them.
+//! Every family does the same operations on the same lanes in the same order, so all give equal
+//! bits; a test compares them.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -29,7 +30,10 @@ impl Family {
             2 => Self::Avx2,
             3 => Self::Portable,
             _ => {
-                let best = [Self::Avx512, Self::Avx2].into_iter().find(|f| f.is_supported()).unwrap_or(Self::Portable);
+                let best = [Self::Avx512, Self::Avx2]
+                    .into_iter()
+                    .find(|f| f.is_supported())
+                    .unwrap_or(Self::Portable);
                 set_family(best);
                 best
             }
@@ -57,7 +61,8 @@ impl Family {
     }
 }
 
-/// Uses a family from now on, in the whole process: for tests and benchmarks. One that the machine lacks is ignored.
+/// Uses a family from now on, in the whole process: for tests and benchmarks. One that the machine
+/// lacks is ignored.
 pub fn set_family(family: Family) {
     if family.is_supported() {
         let code = match family {
@@ -153,8 +158,9 @@ impl Lanes for Portable {
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86 {
-    //! `unsafe` here pays with a known vector width: left to the optimiser, the accumulators of a matrix tile spill.
-    //! All of it is sound because these types are only used inside functions compiled for their features (see `kernel!`).
+    //! `unsafe` here pays with a known vector width: left to the optimiser, the accumulators of a
+    //! matrix tile spill. All of it is sound because these types are only used inside functions
+    //! compiled for their features (see `kernel!`).
 
     use std::arch::x86_64::*;
 
@@ -225,7 +231,12 @@ pub(crate) mod x86 {
         #[inline(always)]
         fn where_positive(self, gate: Self) -> Self {
             // SAFETY: the caller runs with AVX-512.
-            Self(unsafe { _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(gate.0, _mm512_setzero_ps()), self.0) })
+            Self(unsafe {
+                _mm512_maskz_mov_ps(
+                    _mm512_cmp_ps_mask::<_CMP_GT_OQ>(gate.0, _mm512_setzero_ps()),
+                    self.0,
+                )
+            })
         }
     }
 
@@ -273,12 +284,18 @@ pub(crate) mod x86 {
         #[inline(always)]
         fn where_positive(self, gate: Self) -> Self {
             // SAFETY: the caller runs with AVX2.
-            Self([0, 1].map(|i| unsafe { _mm256_and_ps(self.0[i], _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[i], _mm256_setzero_ps())) }))
+            Self([0, 1].map(|i| unsafe {
+                _mm256_and_ps(
+                    self.0[i],
+                    _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[i], _mm256_setzero_ps()),
+                )
+            }))
         }
     }
 }
 
-/// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family and chosen at run time.
+/// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family and chosen at run
+/// time.
 macro_rules! kernel {
     ($(#[$meta:meta])* $vis:vis fn $name:ident<$lanes:ident>($($arg:ident: $ty:ty),* $(,)?) $body:block) => {
         $(#[$meta])*

@@ -7,13 +7,15 @@ pub const BRICK: usize = 8;
 /// Factors of a brick's y and z coordinates in its hash (Müller et al. 2022, eq. 4); x has 1.
 pub const HASH_FACTORS: [u32; 2] = [2_654_435_761, 805_459_861];
 
-/// Outputs of the density network: raw density, the colour's raw red, green and blue, and the view features.
+/// Outputs of the density network: raw density, the colour's raw red, green and blue, and the view
+/// features.
 pub const DENSITY_OUTPUTS: usize = 16;
 /// First raw colour and first view feature among those outputs.
 pub const RAW_COLOUR: usize = 1;
 /// See [`RAW_COLOUR`].
 pub const VIEW_FEATURE: usize = 4;
-/// View features: composited along a ray, they are what the view network gets besides the direction.
+/// View features: composited along a ray, they are what the view network gets besides the
+/// direction.
 pub const VIEW_FEATURES: usize = DENSITY_OUTPUTS - VIEW_FEATURE;
 /// Spherical harmonics of a direction, up to degree 2.
 pub const BASIS: usize = 9;
@@ -29,7 +31,8 @@ pub const DARK: f32 = 9.210_34;
 
 /// Cells of the occupancy along each axis of the unit cube.
 pub const OCCUPANCY_CELLS: usize = 128;
-/// Optical depth of a step below which a cell is thin: in training, rays take a sample of double length at every other step.
+/// Optical depth of a step below which a cell is thin: in training, rays take a sample of double
+/// length at every other step.
 pub const THIN: f32 = 0.05;
 /// Optical depth of a step below which a cell is empty, once the mean is above it.
 pub const EMPTY: f32 = 0.01;

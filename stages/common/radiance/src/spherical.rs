@@ -29,7 +29,9 @@ mod tests {
                 let z = (2.0 * (f64::from(a) + 0.5) / f64::from(n)) - 1.0;
                 let phi = std::f64::consts::TAU * (f64::from(b) + 0.5) / f64::from(n);
                 let r = (1.0 - z * z).sqrt();
-                let y = spherical_harmonics([(r * phi.cos()) as f32, (r * phi.sin()) as f32, z as f32]).map(f64::from);
+                let y =
+                    spherical_harmonics([(r * phi.cos()) as f32, (r * phi.sin()) as f32, z as f32])
+                        .map(f64::from);
                 for i in 0..BASIS {
                     for j in 0..BASIS {
                         gram[i][j] += y[i] * y[j] * 4.0 * std::f64::consts::PI / f64::from(n * n);

@@ -1,5 +1,6 @@
-/// How far a training has come, whichever field it trains, and how it takes numbers that aren't finite: the first time it goes on without
-/// that step, at half the rate; when it happens again within a hundred steps, it gives up.
+/// How far a training has come, whichever field it trains, and how it takes numbers that aren't
+/// finite: the first time it goes on without that step, at half the rate; when it happens again
+/// within a hundred steps, it gives up.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tally {
     /// Steps taken.
@@ -50,7 +51,13 @@ impl Tally {
 
     /// For a checkpoint.
     pub fn counters(&self) -> [u64; 5] {
-        [self.steps, self.bundles, self.rays, self.rate_scale.to_bits(), self.last_fault.unwrap_or(u64::MAX)]
+        [
+            self.steps,
+            self.bundles,
+            self.rays,
+            self.rate_scale.to_bits(),
+            self.last_fault.unwrap_or(u64::MAX),
+        ]
     }
 
     /// From a checkpoint.

@@ -18,19 +18,26 @@ use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 use crate::tally::Tally;
 
-/// Where a trainer's rays come from and how their colours are judged. Rays come in bundles that are judged together: the s×s
-/// sub-pixel rays of an LR pixel are a pixel bundle.
+/// Where a trainer's rays come from and how their colours are judged. Rays come in bundles that are
+/// judged together: the s×s sub-pixel rays of an LR pixel are a pixel bundle.
 pub trait Supervisor: Sync {
-    /// Is told before every step which share of the training's rays is done, from which alone its bundles may change.
+    /// Is told before every step which share of the training's rays is done, from which alone its
+    /// bundles may change.
     fn set_progress(&mut self, _done: f64) {}
     /// Rays in a bundle of this step.
     fn rays_per_bundle(&self) -> usize;
-    /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training: draw from it alone.
+    /// Casts the rays of a bundle. `bundle` counts from 0 over the whole training: draw from it
+    /// alone.
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]);
     /// The bundle's loss, given its rays' colours; writes the loss's gradient by each colour.
-    fn loss_and_gradient(&self, bundle: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64;
-    /// Is given each bundle's colours again after a step that went well, in the order of the bundles: for a supervision that keeps
-    /// what was rendered.
+    fn loss_and_gradient(
+        &self,
+        bundle: u64,
+        colours: &[[f32; 3]],
+        gradients: &mut [[f32; 3]],
+    ) -> f64;
+    /// Is given each bundle's colours again after a step that went well, in the order of the
+    /// bundles: for a supervision that keeps what was rendered.
     fn remember(&mut self, _bundle: u64, _colours: &[[f32; 3]]) {}
 }
 
@@ -41,7 +48,8 @@ pub struct TrainingOptions {
     pub rays: u64,
     /// Most rays in a step.
     pub max_rays_per_step: usize,
-    /// Samples that a step aims at; while space is full of semi-transparent density, steps have fewer rays.
+    /// Samples that a step aims at; while space is full of semi-transparent density, steps have
+    /// fewer rays.
     pub samples_per_step: usize,
     /// Learning rate of the grid's coarsest level at its highest.
     pub learning_rate: f64,
@@ -53,16 +61,20 @@ pub struct TrainingOptions {
     pub learning_rate_decay: f64,
     /// Steps of linear warm-up.
     pub warm_up: u64,
-    /// Share that the weights' exponential moving average keeps at each of its steps; 0 for no average.
+    /// Share that the weights' exponential moving average keeps at each of its steps; 0 for no
+    /// average.
     pub ema_decay: f32,
-    /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision gives.
+    /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision
+    /// gives.
     pub distortion: f32,
-    /// Weight of the floater loss, the mean over all rays: opacity that has the background's colour.
+    /// Weight of the floater loss, the mean over all rays: opacity that has the background's
+    /// colour.
     pub floater_loss: f32,
     /// Weight decay of the networks.
     pub network_decay: f32,
-    /// Samples whose gradient is shorter than so many times the mean of those around go back to the grid at random, as often as their share
-    /// of it says and lengthened by as much (Russian roulette): the expected gradient stays. 0 takes all back.
+    /// Samples whose gradient is shorter than so many times the mean of those around go back to the
+    /// grid at random, as often as their share of it says and lengthened by as much (Russian
+    /// roulette): the expected gradient stays. 0 takes all back.
     pub roulette: f32,
     /// Seed of everything that is drawn.
     pub seed: u64,
@@ -75,7 +87,8 @@ impl TrainingOptions {
         wanted.clamp(256, self.max_rays_per_step.max(256))
     }
 
-    /// What learning rates are multiplied with in a step: they rise at first, and fall exponentially.
+    /// What learning rates are multiplied with in a step: they rise at first, and fall
+    /// exponentially.
     pub fn schedule(&self, tally: &Tally) -> f64 {
         let warm = ((tally.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
         tally.rate_scale * warm * self.learning_rate_decay.powf(tally.done(self.rays))
@@ -98,7 +111,9 @@ impl TrainingOptions {
 
     /// Whether weights go into their average now.
     pub fn averages(&self, tally: &Tally) -> bool {
-        self.ema_decay > 0.0 && tally.done(self.rays) > AVERAGE_FROM && tally.steps.is_multiple_of(AVERAGE_EVERY)
+        self.ema_decay > 0.0
+            && tally.done(self.rays) > AVERAGE_FROM
+            && tally.steps.is_multiple_of(AVERAGE_EVERY)
     }
 }
 
@@ -119,7 +134,9 @@ pub struct StepReport {
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
     /// Numbers went wrong twice within a hundred steps.
-    #[error("step {step}: {tensor} is not finite, for the second time within 100 steps; lower the rate")]
+    #[error(
+        "step {step}: {tensor} is not finite, for the second time within 100 steps; lower the rate"
+    )]
     NotFinite {
         /// The step.
         step: u64,
@@ -185,7 +202,10 @@ struct Worker {
 impl Trainer {
     /// Starts from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
-        let zeros = || Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] };
+        let zeros = || Moments {
+            grid: vec![0.0; field.grid.len()],
+            network: vec![0.0; field.network.len()],
+        };
         Self {
             first: zeros(),
             second: zeros(),
@@ -228,11 +248,16 @@ impl Trainer {
     }
 
     /// Takes a step; `None` once all rays are spent.
-    pub fn step(&mut self, supervision: &mut impl Supervisor) -> Result<Option<StepReport>, TrainingError> {
+    pub fn step(
+        &mut self,
+        supervision: &mut impl Supervisor,
+    ) -> Result<Option<StepReport>, TrainingError> {
         supervision.set_progress(self.tally.done(self.options.rays));
         let bundle = supervision.rays_per_bundle();
         let wanted = self.options.rays_of_step(self.samples_per_ray);
-        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else { return Ok(None) };
+        let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else {
+            return Ok(None);
+        };
         self.update_occupancy();
         for layer in self.field.layers.all() {
             layer.transpose(&self.field.network, &mut self.transposed);
@@ -274,7 +299,9 @@ impl Trainer {
             self.apply();
             self.average();
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
-            (first_bundle..).zip(colours).for_each(|(bundle, colours)| supervision.remember(bundle, colours));
+            (first_bundle..)
+                .zip(colours)
+                .for_each(|(bundle, colours)| supervision.remember(bundle, colours));
         }
         self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped: fault.is_some() }))
@@ -287,7 +314,11 @@ impl Trainer {
             Some("the loss")
         } else if !finite(self.gradients.network.iter().sum()) {
             Some("the networks' gradient")
-        } else if !self.shards.par_iter().all(|s| s.features.levels.iter().flatten().flatten().all(|g| g.is_finite())) {
+        } else if !self
+            .shards
+            .par_iter()
+            .all(|s| s.features.levels.iter().flatten().flatten().all(|g| g.is_finite()))
+        {
             Some("the grid's gradient")
         } else {
             None
@@ -297,7 +328,8 @@ impl Trainer {
     fn apply(&mut self) {
         let options = &self.options;
         let (schedule, step) = (options.schedule(&self.tally), self.tally.steps + 1);
-        let network_step = AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
+        let network_step =
+            AdamStep::new(step, options.mlp_learning_rate * schedule, options.network_decay);
         // All of a network is touched, always.
         self.touched_network.fill(1);
         adam(
@@ -311,8 +343,12 @@ impl Trainer {
 
         let shards = &self.shards;
         let mut work = Vec::with_capacity(self.field.levels.len());
-        let mut grids =
-            (&mut self.field.grid[..], &mut self.gradients.grid[..], &mut self.first.grid[..], &mut self.second.grid[..]);
+        let mut grids = (
+            &mut self.field.grid[..],
+            &mut self.gradients.grid[..],
+            &mut self.first.grid[..],
+            &mut self.second.grid[..],
+        );
         for ((i, level), touched) in self.field.levels.iter().enumerate().zip(&mut self.touched) {
             let len = level.range().len();
             let (w, rest_w) = grids.0.split_at_mut(len);
@@ -334,17 +370,25 @@ impl Trainer {
         });
     }
 
-    /// Late in the training, takes the weights into their average (Polyak): what is left of the steps' noise evens out.
+    /// Late in the training, takes the weights into their average (Polyak): what is left of the
+    /// steps' noise evens out.
     fn average(&mut self) {
         if !self.options.averages(&self.tally) {
             return;
         }
         let field = &self.field;
-        let average = self.average.get_or_insert_with(|| Moments { grid: field.grid.clone(), network: field.network.clone() });
+        let average = self.average.get_or_insert_with(|| Moments {
+            grid: field.grid.clone(),
+            network: field.network.clone(),
+        });
         let new = 1.0 - self.options.ema_decay;
         let pairs = [(&mut average.grid, &field.grid), (&mut average.network, &field.network)];
         for (average, now) in pairs {
-            average.par_iter_mut().with_min_len(1 << 16).zip(now).for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
+            average
+                .par_iter_mut()
+                .with_min_len(1 << 16)
+                .zip(now)
+                .for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
         }
     }
 
@@ -371,14 +415,16 @@ impl Trainer {
         self.field.occupancy.update(&cells, &found, step);
     }
 
-    /// Writes all that a resumed training needs to end in the same bytes. The caller makes it atomic.
+    /// Writes all that a resumed training needs to end in the same bytes. The caller makes it
+    /// atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
         let counters = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
         let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
         let occupied = self.field.occupancy.to_bytes();
         let average = self.average.iter();
-        let average =
-            average.flat_map(|a| [("average.grid", Tensor::F32(&a.grid)), ("average.network", Tensor::F32(&a.network))]);
+        let average = average.flat_map(|a| {
+            [("average.grid", Tensor::F32(&a.grid)), ("average.network", Tensor::F32(&a.network))]
+        });
         let tensors: Vec<_> = average
             .chain([
                 ("counters", Tensor::U8(&counters)),
@@ -405,8 +451,10 @@ impl Trainer {
         read_counters(path, |tensors, counters| {
             let field = &mut self.field;
             let averaged = tensors.names().contains(&"average.grid");
-            self.average =
-                averaged.then(|| Moments { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] });
+            self.average = averaged.then(|| Moments {
+                grid: vec![0.0; field.grid.len()],
+                network: vec![0.0; field.network.len()],
+            });
             if let Some(average) = &mut self.average {
                 read_f32(tensors, "average.grid", &mut average.grid)?;
                 read_f32(tensors, "average.network", &mut average.network)?;
@@ -433,8 +481,12 @@ impl Trainer {
 }
 
 /// Opens a checkpoint and reads its six counters.
-fn read_counters<T>(path: &Path, then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>) -> Result<T, FieldError> {
-    let bytes = std::fs::read(path).map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+fn read_counters<T>(
+    path: &Path,
+    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>,
+) -> Result<T, FieldError> {
+    let bytes = std::fs::read(path)
+        .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
     let read = || {
         let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
         let counters = read_u8(&tensors, "counters", 48)?;
@@ -462,7 +514,12 @@ struct StepWork<'a, S> {
 
 impl Shard {
     /// Takes a range of the step's bundles forward and back.
-    fn run(&mut self, worker: &mut Worker, work: &StepWork<'_, impl Supervisor>, range: std::ops::Range<usize>) {
+    fn run(
+        &mut self,
+        worker: &mut Worker,
+        work: &StepWork<'_, impl Supervisor>,
+        range: std::ops::Range<usize>,
+    ) {
         self.colours.clear();
         self.features.clear();
         self.network.resize(work.field.network.len(), 0.0);
@@ -480,7 +537,12 @@ impl Shard {
     }
 
     /// Takes a few bundles forward and back.
-    fn run_chunk(&mut self, worker: &mut Worker, work: &StepWork<'_, impl Supervisor>, here: std::ops::Range<usize>) {
+    fn run_chunk(
+        &mut self,
+        worker: &mut Worker,
+        work: &StepWork<'_, impl Supervisor>,
+        here: std::ops::Range<usize>,
+    ) {
         let StepWork { field, supervision, options, .. } = *work;
         let bundle = supervision.rays_per_bundle();
         let rays = here.len() * bundle;
@@ -500,10 +562,14 @@ impl Shard {
         worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, Strides::ByCell);
         self.samples += worker.chunk.samples();
-        for (colour, (sum, background)) in worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds)) {
-            *colour = std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
+        for (colour, (sum, background)) in
+            worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds))
+        {
+            *colour =
+                std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
         }
-        let judged = worker.colours.chunks_exact(bundle).zip(worker.gradients.chunks_exact_mut(bundle));
+        let judged =
+            worker.colours.chunks_exact(bundle).zip(worker.gradients.chunks_exact_mut(bundle));
         for (number, (colours, gradients)) in numbers.zip(judged) {
             self.loss += supervision.loss_and_gradient(number, colours, gradients);
         }
@@ -511,10 +577,24 @@ impl Shard {
         let scale = 1.0 / work.bundles as f32;
         worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
         let of_ray = |weight: f32| weight * scale / bundle as f32;
-        let regularisers = Regularisers { distortion: of_ray(options.distortion), floater_loss: of_ray(options.floater_loss) };
-        let towards = RayGradients { colours: &worker.gradients, backgrounds: &worker.backgrounds, regularisers };
-        let mut network = NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };
-        worker.chunk.backward(field, towards, options.roulette(first_ray), &mut network, &mut self.features);
+        let regularisers = Regularisers {
+            distortion: of_ray(options.distortion),
+            floater_loss: of_ray(options.floater_loss),
+        };
+        let towards = RayGradients {
+            colours: &worker.gradients,
+            backgrounds: &worker.backgrounds,
+            regularisers,
+        };
+        let mut network =
+            NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };
+        worker.chunk.backward(
+            field,
+            towards,
+            options.roulette(first_ray),
+            &mut network,
+            &mut self.features,
+        );
     }
 }
 
@@ -538,21 +618,38 @@ mod tests {
         fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
             let mut rng = CounterRng::new(1, 2, bundle);
             let [x, y] = [0, 1].map(|_| 1.6 * rng.uniform() - 0.8);
-            rays[0] = Ray { origin: [x, y, 4.0], direction: [0.0, 0.0, -1.0], background: [self.background; 3] };
+            rays[0] = Ray {
+                origin: [x, y, 4.0],
+                direction: [0.0, 0.0, -1.0],
+                background: [self.background; 3],
+            };
         }
 
-        fn loss_and_gradient(&self, _: u64, colours: &[[f32; 3]], gradients: &mut [[f32; 3]]) -> f64 {
+        fn loss_and_gradient(
+            &self,
+            _: u64,
+            colours: &[[f32; 3]],
+            gradients: &mut [[f32; 3]],
+        ) -> f64 {
             gradients[0] = colours[0].map(|c| 2.0 * (c - 1.0));
             colours[0].iter().map(|c| f64::from((c - 1.0) * (c - 1.0))).sum()
         }
     }
 
-    /// A white floater before white is as good as nothing to the images, and stays; by the floater loss it goes.
+    /// A white floater before white is as good as nothing to the images, and stays; by the floater
+    /// loss it goes.
     #[test]
     fn what_passes_for_the_background_goes() {
-        let architecture =
-            Architecture { finest: 32, levels: 4, log2_entries: 10, hidden: 16, steps: 64, ..Architecture::default() };
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
+        let architecture = Architecture {
+            finest: 32,
+            levels: 4,
+            log2_entries: 10,
+            hidden: 16,
+            steps: 64,
+            ..Architecture::default()
+        };
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
         let trained = |field: Field, background: f32, floater_loss: f32, steps: u64| {
             let options = TrainingOptions {
                 rays: steps * 256,
@@ -573,14 +670,20 @@ mod tests {
             let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
             while trainer.step(&mut white).unwrap().is_some() {}
             let mut rays = [Ray::default(); 64];
-            (0..).zip(&mut rays).for_each(|(bundle, ray)| white.sample_rays(bundle, std::slice::from_mut(ray)));
+            (0..)
+                .zip(&mut rays)
+                .for_each(|(bundle, ray)| white.sample_rays(bundle, std::slice::from_mut(ray)));
             let field = trainer.finish();
             let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
             (field, opacity)
         };
         let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0, 40);
-        let ((_, without), (_, with)) = (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));
-        println!("opacity {opacity} before black, then before white {without}, with the floater loss {with}");
+        let ((_, without), (_, with)) =
+            (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));
+        println!(
+            "opacity {opacity} before black, then before white {without}, with the floater loss \
+            {with}"
+        );
         assert!(opacity > 0.5 && without > 0.5 * opacity && with < 0.1 * without);
     }
 }

@@ -1,8 +1,8 @@
 use pixels::Image;
 use tch::{TchError, Tensor};
 
-/// Pixels along each side of a fold: the network sees 2×2 pixels as one of four times as many channels, which widens what it sees
-/// around a pixel at the same cost.
+/// Pixels along each side of a fold: the network sees 2×2 pixels as one of four times as many
+/// channels, which widens what it sees around a pixel at the same cost.
 pub(crate) const FOLD: usize = 2;
 
 /// Where a square of an image lies, in pixels; it may reach over the border, which goes on.
@@ -22,26 +22,36 @@ impl Square {
         Self { x, y, size: (self.size.0 + 2 * by, self.size.1 + 2 * by) }
     }
 
-    /// Goes through the square's pixels, column and row in it, in the order in which the network takes them: rows of folds, a fold's pixels
-    /// together.
+    /// Goes through the square's pixels, column and row in it, in the order in which the network
+    /// takes them: rows of folds, a fold's pixels together.
     pub(crate) fn fold(self, mut pixel: impl FnMut(usize, usize)) {
         for fold_y in 0..self.size.1 / FOLD {
             for fold_x in 0..self.size.0 / FOLD {
-                (0..FOLD * FOLD).for_each(|k| pixel(fold_x * FOLD + k % FOLD, fold_y * FOLD + k / FOLD));
+                (0..FOLD * FOLD)
+                    .for_each(|k| pixel(fold_x * FOLD + k % FOLD, fold_y * FOLD + k / FOLD));
             }
         }
     }
 
     /// An image's samples at a place in the square; beyond the border, those at the border.
     pub(crate) fn of(self, image: &Image, column: usize, row: usize) -> &[f32] {
-        let clamped = |start: isize, by: usize, size: usize| (start + by as isize).clamp(0, size as isize - 1) as usize;
-        let (column, row) = (clamped(self.x, column, image.width), clamped(self.y, row, image.height));
+        let clamped = |start: isize, by: usize, size: usize| {
+            (start + by as isize).clamp(0, size as isize - 1) as usize
+        };
+        let (column, row) =
+            (clamped(self.x, column, image.width), clamped(self.y, row, image.height));
         let at = row * image.width + column;
         &image.data[at * image.channels..(at + 1) * image.channels]
     }
 
-    /// Takes folded samples apart again: calls with column, row (in the square) and a pixel's samples.
-    pub(crate) fn unfold(self, samples: &[f32], channels: usize, mut pixel: impl FnMut(usize, usize, &[f32])) {
+    /// Takes folded samples apart again: calls with column, row (in the square) and a pixel's
+    /// samples.
+    pub(crate) fn unfold(
+        self,
+        samples: &[f32],
+        channels: usize,
+        mut pixel: impl FnMut(usize, usize, &[f32]),
+    ) {
         let across = self.size.0 / FOLD;
         for (i, sample) in samples.chunks_exact(channels).enumerate() {
             let (fold, k) = (i / (FOLD * FOLD), i % (FOLD * FOLD));
@@ -49,10 +59,11 @@ impl Square {
         }
     }
 
-    /// Folded samples of squares of this size as a tensor (squares × channels × rows × columns), channels last in memory, as
-    /// convolutions like it.
+    /// Folded samples of squares of this size as a tensor (squares × channels × rows × columns),
+    /// channels last in memory, as convolutions like it.
     pub(crate) fn tensor(self, samples: &[f32], channels: usize) -> Result<Tensor, TchError> {
-        let (width, height, depth) = (self.size.0 / FOLD, self.size.1 / FOLD, channels * FOLD * FOLD);
+        let (width, height, depth) =
+            (self.size.0 / FOLD, self.size.1 / FOLD, channels * FOLD * FOLD);
         let count = samples.len() / (width * height * depth);
         let shape = [count, height, width, depth].map(|d| d as i64);
         Tensor::f_from_slice(samples)?.f_reshape(shape)?.f_permute([0, 3, 1, 2])

@@ -47,7 +47,8 @@ pub enum Network {
 
 /// Name of the file that describes a refiner.
 pub const REFINER_FILE: &str = "refiner.json";
-/// Name of the file with its weights: safetensors; ours has kernels as outputs × rows × columns × inputs.
+/// Name of the file with its weights: safetensors; ours has kernels as outputs × rows × columns ×
+/// inputs.
 pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 
 /// `refiner.json`: what a folder with a refiner says of it.
@@ -56,13 +57,15 @@ pub const WEIGHTS_FILE: &str = "refiner.safetensors";
 pub struct RefinerFile {
     /// The network.
     pub network: Network,
-    /// Share of what it predicts that is added: what was best for the views that training left out, from 0 to 1.
+    /// Share of what it predicts that is added: what was best for the views that training left out,
+    /// from 0 to 1.
     pub strength: f64,
     /// Mean PSNR of those views as they were rendered, in dB.
     pub rendered_psnr: f64,
     /// Mean PSNR of those views refined, in dB.
     pub refined_psnr: f64,
-    /// Confidence in references, as a share of what they saw of those views, where the network knows references.
+    /// Confidence in references, as a share of what they saw of those views, where the network
+    /// knows references.
     #[serde(default)]
     pub trusted: Option<f64>,
     /// Whether the network takes views that are consistent with LR photographs of their own.
@@ -70,8 +73,9 @@ pub struct RefinerFile {
     pub agreeing: bool,
 }
 
-/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two (Lim et al. 2017), one out. It pads
-/// nothing: borders are gone on with before it, and what it predicts depends on nothing but what it sees.
+/// A network of 3×3 convolutions on folds of 2×2 pixels: one in, `blocks` residual blocks of two
+/// (Lim et al. 2017), one out. It pads nothing: borders are gone on with before it, and what it
+/// predicts depends on nothing but what it sees.
 #[derive(Debug)]
 pub struct Refiner {
     architecture: RefinerArchitecture,
@@ -85,7 +89,8 @@ pub(crate) const INPUTS: usize = 4;
 pub(crate) const REFERENCE_INPUTS: usize = 11;
 /// Channels of an image.
 pub(crate) const OUTPUTS: usize = 3;
-/// Pixels along a tile's side: with what a network sees around it small enough for the cache, large enough that little is seen twice.
+/// Pixels along a tile's side: with what a network sees around it small enough for the cache, large
+/// enough that little is seen twice.
 const TILE: usize = 128;
 /// Most channels, and most blocks, of a network that is read.
 const MOST: u32 = 4096;
@@ -99,11 +104,18 @@ impl Refiner {
         let layers = layers(architecture);
         let mut parameters = Vec::with_capacity(2 * layers.len());
         for (i, (_, inputs, outputs)) in layers.iter().enumerate() {
-            // As PyTorch draws them: blocks that begin by adding little. The last layer, and with it the prediction, starts at 0.
-            let reach = if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
-            let kernel: Vec<f32> =
-                (0..outputs * 9 * inputs).map(|_| (reach * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32).collect();
-            parameters.push(Tensor::f_from_slice(&kernel)?.f_reshape(kernel_shape(*inputs, *outputs))?.set_requires_grad(true));
+            // As PyTorch draws them: blocks that begin by adding little. The last layer, and with
+            // it the prediction, starts at 0.
+            let reach =
+                if i + 1 == layers.len() { 0.0 } else { (1.0 / (9 * inputs) as f64).sqrt() };
+            let kernel: Vec<f32> = (0..outputs * 9 * inputs)
+                .map(|_| (reach * (2.0 * f64::from(rng.uniform()) - 1.0)) as f32)
+                .collect();
+            parameters.push(
+                Tensor::f_from_slice(&kernel)?
+                    .f_reshape(kernel_shape(*inputs, *outputs))?
+                    .set_requires_grad(true),
+            );
             parameters.push(Tensor::f_from_slice(&vec![0.0f32; *outputs])?.set_requires_grad(true));
         }
         Ok(Self { architecture, parameters })
@@ -117,7 +129,8 @@ impl Refiner {
             return Err(RefinementError::Architecture { channels, blocks });
         }
         let weights = nets::Weights::read(path)?;
-        let tensors = shapes(architecture).into_iter().map(|(name, shape)| weights.tensor(&name, &shape));
+        let tensors =
+            shapes(architecture).into_iter().map(|(name, shape)| weights.tensor(&name, &shape));
         Ok(Self { architecture, parameters: tensors.collect::<Result<_, _>>()? })
     }
 
@@ -160,18 +173,25 @@ impl Refiner {
         let mut x = layer(input, 0)?;
         for block in 0..self.architecture.blocks as usize {
             let inner = layer(&x, 1 + 2 * block)?.f_relu()?;
-            let [_, _, height, width] = x.size()[..] else { unreachable!("a convolution's output has four dimensions") };
+            let [_, _, height, width] = x.size()[..] else {
+                unreachable!("a convolution's output has four dimensions")
+            };
             let middle = x.f_narrow(2, 2, height - 4)?.f_narrow(3, 2, width - 4)?;
             x = middle.f_add(&layer(&inner, 2 + 2 * block)?)?;
         }
         layer(&x, 1 + 2 * self.architecture.blocks as usize)
     }
 
-    /// The view with `strength` times what the network adds; a reference-based network takes it from
-    /// [`with_references`](crate::with_references). An image of three channels in
-    /// 0..1. The network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another way, and the mean of its answers is
-    /// added (Timofte et al. 2016).
-    pub fn refine_by(&self, view: &Image, strength: f32, turns: u32) -> Result<Image, RefinementError> {
+    /// The view with `strength` times what the network adds; a reference-based network takes it
+    /// from [`with_references`](crate::with_references). An image of three channels in 0..1. The
+    /// network is asked `turns` times, 1 to 8, each time with the view turned or mirrored another
+    /// way, and the mean of its answers is added (Timofte et al. 2016).
+    pub fn refine_by(
+        &self,
+        view: &Image,
+        strength: f32,
+        turns: u32,
+    ) -> Result<Image, RefinementError> {
         let inputs = self.architecture.inputs();
         if view.channels != inputs {
             return Err(RefinementError::Channels { channels: view.channels, expected: inputs });
@@ -186,19 +206,26 @@ impl Refiner {
         let refined: Vec<(Square, Vec<f32>)> = tiles
             .into_par_iter()
             .map(|(x, y, refiner)| -> Result<_, TchError> {
-                let side = |from: usize, size: usize| (size - from).min(TILE).next_multiple_of(FOLD);
-                let square = Square { x: x as isize, y: y as isize, size: (side(x, width), side(y, height)) };
+                let side =
+                    |from: usize, size: usize| (size - from).min(TILE).next_multiple_of(FOLD);
+                let square = Square {
+                    x: x as isize,
+                    y: y as isize,
+                    size: (side(x, width), side(y, height)),
+                };
                 Ok((square, refiner.added(view, square, turns)?))
             })
             .collect::<Result<_, _>>()?;
         let mut data = vec![0.0; width * height * OUTPUTS];
         for (square, added) in &refined {
             for (i, added) in added.chunks_exact(OUTPUTS).enumerate() {
-                let (column, row) = (square.x as usize + i % square.size.0, square.y as usize + i / square.size.0);
+                let (column, row) =
+                    (square.x as usize + i % square.size.0, square.y as usize + i / square.size.0);
                 if column < width && row < height {
                     let at = row * width + column;
                     for c in 0..OUTPUTS {
-                        data[at * OUTPUTS + c] = (view.data[at * inputs + c] + strength * added[c]).clamp(0.0, 1.0);
+                        data[at * OUTPUTS + c] =
+                            (view.data[at * inputs + c] + strength * added[c]).clamp(0.0, 1.0);
                     }
                 }
             }
@@ -206,7 +233,8 @@ impl Refiner {
         Ok(Image::new(width, height, OUTPUTS, data))
     }
 
-    /// What the network adds to a square of a view, the mean over turns: row by row, channels interleaved.
+    /// What the network adds to a square of a view, the mean over turns: row by row, channels
+    /// interleaved.
     fn added(&self, view: &Image, square: Square, turns: &[Turn]) -> Result<Vec<f32>, TchError> {
         let around = square.grown(self.reach());
         let inputs = self.architecture.inputs();
@@ -239,8 +267,9 @@ impl Refiner {
 /// Name, inputs and outputs of each layer.
 fn layers(architecture: RefinerArchitecture) -> Vec<(String, usize, usize)> {
     let width = architecture.channels as usize;
-    let blocks = (0..architecture.blocks)
-        .flat_map(|i| [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]);
+    let blocks = (0..architecture.blocks).flat_map(|i| {
+        [(format!("block_{i}.first"), width, width), (format!("block_{i}.second"), width, width)]
+    });
     let first = ("first".to_owned(), architecture.inputs() * FOLD * FOLD, width);
     let last = ("last".to_owned(), width, OUTPUTS * FOLD * FOLD);
     std::iter::once(first).chain(blocks).chain([last]).collect()
@@ -253,7 +282,10 @@ fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
 /// Names and shapes of the parameters.
 fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
     let both = |(name, inputs, outputs): (String, usize, usize)| {
-        [(format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()), (format!("{name}.bias"), vec![outputs as i64])]
+        [
+            (format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()),
+            (format!("{name}.bias"), vec![outputs as i64]),
+        ]
     };
     layers(architecture).into_iter().flat_map(both).collect()
 }
@@ -264,7 +296,12 @@ mod tests {
 
     fn image(width: usize, height: usize) -> Image {
         let mut rng = CounterRng::new(1, 2, 3);
-        Image::new(width, height, INPUTS, (0..width * height * INPUTS).map(|_| rng.uniform()).collect())
+        Image::new(
+            width,
+            height,
+            INPUTS,
+            (0..width * height * INPUTS).map(|_| rng.uniform()).collect(),
+        )
     }
 
     /// A network whose every weight says something.
@@ -272,7 +309,8 @@ mod tests {
         let mut refiner = Refiner::new(architecture, 5).unwrap();
         let mut rng = CounterRng::new(5, 6, 7);
         for parameter in &mut refiner.parameters {
-            let values: Vec<f32> = (0..parameter.numel()).map(|_| 0.2 * (rng.uniform() - 0.5)).collect();
+            let values: Vec<f32> =
+                (0..parameter.numel()).map(|_| 0.2 * (rng.uniform() - 0.5)).collect();
             *parameter = Tensor::from_slice(&values).reshape(parameter.size());
         }
         refiner
@@ -286,34 +324,48 @@ mod tests {
         let refiner = random(architecture);
         for (width, height) in [(131, 257), (128, 128), (3, 1), (260, 5)] {
             let view = image(width, height);
-            let square = Square { x: 0, y: 0, size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)) };
+            let square = Square {
+                x: 0,
+                y: 0,
+                size: (width.next_multiple_of(FOLD), height.next_multiple_of(FOLD)),
+            };
             let around = square.grown(refiner.reach());
             let mut input = Vec::new();
             around.fold(|x, y| input.extend_from_slice(around.of(&view, x, y)));
-            let added = samples(&no_grad(|| refiner.forward(&around.tensor(&input, INPUTS).unwrap())).unwrap()).unwrap();
+            let added = samples(
+                &no_grad(|| refiner.forward(&around.tensor(&input, INPUTS).unwrap())).unwrap(),
+            )
+            .unwrap();
             let refined = refiner.refine(&view).unwrap();
             square.unfold(&added, OUTPUTS, |x, y, added| {
                 if x < width && y < height {
                     for c in 0..OUTPUTS {
-                        let whole = (view.data[(y * width + x) * INPUTS + c] + added[c]).clamp(0.0, 1.0);
+                        let whole =
+                            (view.data[(y * width + x) * INPUTS + c] + added[c]).clamp(0.0, 1.0);
                         let tiled = refined.data[(y * width + x) * OUTPUTS + c];
-                        assert!((whole - tiled).abs() < 1e-5, "{width}×{height} at {x}, {y}: {tiled} where {whole} is right");
+                        assert!(
+                            (whole - tiled).abs() < 1e-5,
+                            "{width}×{height} at {x}, {y}: {tiled} where {whole} is right"
+                        );
                     }
                 }
             });
         }
     }
 
-    /// Internal learning from little pushes features below 0 everywhere. What the network adds must still follow what it sees,
-    /// or it would never learn again.
+    /// Internal learning from little pushes features below 0 everywhere. What the network adds must
+    /// still follow what it sees, or it would never learn again.
     #[test]
     fn a_network_does_not_fall_silent() {
         nets::deterministic();
         let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
         let (dark, view) = (Image::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), image(16, 16));
-        let added = |view: &Image| refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap();
-        let apart = added(&dark).iter().zip(added(&view)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let added = |view: &Image| {
+            refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap()
+        };
+        let apart =
+            added(&dark).iter().zip(added(&view)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
         assert!(apart > 0.01, "{apart}");
     }
 
@@ -324,8 +376,10 @@ mod tests {
         let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let view = image(150, 10);
         let mirrored = |p: &Image| {
-            let data =
-                p.data.chunks_exact(p.width * p.channels).flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
+            let data = p
+                .data
+                .chunks_exact(p.width * p.channels)
+                .flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
             Image::new(p.width, p.height, p.channels, data.collect())
         };
         let apart = |turns: u32| {
@@ -341,20 +395,32 @@ mod tests {
     fn what_is_written_is_read_and_other_networks_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join(WEIGHTS_FILE);
-        let architecture = RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
+        let architecture =
+            RefinerArchitecture { channels: 6, blocks: 1, guidance: Some(Guidance::default()) };
         let refiner = random(architecture);
         refiner.write(&path).unwrap();
         let again = Refiner::read(&path, architecture).unwrap();
-        assert!(refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t));
-        for other in [RefinerArchitecture { channels: 7, ..architecture }, RefinerArchitecture { blocks: 2, ..architecture }] {
+        assert!(
+            refiner.named().iter().zip(again.named()).all(|((a, s), (b, t))| *a == b && *s == t)
+        );
+        for other in [
+            RefinerArchitecture { channels: 7, ..architecture },
+            RefinerArchitecture { blocks: 2, ..architecture },
+        ] {
             assert!(Refiner::read(&path, other).is_err());
         }
-        for other in
-            [RefinerArchitecture { channels: 0, ..architecture }, RefinerArchitecture { blocks: u32::MAX, ..architecture }]
-        {
-            assert!(Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours"));
+        for other in [
+            RefinerArchitecture { channels: 0, ..architecture },
+            RefinerArchitecture { blocks: u32::MAX, ..architecture },
+        ] {
+            assert!(
+                Refiner::read(&path, other).unwrap_err().to_string().contains("not one of ours")
+            );
         }
-        assert!(matches!(again.refine(&image(8, 8)), Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })));
+        assert!(matches!(
+            again.refine(&image(8, 8)),
+            Err(RefinementError::Channels { channels: 4, expected: REFERENCE_INPUTS })
+        ));
         let bytes = std::fs::read(&path).unwrap();
         for end in [0, 7, 100, bytes.len() - 1] {
             std::fs::write(&path, &bytes[..end]).unwrap();

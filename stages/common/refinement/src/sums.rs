@@ -1,4 +1,5 @@
-/// Pixels to each side over which what is shown is compared with what is rendered: in their mean the detail that rendering lacks evens out.
+/// Pixels to each side over which what is shown is compared with what is rendered: in their mean
+/// the detail that rendering lacks evens out.
 pub(crate) const AROUND: usize = 5;
 
 /// Sums of numbers that pixels have, over all that lies above and to the left of each.
@@ -18,7 +19,8 @@ impl<const N: usize> Sums<N> {
             let mut left = [0.0; N];
             for (x, pixel) in row.iter().enumerate() {
                 left.iter_mut().zip(pixel).for_each(|(sum, value)| *sum += value);
-                sums[(y + 1) * across + x + 1] = std::array::from_fn(|i| sums[y * across + x + 1][i] + left[i]);
+                sums[(y + 1) * across + x + 1] =
+                    std::array::from_fn(|i| sums[y * across + x + 1][i] + left[i]);
             }
         }
         Self { sums, width, height }
@@ -29,7 +31,9 @@ impl<const N: usize> Sums<N> {
         let (left, right) = (x.saturating_sub(AROUND), (x + AROUND + 1).min(self.width));
         let (top, bottom) = (y.saturating_sub(AROUND), (y + AROUND + 1).min(self.height));
         let at = |x: usize, y: usize, i: usize| self.sums[y * (self.width + 1) + x][i];
-        std::array::from_fn(|i| at(right, bottom, i) - at(left, bottom, i) - at(right, top, i) + at(left, top, i))
+        std::array::from_fn(|i| {
+            at(right, bottom, i) - at(left, bottom, i) - at(right, top, i) + at(left, top, i)
+        })
     }
 }
 
@@ -45,7 +49,8 @@ mod tests {
         for (x, y) in [(0, 0), (8, 6), (16, 12), (3, 12)] {
             let near = |a: usize, b: usize| a.abs_diff(b) <= AROUND;
             let pixels = (0..width * height).filter(|i| near(i % width, x) && near(i / width, y));
-            let expected = pixels.map(value).fold([0.0; 2], |sum, v| [sum[0] + v[0], sum[1] + v[1]]);
+            let expected =
+                pixels.map(value).fold([0.0; 2], |sum, v| [sum[0] + v[0], sum[1] + v[1]]);
             assert_eq!(sums.around(x, y), expected, "{x}, {y}");
         }
         assert!(Sums::<1>::new(0, &[]).sums.iter().all(|s| *s == [0.0]));

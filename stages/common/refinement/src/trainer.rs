@@ -18,7 +18,8 @@ pub trait Training {
     /// Steps taken.
     fn steps(&self) -> u64;
 
-    /// Takes a step on some of the examples, of which there is at least one; the error before it, `None` once all steps are taken.
+    /// Takes a step on some of the examples, of which there is at least one; the error before it,
+    /// `None` once all steps are taken.
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError>;
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
@@ -45,8 +46,9 @@ pub struct RefinerTraining {
     pub seed: u64,
 }
 
-/// Trains a [`Refiner`] by Adam on the squared error of squares of examples, each turned, mirrored and with its colours changed: what is
-/// learnt are edges, not the scene's own colours, and so it holds at another size, too. Its error is the mean squared one.
+/// Trains a [`Refiner`] by Adam on the squared error of squares of examples, each turned, mirrored
+/// and with its colours changed: what is learnt are edges, not the scene's own colours, and so it
+/// holds at another size, too. Its error is the mean squared one.
 pub struct RefinerTrainer {
     refiner: Refiner,
     options: RefinerTraining,
@@ -55,8 +57,8 @@ pub struct RefinerTrainer {
     pool: Option<Pool>,
 }
 
-/// Examples with what drawn references know of them: where references show a view is looked up once for all squares of it that are drawn, and
-/// no more views than these are kept.
+/// Examples with what drawn references know of them: where references show a view is looked up once
+/// for all squares of it that are drawn, and no more views than these are kept.
 struct Pool {
     round: u64,
     /// Which example, and as the network takes it.
@@ -64,15 +66,28 @@ struct Pool {
 }
 
 impl Pool {
-    fn new(round: u64, options: &RefinerTraining, guidance: Guidance, examples: &[KnownView]) -> Self {
+    fn new(
+        round: u64,
+        options: &RefinerTraining,
+        guidance: Guidance,
+        examples: &[KnownView],
+    ) -> Self {
         let view = |i: u64| {
             let mut rng = CounterRng::new(options.seed, POOLS, round * POOL + i);
             let mut draw = || rng.below(examples.len() as u64) as usize;
-            let (chosen, drawn): (usize, Vec<usize>) = (draw(), (0..options.references).map(|_| draw()).collect());
+            let (chosen, drawn): (usize, Vec<usize>) =
+                (draw(), (0..options.references).map(|_| draw()).collect());
             let alone = rng.below(ALONE) == 0;
             // A view is no reference for itself.
-            let others = drawn.iter().filter(|other| !alone && **other != chosen).map(|other| &examples[*other]);
-            (chosen, with_references(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance).view)
+            let others = drawn
+                .iter()
+                .filter(|other| !alone && **other != chosen)
+                .map(|other| &examples[*other]);
+            (
+                chosen,
+                with_references(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance)
+                    .view,
+            )
         };
         Self { round, views: (0..POOL).map(view).collect() }
     }
@@ -82,12 +97,14 @@ impl Pool {
 const SHARDS: usize = 8;
 /// Steps over which the rate rises.
 const WARM_UP: u64 = 50;
-/// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach nothing.
+/// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach
+/// nothing.
 const CONTRAST: f32 = 0.08;
 const REDRAWS: usize = 8;
 /// A reference-based network gets no reference once in so many times, so that it can do without.
 const ALONE: u64 = 8;
-/// Views that squares are drawn from at a time where there are references, and steps until they are drawn anew.
+/// Views that squares are drawn from at a time where there are references, and steps until they are
+/// drawn anew.
 const POOL: u64 = 32;
 const ROUND: u64 = 200;
 /// Purposes of draws.
@@ -120,15 +137,26 @@ impl RefinerTrainer {
         &self.refiner
     }
 
-    /// Scores examples that training left out, with references drawn from those that it had, and finds the share of the prediction that
-    /// serves them best.
-    pub fn score(&self, examples: &[KnownView], references: &[KnownView]) -> Result<RefinerScores, RefinementError> {
+    /// Scores examples that training left out, with references drawn from those that it had, and
+    /// finds the share of the prediction that serves them best.
+    pub fn score(
+        &self,
+        examples: &[KnownView],
+        references: &[KnownView],
+    ) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
         let view = |(i, example): (usize, &KnownView)| -> Image {
-            let Some(guidance) = self.refiner.architecture().guidance else { return example.rendered.view.clone() };
+            let Some(guidance) = self.refiner.architecture().guidance else {
+                return example.rendered.view.clone();
+            };
             let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
-            let drawn = (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
-            let conditioned = with_references(&example.rendered, &drawn.map(|k| &references[k]).collect::<Vec<_>>(), guidance);
+            let drawn =
+                (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
+            let conditioned = with_references(
+                &example.rendered,
+                &drawn.map(|k| &references[k]).collect::<Vec<_>>(),
+                guidance,
+            );
             conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
             conditioned.view
         };
@@ -151,11 +179,17 @@ impl RefinerTrainer {
         let mut refined = 0.0;
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let by = self.refiner.refine_by(view, strength as f32, 1)?;
-            let error: f64 = by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
+            let error: f64 =
+                by.data.iter().zip(&truth.data).map(|(r, t)| f64::from(t - r).powi(2)).sum();
             refined += psnr_of(error / truth.data.len() as f64);
         }
         let count = examples.len().max(1) as f64;
-        Ok(RefinerScores { rendered_psnr: rendered / count, refined_psnr: refined / count, strength, confidence })
+        Ok(RefinerScores {
+            rendered_psnr: rendered / count,
+            refined_psnr: refined / count,
+            strength,
+            confidence,
+        })
     }
 }
 
@@ -169,8 +203,9 @@ impl Training for RefinerTrainer {
         if self.steps() >= steps {
             return Ok(None);
         }
-        let shards: Vec<(Refiner, Range<usize>)> =
-            (0..SHARDS).map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS)).collect();
+        let shards: Vec<(Refiner, Range<usize>)> = (0..SHARDS)
+            .map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS))
+            .collect();
         let (step, options) = (self.steps(), self.options);
         let round = step / ROUND;
         if let Some(guidance) = self.refiner.architecture().guidance
@@ -179,8 +214,15 @@ impl Training for RefinerTrainer {
             self.pool = Some(Pool::new(round, &options, guidance, examples));
         }
         let subjects: Vec<Subject<'_>> = match &self.pool {
-            Some(pool) => pool.views.iter().map(|(i, view)| Subject { view, truth: &examples[*i].truth }).collect(),
-            None => examples.iter().map(|example| Subject { view: &example.rendered.view, truth: &example.truth }).collect(),
+            Some(pool) => pool
+                .views
+                .iter()
+                .map(|(i, view)| Subject { view, truth: &examples[*i].truth })
+                .collect(),
+            None => examples
+                .iter()
+                .map(|example| Subject { view: &example.rendered.view, truth: &example.truth })
+                .collect(),
         };
         let parts: Vec<(f64, Vec<Tensor>)> = shards
             .into_par_iter()
@@ -191,7 +233,9 @@ impl Training for RefinerTrainer {
         let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
         let mut gradients = parts.next().unwrap_or_default();
         for part in parts {
-            no_grad(|| gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop)))?;
+            no_grad(|| {
+                gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop))
+            })?;
         }
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
@@ -230,7 +274,11 @@ fn shard(
     }
     let added = refiner.forward(&around.tensor(&inputs, refiner.architecture().inputs())?)?;
     let all = (options.batch * options.square * options.square * OUTPUTS) as f64;
-    let loss = added.f_sub(&square.tensor(&lacks, OUTPUTS)?)?.f_square()?.f_sum(None::<Kind>)?.f_div_scalar(all)?;
+    let loss = added
+        .f_sub(&square.tensor(&lacks, OUTPUTS)?)?
+        .f_square()?
+        .f_sum(None::<Kind>)?
+        .f_div_scalar(all)?;
     let parameters: Vec<Tensor> = refiner.parameters().collect();
     let gradients = Tensor::f_run_backward(&[&loss], &parameters, false, false)?;
     Ok((loss.f_double_value(&[])?, gradients))
@@ -262,8 +310,10 @@ impl<'a> TrainingSquare<'a> {
         let mut place = || {
             let subject = subjects[rng.below(subjects.len() as u64) as usize];
             // On even pixels, as the folds of whole views lie.
-            let mut start =
-                |size: usize| (rng.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD) as isize;
+            let mut start = |size: usize| {
+                (rng.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD)
+                    as isize
+            };
             let (x, y) = (start(subject.view.width), start(subject.view.height));
             (subject, Square { x, y, size: (options.square, options.square) })
         };
@@ -285,7 +335,8 @@ impl<'a> TrainingSquare<'a> {
         Self { subject, square, turn, order, gain, offset }
     }
 
-    /// Appends what the network gets, which reaches farther than the square, and what it should add.
+    /// Appends what the network gets, which reaches farther than the square, and what it should
+    /// add.
     fn append(&self, refiner: &Refiner, inputs: &mut Vec<f32>, lacks: &mut Vec<f32>) {
         let Subject { view, truth } = self.subject;
         let around = self.square.grown(refiner.reach());
@@ -295,7 +346,9 @@ impl<'a> TrainingSquare<'a> {
             inputs.extend(self.order.map(|c| self.gain * pixel[c] + self.offset));
             inputs.push(pixel[OUTPUTS]);
             if view.channels == REFERENCE_INPUTS {
-                let [.., r, g, b, confidence, x, y, z] = pixel else { unreachable!("a conditioned view has that many channels") };
+                let [.., r, g, b, confidence, x, y, z] = pixel else {
+                    unreachable!("a conditioned view has that many channels")
+                };
                 let (differences, lacking) = ([r, g, b], [x, y, z]);
                 inputs.extend(self.order.map(|c| self.gain * differences[c]));
                 inputs.push(*confidence);
@@ -334,7 +387,9 @@ mod tests {
             let x = i % 32 + 1;
             if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
         };
-        let view = (0..32 * 32).flat_map(|i| [level(i, true), level(i, true), level(i, true), 1.0]).collect();
+        let view = (0..32 * 32)
+            .flat_map(|i| [level(i, true), level(i, true), level(i, true), 1.0])
+            .collect();
         let truth = (0..32 * 32).flat_map(|i| [level(i, false); 3]).collect();
         let camera = Camera {
             name: phase.to_string(),
@@ -348,17 +403,30 @@ mod tests {
                 distortion: Default::default(),
             },
             // A wall at distance 2, along which the camera moves by a pixel a phase.
-            camera_to_world: [[1.0, 0.0, 0.0, phase as f64 / 16.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+            camera_to_world: [
+                [1.0, 0.0, 0.0, phase as f64 / 16.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 2.0],
+            ],
         };
         let view = Image::new(32, 32, 4, view);
-        let rendered = Rendered { camera, view, depth: vec![2.0; 32 * 32], opacity: vec![1.0; 32 * 32] };
+        let rendered =
+            Rendered { camera, view, depth: vec![2.0; 32 * 32], opacity: vec![1.0; 32 * 32] };
         KnownView { rendered, truth: Image::new(32, 32, 3, truth) }
     }
 
     fn trained(guidance: Option<Guidance>) -> (RefinerTrainer, Vec<KnownView>) {
         nets::deterministic();
-        let options = RefinerTraining { steps: 300, batch: 8, square: 16, references: 1, rate: 5e-3, seed: 3 };
-        let refiner = Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
+        let options = RefinerTraining {
+            steps: 300,
+            batch: 8,
+            square: 16,
+            references: 1,
+            rate: 5e-3,
+            seed: 3,
+        };
+        let refiner =
+            Refiner::new(RefinerArchitecture { channels: 8, blocks: 1, guidance }, 3).unwrap();
         let mut trainer = RefinerTrainer::new(refiner, options).unwrap();
         let examples: Vec<KnownView> = (0..4).map(example).collect();
         while trainer.step(&examples).unwrap().is_some() {}
@@ -375,7 +443,8 @@ mod tests {
         }
     }
 
-    /// References of the stripes' own wall show them as they are, at their place, with full confidence; wherever they can't see, nothing.
+    /// References of the stripes' own wall show them as they are, at their place, with full
+    /// confidence; wherever they can't see, nothing.
     #[test]
     fn references_show_what_is_there() {
         let (view, other) = (example(5), example(2));
@@ -384,14 +453,19 @@ mod tests {
         for (i, pixel) in pixels.data.chunks_exact(REFERENCE_INPUTS).enumerate() {
             let column = i % 32;
             if pixel[7] == 0.0 {
-                // The other camera stands three pixels to the left: it doesn't see the last three columns.
+                // The other camera stands three pixels to the left: it doesn't see the last three
+                // columns.
                 assert!(column >= 29 && pixel[4..7] == [0.0; 3], "column {column}");
                 continue;
             }
             seen += 1;
             worst = worst.max((pixel[0] + pixel[4] - view.truth.data[i * 3]).abs());
             // At the border half a stripe is seen, which isn't as dark as the blurred one.
-            assert!(pixel[7] > if (5..20).contains(&column) { 0.8 } else { 0.5 }, "column {column}: {}", pixel[7]);
+            assert!(
+                pixel[7] > if (5..20).contains(&column) { 0.8 } else { 0.5 },
+                "column {column}: {}",
+                pixel[7]
+            );
         }
         assert!(seen >= 28 * 32 && worst < 1e-3, "{seen} pixels seen, {worst} off");
         assert!(

@@ -19,18 +19,25 @@ pub struct Rendered {
 impl Rendered {
     /// From a view's file, over a grey level.
     pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
-        let refuse = |reason: String| Err(RefinementError::View { name: camera.name.clone(), reason });
+        let refuse =
+            |reason: String| Err(RefinementError::View { name: camera.name.clone(), reason });
         let (Some(premultiplied), Some(depth)) = (image.premultiplied(), image.channel("Z")) else {
             return refuse("channels R, G, B, A and Z are expected".to_owned());
         };
         let k = &camera.intrinsics;
         if (image.width, image.height) != (k.width as usize, k.height as usize) {
             let (width, height) = (image.width, image.height);
-            return refuse(format!("{width}×{height} pixels where its camera has {}×{}", k.width, k.height));
+            return refuse(format!(
+                "{width}×{height} pixels where its camera has {}×{}",
+                k.width, k.height
+            ));
         }
         let over = premultiplied.over(background);
-        let pixels =
-            over.data.chunks_exact(3).zip(premultiplied.data.chunks_exact(4)).flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
+        let pixels = over
+            .data
+            .chunks_exact(3)
+            .zip(premultiplied.data.chunks_exact(4))
+            .flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
         let view = Image::new(image.width, image.height, 4, pixels.collect());
         Ok(Self { opacity: premultiplied.channel(3), depth: depth.to_vec(), view, camera })
     }
@@ -47,8 +54,13 @@ impl Rendered {
     /// Where they aren't of its size.
     #[must_use]
     pub fn with_colours(mut self, colours: &Image) -> Self {
-        assert_eq!((colours.width, colours.height), (self.view.width, self.view.height), "colours of its size");
-        for (pixel, colour) in self.view.data.chunks_exact_mut(4).zip(colours.data.chunks_exact(3)) {
+        assert_eq!(
+            (colours.width, colours.height),
+            (self.view.width, self.view.height),
+            "colours of its size"
+        );
+        for (pixel, colour) in self.view.data.chunks_exact_mut(4).zip(colours.data.chunks_exact(3))
+        {
             pixel[..3].copy_from_slice(colour);
         }
         self
@@ -60,19 +72,23 @@ impl Rendered {
     }
 }
 
-/// A rendered view whose true image is known: an example to learn from, or a reference for other views.
+/// A rendered view whose true image is known: an example to learn from, or a reference for other
+/// views.
 #[derive(Clone, Debug)]
 pub struct KnownView {
     /// As rendered.
     pub rendered: Rendered,
-    /// Colour, on the background that is shown; of the view's size. What is rendered, where nothing is known.
+    /// Colour, on the background that is shown; of the view's size. What is rendered, where nothing
+    /// is known.
     pub truth: Image,
 }
 
 impl KnownView {
-    /// A rendered view with its photograph, over the same background. Where that doesn't count it is taken for what is rendered, and so says nothing.
+    /// A rendered view with its photograph, over the same background. Where that doesn't count it
+    /// is taken for what is rendered, and so says nothing.
     pub fn new(rendered: Rendered, photograph: Photograph) -> Result<Self, RefinementError> {
-        let (view, name, Photograph { image: mut truth, mask }) = (&rendered.view, &rendered.camera.name, photograph);
+        let (view, name, Photograph { image: mut truth, mask }) =
+            (&rendered.view, &rendered.camera.name, photograph);
         if (view.width, view.height) != (truth.width, truth.height) {
             let reason = format!(
                 "{}×{} pixels where its image has {}×{}; render it for the image's camera",
@@ -85,12 +101,13 @@ impl KnownView {
     }
 }
 
-/// Pixels along the sides of blocks whose means are compared: in those, what a field lacks in detail evens out.
+/// Pixels along the sides of blocks whose means are compared: in those, what a field lacks in
+/// detail evens out.
 const BLOCK: usize = 8;
 
 impl KnownView {
-    /// The exposure of the true image against the rendered view, which has the exposure of the images that the field learnt from.
-    /// None where too little says what it is.
+    /// The exposure of the true image against the rendered view, which has the exposure of the
+    /// images that the field learnt from. None where too little says what it is.
     pub fn exposure(&self) -> Option<Exposure> {
         Exposure::between(&self.rendered.view, &self.truth, BLOCK)
     }
@@ -133,11 +150,14 @@ mod tests {
             let colour = [0, 1, 2].map(|c| 0.2 + 0.5 * counter_rng::uniform(5, c, patch));
             view.extend(colour);
             view.push(1.0);
-            truth.extend(colour.map(|v| (gain * (v + 0.2 * (rng.uniform() - 0.5)) + offset).clamp(0.0, 1.0)));
+            truth.extend(
+                colour.map(|v| (gain * (v + 0.2 * (rng.uniform() - 0.5)) + offset).clamp(0.0, 1.0)),
+            );
         }
         let count = width * height;
         let view = Image::new(width, height, 4, view);
-        let rendered = Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
+        let rendered =
+            Rendered { camera, view, depth: vec![2.0; count], opacity: vec![1.0; count] };
         KnownView { rendered, truth: Image::new(width, height, 3, truth) }
     }
 
@@ -147,7 +167,10 @@ mod tests {
         for (gain, offset) in [(0.6, 0.0), (0.8, 0.1), (1.2, -0.05)] {
             let dark = view(gain, offset);
             let exposure = dark.exposure().unwrap();
-            assert!(!exposure.is_none() && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05), "{exposure:?}");
+            assert!(
+                !exposure.is_none() && exposure.gain.iter().all(|g| (g / gain - 1.0).abs() < 0.05),
+                "{exposure:?}"
+            );
             let offsets = exposure.offset.map(|o| (o - offset).abs());
             assert!(offsets.iter().all(|o| *o < 0.02), "{exposure:?}");
             let (same, again) = (view(1.0, 0.0), dark.without(&exposure));

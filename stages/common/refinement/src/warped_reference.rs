@@ -1,4 +1,5 @@
-//! Reference-based refinement: HR references brought over to a view by its depth, and the confidence in what they show there.
+//! Reference-based refinement: HR references brought over to a view by its depth, and the
+//! confidence in what they show there.
 
 use std::ops::Range;
 
@@ -16,7 +17,8 @@ use crate::view::{KnownView, Rendered};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Guidance {
-    /// Whether a reference shows only what it sees by its own depth; without it also what something stands before.
+    /// Whether a reference shows only what it sees by its own depth; without it also what something
+    /// stands before.
     pub occlusion: bool,
     /// Whether what a reference shows is moved, by up to two pixels, to fit what is rendered.
     pub alignment: bool,
@@ -29,9 +31,10 @@ impl Default for Guidance {
     }
 }
 
-/// What references know of some rows of a view: how the colour they show there differs from the rendered one; the confidence in them,
-/// from 0 (none of them sees it) to 1 (one sees it from the same direction, as large, and as it is rendered); and what their own rendered views
-/// lack there, which is of use even where they show a surface a little aside, or in another light.
+/// What references know of some rows of a view: how the colour they show there differs from the
+/// rendered one; the confidence in them, from 0 (none of them sees it) to 1 (one sees it from the
+/// same direction, as large, and as it is rendered); and what their own rendered views lack there,
+/// which is of use even where they show a surface a little aside, or in another light.
 #[derive(Debug)]
 struct ReferenceFeatures {
     known: Vec<[f32; KNOWN]>,
@@ -71,13 +74,15 @@ impl Use {
 /// A view with what references know of it.
 #[derive(Clone, Debug)]
 pub struct ConditionedView {
-    /// As a reference-based refiner takes it: colour, opacity, difference to the references, their confidence, and what their own views lack.
+    /// As a reference-based refiner takes it: colour, opacity, difference to the references, their
+    /// confidence, and what their own views lack.
     pub view: Image,
     /// What each reference was of use for.
     pub uses: Vec<Use>,
 }
 
-/// A mean difference that halves the confidence, twice; and how far, in pixels, a reference may jump between neighbours before it does.
+/// A mean difference that halves the confidence, twice; and how far, in pixels, a reference may
+/// jump between neighbours before it does.
 const DIFFERENT: f32 = 0.1;
 const JUMP: f32 = 1.0;
 
@@ -98,26 +103,44 @@ pub(crate) struct WarpedReference {
 
 impl WarpedReference {
     /// What a reference shows at a place of it, for a pixel as rendered.
-    pub(crate) fn new(reference: &KnownView, place: [f32; 2], visibility: f32, pixel: &[f32]) -> Self {
-        let (colour, theirs) = (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
+    pub(crate) fn new(
+        reference: &KnownView,
+        place: [f32; 2],
+        visibility: f32,
+        pixel: &[f32],
+    ) -> Self {
+        let (colour, theirs) =
+            (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
         let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
         let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
         // An image with a hole in it shows nothing there.
         let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
-        if is_shown { Self { difference, lacking, place, visibility, confidence: visibility } } else { Self::default() }
+        if is_shown {
+            Self { difference, lacking, place, visibility, confidence: visibility }
+        } else {
+            Self::default()
+        }
     }
 }
 
 impl ReferenceFeatures {
     /// What references know of rows.
-    fn new(rendered: &Rendered, references: &[&KnownView], rows: Range<usize>, guidance: Guidance) -> Self {
-        let mut sums = vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
+    fn new(
+        rendered: &Rendered,
+        references: &[&KnownView],
+        rows: Range<usize>,
+        guidance: Guidance,
+    ) -> Self {
+        let mut sums =
+            vec![([0.0f32; 3], [0.0f32; 3], 0.0f32, 0.0f32); rendered.view.width * rows.len()];
         let mut uses = Vec::new();
         for reference in references {
             let warped = warp(rendered, reference, &rows, guidance);
             let mut of_use = Use::default();
-            for ((sum, lacks, weights, best), WarpedReference { difference, lacking, visibility, confidence, .. }) in
-                sums.iter_mut().zip(warped)
+            for (
+                (sum, lacks, weights, best),
+                WarpedReference { difference, lacking, visibility, confidence, .. },
+            ) in sums.iter_mut().zip(warped)
             {
                 of_use.add(&Use {
                     seen: usize::from(visibility > 0.0),
@@ -142,9 +165,15 @@ impl ReferenceFeatures {
     }
 }
 
-/// What a reference shows of rows, with less confidence where around a pixel it looks otherwise than rendered (wrong depth, something that moved, a
-/// highlight) or comes from here and there (noisy depth, an edge).
-fn warp(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidance: Guidance) -> Vec<WarpedReference> {
+/// What a reference shows of rows, with less confidence where around a pixel it looks otherwise
+/// than rendered (wrong depth, something that moved, a highlight) or comes from here and there
+/// (noisy depth, an edge).
+fn warp(
+    rendered: &Rendered,
+    reference: &KnownView,
+    rows: &Range<usize>,
+    guidance: Guidance,
+) -> Vec<WarpedReference> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     // What is looked at around a pixel was itself moved by what lies around it.
     let around = if guidance.alignment { 2 * AROUND } else { AROUND };
@@ -158,10 +187,18 @@ fn warp(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidanc
         };
         let Some(visibility) = visibility else { return WarpedReference::default() };
         let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
-        WarpedReference::new(reference, visibility.place, well, &rendered.view.data[(row * width + column) * INPUTS..])
+        WarpedReference::new(
+            reference,
+            visibility.place,
+            well,
+            &rendered.view.data[(row * width + column) * INPUTS..],
+        )
     };
-    let mut warped: Vec<WarpedReference> =
-        near.clone().flat_map(|row| (0..width).map(move |column| (column, row))).map(|(c, r)| show(c, r)).collect();
+    let mut warped: Vec<WarpedReference> = near
+        .clone()
+        .flat_map(|row| (0..width).map(move |column| (column, row)))
+        .map(|(c, r)| show(c, r))
+        .collect();
     if guidance.alignment {
         warped = align(&warped, rendered, reference, near.start);
     }
@@ -190,7 +227,8 @@ fn warp(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidanc
                     let (Some(a), Some(b)) = (a, b) else { return 0.0 };
                     (0..2).map(|i| (a[i] + b[i] - 2.0 * own.place[i]).powi(2)).sum::<f32>()
                 };
-                let jumped = jump(neighbour(-1, 0), neighbour(1, 0)) + jump(neighbour(0, -1), neighbour(0, 1));
+                let jumped = jump(neighbour(-1, 0), neighbour(1, 0))
+                    + jump(neighbour(0, -1), neighbour(0, 1));
                 own.confidence *= (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (JUMP * JUMP));
             }
             all.push(own);
@@ -199,23 +237,32 @@ fn warp(rendered: &Rendered, reference: &KnownView, rows: &Range<usize>, guidanc
     all
 }
 
-/// A view with what references know of it, as a reference-based refiner takes it: with its [`crate::Architecture::guidance`].
-pub fn with_references(rendered: &Rendered, references: &[&KnownView], guidance: Guidance) -> ConditionedView {
+/// A view with what references know of it, as a reference-based refiner takes it: with its
+/// [`crate::Architecture::guidance`].
+pub fn with_references(
+    rendered: &Rendered,
+    references: &[&KnownView],
+    guidance: Guidance,
+) -> ConditionedView {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
     let band = |(i, out): (usize, &mut [f32])| {
         let rows = i * BAND..(i * BAND + BAND).min(height);
         let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
-        let pixels = rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&features.known);
+        let pixels = rendered.view.data[rows.start * width * INPUTS..]
+            .chunks_exact(INPUTS)
+            .zip(&features.known);
         for (out, (pixel, known)) in out.chunks_exact_mut(REFERENCE_INPUTS).zip(pixels) {
             out[..INPUTS].copy_from_slice(pixel);
             out[INPUTS..].copy_from_slice(known);
         }
         features.uses
     };
-    let uses: Vec<Vec<Use>> = data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate().map(band).collect();
+    let uses: Vec<Vec<Use>> =
+        data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate().map(band).collect();
     let mut sums = vec![Use::default(); references.len()];
-    uses.iter().for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
+    uses.iter()
+        .for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), uses: sums }
 }
 
@@ -232,8 +279,8 @@ mod tests {
     const WIDTH: usize = 96;
     const HEIGHT: usize = 48;
 
-    /// A wall at distance 2 with patches of six pixels, as it is and blurred, from a camera so many pixels to the right; `depth` is what the
-    /// field believes.
+    /// A wall at distance 2 with patches of six pixels, as it is and blurred, from a camera so many
+    /// pixels to the right; `depth` is what the field believes.
     fn wall(right: usize, depth: impl Fn(usize) -> f32) -> KnownView {
         let level = |x: isize, y: isize, c: u64| {
             let patch = (x + right as isize).div_euclid(6) * 1000 + y.div_euclid(6);
@@ -241,9 +288,12 @@ mod tests {
         };
         let pixels = || (0..HEIGHT as isize).flat_map(|y| (0..WIDTH as isize).map(move |x| (x, y)));
         let truth = pixels().flat_map(|(x, y)| [0, 1, 2].map(|c| level(x, y, c))).collect();
-        let blurred =
-            |x: isize, y: isize, c: u64| (-1..=1).map(|i| level(x + i, y - i, c) + level(x + i, y + i, c)).sum::<f32>() / 6.0;
-        let view = pixels().flat_map(|(x, y)| [blurred(x, y, 0), blurred(x, y, 1), blurred(x, y, 2), 1.0]).collect();
+        let blurred = |x: isize, y: isize, c: u64| {
+            (-1..=1).map(|i| level(x + i, y - i, c) + level(x + i, y + i, c)).sum::<f32>() / 6.0
+        };
+        let view = pixels()
+            .flat_map(|(x, y)| [blurred(x, y, 0), blurred(x, y, 1), blurred(x, y, 2), 1.0])
+            .collect();
         let camera = Camera {
             name: right.to_string(),
             intrinsics: Intrinsics {
@@ -255,7 +305,11 @@ mod tests {
                 cy: 24.0,
                 distortion: Default::default(),
             },
-            camera_to_world: [[1.0, 0.0, 0.0, right as f64 * 2.0 / 300.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]],
+            camera_to_world: [
+                [1.0, 0.0, 0.0, right as f64 * 2.0 / 300.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 2.0],
+            ],
         };
         let view = Image::new(WIDTH, HEIGHT, 4, view);
         let depth = (0..WIDTH * HEIGHT).map(depth).collect();
@@ -263,13 +317,22 @@ mod tests {
         KnownView { rendered, truth: Image::new(WIDTH, HEIGHT, 3, truth) }
     }
 
-    /// Share of the view that is known of, confidence there, and how far what is shown there is from the truth, weighted by the confidence.
+    /// Share of the view that is known of, confidence there, and how far what is shown there is
+    /// from the truth, weighted by the confidence.
     fn judged(view: &KnownView, reference: &KnownView, guidance: Guidance) -> (f64, f64, f64) {
-        let ConditionedView { view: conditioned, uses } = with_references(&view.rendered, &[reference], guidance);
-        let (seen, confidence) = (uses[0].seen as f64 / (WIDTH * HEIGHT) as f64, uses[0].confidence / uses[0].seen.max(1) as f64);
+        let ConditionedView { view: conditioned, uses } =
+            with_references(&view.rendered, &[reference], guidance);
+        let (seen, confidence) = (
+            uses[0].seen as f64 / (WIDTH * HEIGHT) as f64,
+            uses[0].confidence / uses[0].seen.max(1) as f64,
+        );
         let (mut sum, mut all) = (0.0, 0.0);
-        for (pixel, truth) in conditioned.data.chunks_exact(REFERENCE_INPUTS).zip(view.truth.data.chunks_exact(3)) {
-            let off = (0..3).map(|c| f64::from(pixel[c] + pixel[4 + c] - truth[c]).abs()).sum::<f64>() / 3.0;
+        for (pixel, truth) in
+            conditioned.data.chunks_exact(REFERENCE_INPUTS).zip(view.truth.data.chunks_exact(3))
+        {
+            let off =
+                (0..3).map(|c| f64::from(pixel[c] + pixel[4 + c] - truth[c]).abs()).sum::<f64>()
+                    / 3.0;
             sum += off * f64::from(pixel[7]);
             all += f64::from(pixel[7]);
         }
@@ -280,14 +343,18 @@ mod tests {
     fn confidence_falls_where_it_looks_otherwise_than_rendered() {
         let (view, reference) = (wall(0, |_| 2.0), wall(24, |_| 2.0));
         let (seen, confidence, off) = judged(&view, &reference, Guidance::default());
-        assert!((0.7..0.8).contains(&seen) && confidence > 0.85 && off < 0.01, "right: {seen} {confidence} {off}");
+        assert!(
+            (0.7..0.8).contains(&seen) && confidence > 0.85 && off < 0.01,
+            "right: {seen} {confidence} {off}"
+        );
         // A plane a third too far away: the reference shows what lies eight pixels to the side.
         let (_, confidence, _) = judged(&wall(0, |_| 3.0), &wall(24, |_| 3.0), Guidance::default());
         assert!(confidence < 0.5, "shifted: {confidence}");
         // Depths with noise within what counts as the same surface, seen from far aside.
         let noisy = |seed: u64| move |i: usize| 2.0 + 0.03 * (uniform(seed, 1, i as u64) - 0.5);
         let (_, calm, _) = judged(&wall(0, |_| 2.0), &wall(60, |_| 2.0), Guidance::default());
-        let (_, confidence, _) = judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
+        let (_, confidence, _) =
+            judged(&wall(0, noisy(1)), &wall(60, noisy(2)), Guidance::default());
         assert!(confidence < 0.8 * calm, "noisy: {confidence} of {calm}");
         // A reference of something else.
         let mut other = wall(24, |_| 2.0);
@@ -298,7 +365,8 @@ mod tests {
         assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
     }
 
-    /// Depths a little off put what a reference shows a pixel and more to the side: it is moved back; where depths are right it stays.
+    /// Depths a little off put what a reference shows a pixel and more to the side: it is moved
+    /// back; where depths are right it stays.
     #[test]
     fn alignment_moves_what_is_shown_to_where_it_fits() {
         let off = |depth: f32, alignment: bool| {
@@ -316,7 +384,8 @@ mod tests {
     #[test]
     fn what_is_hidden_is_not_shown() {
         // The reference has a plate before the middle third of its image.
-        let plate = |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
+        let plate =
+            |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
         let seen = |occlusion: bool| {
             let guidance = Guidance { occlusion, ..Guidance::default() };
@@ -334,9 +403,13 @@ mod tests {
             let whole = with_references(&view.rendered, &[&reference], guidance).view;
             let band = ReferenceFeatures::new(&view.rendered, &[&reference], 7..41, guidance);
             assert_eq!(band.known.len(), 34 * WIDTH);
-            let expected = whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
+            let expected =
+                whole.data[7 * WIDTH * REFERENCE_INPUTS..].chunks_exact(REFERENCE_INPUTS);
             for (found, expected) in band.known.iter().zip(expected) {
-                assert!(found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?} {expected:?}");
+                assert!(
+                    found.iter().zip(&expected[INPUTS..]).all(|(a, b)| (a - b).abs() < 1e-5),
+                    "{found:?} {expected:?}"
+                );
             }
         }
     }

@@ -33,11 +33,21 @@ impl Intrinsics {
         Self { width, height, fx: focal, fy: focal, cx, cy, distortion: Distortion::default() }
     }
 
-    /// The same camera with another number of pixels on the same sensor. The scale may differ per axis.
+    /// The same camera with another number of pixels on the same sensor. The scale may differ per
+    /// axis.
     #[must_use]
     pub fn resized(&self, width: u32, height: u32) -> Self {
-        let (sx, sy) = (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
-        Self { width, height, fx: self.fx * sx, fy: self.fy * sy, cx: self.cx * sx, cy: self.cy * sy, ..*self }
+        let (sx, sy) =
+            (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        Self {
+            width,
+            height,
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+            ..*self
+        }
     }
 }
 
@@ -49,7 +59,8 @@ pub struct Camera {
     pub name: String,
     /// The inside.
     pub intrinsics: Intrinsics,
-    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world space.
+    /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
+    /// space.
     pub camera_to_world: [[f64; 4]; 3],
 }
 
@@ -73,7 +84,8 @@ impl CameraRay {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CameraError {
     /// A number that isn't finite.
-    #[error("camera_to_world[{row}][{column}] is {}; poses must be finite", if value.is_nan() { "NaN" } else { "infinite" })]
+    #[error("camera_to_world[{row}][{column}] is {}; poses must be \
+        finite", if value.is_nan() { "NaN" } else { "infinite" })]
     NotFinite {
         /// Row of the pose.
         row: usize,
@@ -103,27 +115,33 @@ pub enum CameraError {
     },
     /// A place that no scene reaches to.
     #[error(
-        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than {FARTHEST:e}; is the pose right, and its unit?",
+        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than {FARTHEST:e}; is \
+        the pose right, and its unit?",
         .0[0], .0[1], .0[2]
     )]
     FarAway([f64; 3]),
     /// The left 3×3 part has determinant -1.
     #[error(
-        "camera_to_world is a reflection (its determinant is {determinant:.3}): axes must be right-handed; negate one of its columns"
+        "camera_to_world is a reflection (its determinant is {determinant:.3}): axes must be \
+        right-handed; negate one of its columns"
     )]
     Mirrored {
         /// Determinant of R.
         determinant: f64,
     },
     /// The left 3×3 part isn't a rotation.
-    #[error("camera_to_world is no rigid motion: R·Rᵀ is off the identity by {error:.3}; remove scale or shear from the pose")]
+    #[error(
+        "camera_to_world is no rigid motion: R·Rᵀ is off the identity by {error:.3}; remove scale \
+        or shear from the pose"
+    )]
     NotRigid {
         /// Largest deviation of R·Rᵀ from the identity.
         error: f64,
     },
 }
 
-/// Scene units from the origin beyond which there are no cameras: f32, by which rays are cast, tells no neighbours apart there.
+/// Scene units from the origin beyond which there are no cameras: f32, by which rays are cast,
+/// tells no neighbours apart there.
 const FARTHEST: f64 = 1e9;
 
 /// Cameras that turn at most so far from their mean direction look one way: cos 45°.
@@ -153,7 +171,8 @@ impl Camera {
         -self.rotation().z_axis.normalize()
     }
 
-    /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j + 0.5) is a pixel's centre.
+    /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j +
+    /// 0.5) is a pixel's centre.
     pub fn ray(&self, x: f64, y: f64) -> CameraRay {
         let k = &self.intrinsics;
         let [x, y] = k.undistort([x, y]);
@@ -161,8 +180,8 @@ impl Camera {
         CameraRay { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
     }
 
-    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and where the lens's distortion says nothing of
-    /// what lies so far aside.
+    /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and
+    /// where the lens's distortion says nothing of what lies so far aside.
     pub fn project(&self, point: DVec3) -> Option<(f64, f64, f64)> {
         let k = &self.intrinsics;
         let p = self.rotation().transpose() * (point - self.centre());
@@ -194,13 +213,16 @@ impl Camera {
         Self { intrinsics: self.intrinsics.resized(width, height), ..self.clone() }
     }
 
-    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale, shear or a reflection, or far from all scenes.
+    /// Refuses what no camera can be: NaN, focal length 0, an empty image, a pose with scale, shear
+    /// or a reflection, or far from all scenes.
     pub fn check(&self) -> Result<(), CameraError> {
         let k = &self.intrinsics;
         if k.width == 0 || k.height == 0 {
             return Err(CameraError::Empty { width: k.width, height: k.height });
         }
-        for (name, value, positive) in [("fx", k.fx, true), ("fy", k.fy, true), ("cx", k.cx, false), ("cy", k.cy, false)] {
+        for (name, value, positive) in
+            [("fx", k.fx, true), ("fy", k.fy, true), ("cx", k.cx, false), ("cy", k.cy, false)]
+        {
             if !value.is_finite() || (positive && value <= 0.0) {
                 return Err(CameraError::Intrinsics { name, value });
             }
@@ -216,8 +238,12 @@ impl Camera {
             return Err(CameraError::Distortion(k.distortion));
         }
         let r = self.rotation();
-        let error = (r * r.transpose() - DMat3::IDENTITY).to_cols_array().into_iter().fold(0.0, |a: f64, b| a.max(b.abs()));
-        // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far off.
+        let error = (r * r.transpose() - DMat3::IDENTITY)
+            .to_cols_array()
+            .into_iter()
+            .fold(0.0, |a: f64, b| a.max(b.abs()));
+        // Published poses are rounded to single precision; real mistakes (a scaled matrix) are far
+        // off.
         if error > 1e-2 {
             return Err(CameraError::NotRigid { error });
         }
@@ -226,7 +252,11 @@ impl Camera {
             return Err(CameraError::Mirrored { determinant });
         }
         let centre = self.centre();
-        if centre.length() > FARTHEST { Err(CameraError::FarAway(centre.to_array())) } else { Ok(()) }
+        if centre.length() > FARTHEST {
+            Err(CameraError::FarAway(centre.to_array()))
+        } else {
+            Ok(())
+        }
     }
 }
 
@@ -262,7 +292,8 @@ mod tests {
         let mut camera = camera(DVec3::Z, 0.0, DVec3::ZERO);
         camera.intrinsics.distortion.radial[0] = -0.4;
         camera.check().unwrap();
-        // Out to a slope of 0.91 places move outwards; 1.6 would be seen near the centre, from the other side.
+        // Out to a slope of 0.91 places move outwards; 1.6 would be seen near the centre, from the
+        // other side.
         let at = |slope: f64| camera.project(DVec3::new(slope, 0.0, -1.0));
         assert!(at(0.4).is_some());
         let folded = camera.intrinsics.distort([18.0 + 40.0 * 1.6, 12.5]);
@@ -272,15 +303,19 @@ mod tests {
 
     fn mild() -> impl Strategy<Value = Distortion> {
         let radial = (-0.2..0.2f64, -0.05..0.05f64, -0.02..0.02f64);
-        (radial, -0.01..0.01f64, -0.01..0.01f64)
-            .prop_map(|((k1, k2, k3), p1, p2)| Distortion { radial: [k1, k2, k3], tangential: [p1, p2] })
+        (radial, -0.01..0.01f64, -0.01..0.01f64).prop_map(|((k1, k2, k3), p1, p2)| Distortion {
+            radial: [k1, k2, k3],
+            tangential: [p1, p2],
+        })
     }
 
     proptest! {
         #[test]
         fn projecting_a_ray_gives_its_pixel_back(
-            a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64, c in (unit(), unit(), unit()),
-            x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64, distortion in prop_oneof![Just(Distortion::default()), mild()],
+            a in (unit(), unit(), 0.1..1.0f64), angle in -3.0..3.0f64,
+            c in (unit(), unit(), unit()),
+            x in 0.0..37.0f64, y in 0.0..23.0f64, t in 0.1..100.0f64,
+            distortion in prop_oneof![Just(Distortion::default()), mild()],
         ) {
             let mut camera = camera(DVec3::from(a), angle, DVec3::from(c) * 5.0);
             camera.intrinsics.distortion = distortion;
@@ -293,14 +328,16 @@ mod tests {
             prop_assert!(camera.project(ray.at(-t)).is_none());
         }
 
-        /// A half-pixel shift would show here: the s×s pixels of an HR image have their mean at the LR pixel's centre.
+        /// A half-pixel shift would show here: the s×s pixels of an HR image have their mean at the
+        /// LR pixel's centre.
         #[test]
         fn resizing_keeps_pixel_footprints(i in 0u32..37, j in 0u32..23, s in 1u32..6) {
             let lr = camera(DVec3::Z, 0.3, DVec3::ONE);
             let hr = lr.resized(37 * s, 23 * s);
             for (corner_x, corner_y) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
                 let (x, y) = (f64::from(i + corner_x), f64::from(j + corner_y));
-                let difference = lr.ray(x, y).direction - hr.ray(x * f64::from(s), y * f64::from(s)).direction;
+                let difference = lr.ray(x, y).direction - hr.ray(x * f64::from(s),
+                    y * f64::from(s)).direction;
                 prop_assert!(difference.length() < 1e-12);
             }
             let offsets: f64 = (0..s).map(|a| (f64::from(i * s + a) + 0.5) / f64::from(s)).sum();
@@ -325,15 +362,24 @@ mod tests {
         bad.camera_to_world.iter_mut().for_each(|row| row[1] = -row[1]);
         let reflection = bad.check().unwrap_err();
         assert!(
-            matches!(reflection, CameraError::Mirrored { .. }) && reflection.to_string().contains("is -1.000"),
+            matches!(reflection, CameraError::Mirrored { .. })
+                && reflection.to_string().contains("is -1.000"),
             "{reflection}"
         );
         let mut bad = good.clone();
         bad.camera_to_world[0][3] = 1e30;
         let far = bad.check().unwrap_err();
-        assert!(far.to_string().contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e9"), "{far}");
+        assert!(
+            far.to_string().contains("centre (1e30, 0e0, 0e0) is farther from the origin than 1e9"),
+            "{far}"
+        );
         bad.camera_to_world[0][3] = f64::NEG_INFINITY;
-        assert!(bad.check().unwrap_err().to_string().contains("camera_to_world[0][3] is infinite; poses must be finite"));
+        assert!(
+            bad.check()
+                .unwrap_err()
+                .to_string()
+                .contains("camera_to_world[0][3] is infinite; poses must be finite")
+        );
         let mut bad = good;
         bad.intrinsics.height = 0;
         assert!(matches!(bad.check(), Err(CameraError::Empty { .. })));

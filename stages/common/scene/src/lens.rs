@@ -5,9 +5,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::Intrinsics;
 
-/// Radial and tangential distortion (Brown 1966), as OpenCV and COLMAP have it: a ray that a pinhole sees at (x, y), in units of the
-/// focal length, is seen at (x·r + 2·p1·x·y + p2·(ρ + 2x²), y·r + p1·(ρ + 2y²) + 2·p2·x·y) with ρ = x² + y² and
-/// r = 1 + k1·ρ + k2·ρ² + k3·ρ³. y points down.
+/// Radial and tangential distortion (Brown 1966), as OpenCV and COLMAP have it: a ray that a
+/// pinhole sees at (x, y), in units of the focal length, is seen at (x·r + 2·p1·x·y + p2·(ρ + 2x²),
+/// y·r + p1·(ρ + 2y²) + 2·p2·x·y) with ρ = x² + y² and r = 1 + k1·ρ + k2·ρ² + k3·ρ³. y points down.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Distortion {
@@ -23,7 +23,8 @@ const MOST_ZOOM: f64 = 4.0;
 /// Places along each side of an image at which a distortion is looked at.
 const BORDER: u32 = 64;
 
-/// A distortion is undone to within so much of the focal length: a hundred-thousandth of a pixel at 10,000 pixels.
+/// A distortion is undone to within so much of the focal length: a hundred-thousandth of a pixel at
+/// 10,000 pixels.
 const EXACT: f64 = 1e-9;
 
 impl fmt::Display for Distortion {
@@ -49,10 +50,14 @@ impl Distortion {
         let [p1, p2] = self.tangential;
         let square = x * x + y * y;
         let (radial, _) = self.radial_at(square);
-        [x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x), y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y]
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x),
+            y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ]
     }
 
-    /// How what is seen moves with a pinhole's (x, y): its x by x, its x by y, which is its y by x, and its y by y.
+    /// How what is seen moves with a pinhole's (x, y): its x by x, its x by y, which is its y by x,
+    /// and its y by y.
     pub fn slope(&self, [x, y]: [f64; 2]) -> [f64; 3] {
         let [p1, p2] = self.tangential;
         let (radial, growth) = self.radial_at(x * x + y * y);
@@ -63,7 +68,8 @@ impl Distortion {
         ]
     }
 
-    /// Where a pinhole sees what is seen at a place, by Newton's method. Nothing of use beyond where the distortion folds back.
+    /// Where a pinhole sees what is seen at a place, by Newton's method. Nothing of use beyond
+    /// where the distortion folds back.
     pub fn undistort(&self, seen: [f64; 2]) -> [f64; 2] {
         const STEPS: usize = 20;
         let mut at = seen;
@@ -83,10 +89,14 @@ impl Distortion {
     /// r and its derivative by ρ.
     fn radial_at(&self, square: f64) -> (f64, f64) {
         let [k1, k2, k3] = self.radial;
-        (1.0 + square * (k1 + square * (k2 + square * k3)), k1 + square * (2.0 * k2 + square * 3.0 * k3))
+        (
+            1.0 + square * (k1 + square * (k2 + square * k3)),
+            k1 + square * (2.0 * k2 + square * 3.0 * k3),
+        )
     }
 
-    /// Whether a place is found back, and the way there from the centre is in order: beyond a radius a distortion may fold back.
+    /// Whether a place is found back, and the way there from the centre is in order: beyond a
+    /// radius a distortion may fold back.
     fn can_undo(&self, seen: [f64; 2]) -> bool {
         let at = self.undistort(seen);
         let [u, v] = self.distort(at);
@@ -100,26 +110,31 @@ impl Distortion {
 }
 
 impl Intrinsics {
-    /// Where in its image a camera without the distortion sees what this one sees at a position, in pixels.
+    /// Where in its image a camera without the distortion sees what this one sees at a position, in
+    /// pixels.
     pub fn undistort(&self, at: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
             return at;
         }
-        let [x, y] = self.distortion.undistort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
+        let [x, y] =
+            self.distortion.undistort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
         [self.fx.mul_add(x, self.cx), self.fy.mul_add(y, self.cy)]
     }
 
-    /// Where in its image this camera sees what one without the distortion sees at a position, in pixels.
+    /// Where in its image this camera sees what one without the distortion sees at a position, in
+    /// pixels.
     pub fn distort(&self, at: [f64; 2]) -> [f64; 2] {
         if self.distortion.is_none() {
             return at;
         }
-        let [u, v] = self.distortion.distort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
+        let [u, v] =
+            self.distortion.distort([(at[0] - self.cx) / self.fx, (at[1] - self.cy) / self.fy]);
         [self.fx.mul_add(u, self.cx), self.fy.mul_add(v, self.cy)]
     }
 
-    /// The pinhole camera of the same size that sees as much as it can and nothing that this one doesn't. `None` where the distortion
-    /// is beyond sense: its image would have to be cut to a quarter and less.
+    /// The pinhole camera of the same size that sees as much as it can and nothing that this one
+    /// doesn't. `None` where the distortion is beyond sense: its image would have to be cut to a
+    /// quarter and less.
     pub fn pinhole(&self) -> Option<Self> {
         let pinhole = Self { distortion: Distortion::default(), ..*self };
         if self.distortion.is_none() {
@@ -145,17 +160,28 @@ impl Intrinsics {
     /// Where in this camera's image what another, at the same place, sees at a position.
     pub fn source(&self, other: &Self, at: [f64; 2]) -> [f64; 2] {
         let [x, y] = other.undistort(at);
-        let along = |v: f64, from: f64, focal: f64, to: f64, to_focal: f64| to_focal.mul_add((v - from) / focal, to);
-        self.distort([along(x, other.cx, other.fx, self.cx, self.fx), along(y, other.cy, other.fy, self.cy, self.fy)])
+        let along = |v: f64, from: f64, focal: f64, to: f64, to_focal: f64| {
+            to_focal.mul_add((v - from) / focal, to)
+        };
+        self.distort([
+            along(x, other.cx, other.fx, self.cx, self.fx),
+            along(y, other.cy, other.fy, self.cy, self.fy),
+        ])
     }
 
-    /// Positions along the image's border: its corners, and what lies between them where lines may be bent.
+    /// Positions along the image's border: its corners, and what lies between them where lines may
+    /// be bent.
     pub fn border(&self) -> impl Iterator<Item = [f64; 2]> {
         let steps = if self.distortion.is_none() { 1 } else { BORDER };
         let (width, height) = (f64::from(self.width), f64::from(self.height));
         (0..steps).flat_map(move |i| {
             let share = f64::from(i) / f64::from(steps);
-            [[share * width, 0.0], [width, share * height], [(1.0 - share) * width, height], [0.0, (1.0 - share) * height]]
+            [
+                [share * width, 0.0],
+                [width, share * height],
+                [(1.0 - share) * width, height],
+                [0.0, (1.0 - share) * height],
+            ]
         })
     }
 
@@ -186,7 +212,9 @@ impl Intrinsics {
             })
         };
         // Of a bent image's border, as many places as of its own.
-        Self { distortion: self.distortion, ..*pinhole }.border().all(|at| inside(self.source(pinhole, at)) && in_order(at))
+        Self { distortion: self.distortion, ..*pinhole }
+            .border()
+            .all(|at| inside(self.source(pinhole, at)) && in_order(at))
     }
 }
 
@@ -198,7 +226,15 @@ mod tests {
 
     fn camera(radial: [f64; 3], tangential: [f64; 2]) -> Intrinsics {
         let distortion = Distortion { radial, tangential };
-        Intrinsics { width: 400, height: 300, fx: 350.0, fy: 355.0, cx: 203.0, cy: 148.0, distortion }
+        Intrinsics {
+            width: 400,
+            height: 300,
+            fx: 350.0,
+            fy: 355.0,
+            cx: 203.0,
+            cy: 148.0,
+            distortion,
+        }
     }
 
     #[test]
@@ -228,7 +264,8 @@ mod tests {
     }
 
     proptest! {
-        /// What the pinhole camera sees lies inside the image, and a slightly wider one would see past it.
+        /// What the pinhole camera sees lies inside the image, and a slightly wider one would see
+        /// past it.
         #[test]
         fn a_pinhole_sees_as_much_as_there_is(camera in mild()) {
             let pinhole = camera.pinhole().expect("a mild distortion");
@@ -238,7 +275,8 @@ mod tests {
         }
 
         #[test]
-        fn undistorting_undoes_distorting(camera in mild(), x in 0.0..400.0f64, y in 0.0..300.0f64) {
+        fn undistorting_undoes_distorting(camera in mild(), x in 0.0..400.0f64,
+            y in 0.0..300.0f64) {
             prop_assert!(camera.has_rays());
             let [u, v] = camera.distort(camera.undistort([x, y]));
             prop_assert!((u - x).hypot(v - y) < 1e-9, "{u} {v}");

@@ -4,14 +4,17 @@
 //!
 //! Written here once, and into every `views.json` ([`Conventions`]):
 //!
-//! * **Camera**: OpenGL axes, x right, y up, looking along -z. `camera_to_world` is the 3×4 matrix `[R | t]`, row by row.
-//! * **Pixels**: pixel (i, j) is column i of row j, row 0 on top, and covers the square [i, i+1) × [j, j+1): its **centre** is
-//!   (i + 0.5, j + 0.5). The principal point of a centred camera is (width/2, height/2). So resizing an image from W to W'
-//!   multiplies `fx` and `cx` by W'/W and nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
-//! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] follow it, so that photographs stay as they were
-//!   taken. Rays are straight all the same.
-//! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is camera-space z-depth in scene units,
-//!   -z of the point in camera space: what EXR channel `Z` holds.
+//! * **Camera**: OpenGL axes, x right, y up, looking along -z. `camera_to_world` is the 3×4 matrix
+//!   `[R | t]`, row by row.
+//! * **Pixels**: pixel (i, j) is column i of row j, row 0 on top, and covers the square [i, i+1) ×
+//!   [j, j+1): its **centre** is (i + 0.5, j + 0.5). The principal point of a centred camera is
+//!   (width/2, height/2). So resizing an image from W to W' multiplies `fx` and `cx` by W'/W and
+//!   nothing else; a half-pixel shift caps PSNR at 25–28 dB at 200 pixels.
+//! * **Distortion** is part of the intrinsics: [`Camera::ray`] and [`Camera::project`] follow it,
+//!   so that photographs stay as they were taken. Rays are straight all the same.
+//! * **Rays**: directions have unit length; t is the distance along the ray. **Depth** is
+//!   camera-space z-depth in scene units, -z of the point in camera space: what EXR channel `Z`
+//!   holds.
 //! * **Colours**: display-encoded sRGB in [0, 1], as the paper trains and scores.
 //!
 //! ```

@@ -9,16 +9,18 @@ pub enum Space {
     /// The box of the bounds, scaled by its longest side: scenes that end.
     #[default]
     Box,
-    /// What one camera would see, its far parts small (NDC; NeRF, appendix C): forward-facing photographs.
+    /// What one camera would see, its far parts small (NDC; NeRF, appendix C): forward-facing
+    /// photographs.
     Ndc(Frustum),
-    /// Everything: the ball in the bounds' box as it is, and what lies outside in a shell around it (mip-NeRF 360, eq. 10):
-    /// cameras among what they see, and a background without end.
+    /// Everything: the ball in the bounds' box as it is, and what lies outside in a shell around it
+    /// (mip-NeRF 360, eq. 10): cameras among what they see, and a background without end.
     Contraction,
 }
 
-/// What a virtual camera sees between two planes. A point (X, Y, Z) of its camera space, Z the depth, has the projective
-/// coordinates (X/Z, Y/Z) between `min` and `max` and the disparity 1/Z between `1/far` and `1/near`: straight lines stay
-/// straight, and even steps along them are fine where a camera sees finely.
+/// What a virtual camera sees between two planes. A point (X, Y, Z) of its camera space, Z the
+/// depth, has the projective coordinates (X/Z, Y/Z) between `min` and `max` and the disparity 1/Z
+/// between `1/far` and `1/near`: straight lines stay straight, and even steps along them are fine
+/// where a camera sees finely.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Frustum {
@@ -38,8 +40,12 @@ impl Frustum {
     /// Whether it has an inside, all numbers finite.
     pub fn is_valid(&self) -> bool {
         let pose = self.camera_to_world.iter().flatten();
-        let finite = pose.chain(&self.min).chain(&self.max).chain([&self.far]).all(|x| x.is_finite());
-        finite && (0..2).all(|i| self.min[i] < self.max[i]) && 0.0 < self.near && self.near < self.far
+        let finite =
+            pose.chain(&self.min).chain(&self.max).chain([&self.far]).all(|x| x.is_finite());
+        finite
+            && (0..2).all(|i| self.min[i] < self.max[i])
+            && 0.0 < self.near
+            && self.near < self.far
     }
 
     /// A world point in the virtual camera's space: x to the right, y up, and the depth.
@@ -58,8 +64,8 @@ impl Frustum {
         DVec3::new(x[i], y[i], z[i])
     }
 
-    /// A point of the virtual camera's space in the unit cube: slopes over the wider of their ranges, then 0 at the front plane
-    /// and 1 at the back.
+    /// A point of the virtual camera's space in the unit cube: slopes over the wider of their
+    /// ranges, then 0 at the front plane and 1 at the back.
     pub fn to_cube(&self, p: DVec3) -> DVec3 {
         let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
         let depth = (1.0 / self.near - 1.0 / p.z) / (1.0 / self.near - 1.0 / self.far);

@@ -34,7 +34,8 @@ pub struct View {
     /// The image: PNG (RGBA with straight alpha, or RGB) or EXR (premultiplied alpha).
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<String>,
-    /// Which of the image's pixels count: PNG of its size, white where they do, black where they don't. Without it: all.
+    /// Which of the image's pixels count: PNG of its size, white where they do, black where they
+    /// don't. Without it: all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
     /// Depth: EXR, channel `Z`.
@@ -52,7 +53,10 @@ impl View {
     }
 
     /// Its image, premultiplied RGBA, and which of its pixels count; none where it has no image.
-    pub fn read_photograph(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+    pub fn read_photograph(
+        &self,
+        input: &artifact::GivenInput,
+    ) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.image else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
         let mask = self.read_mask(input, (image.width, image.height))?;
@@ -69,7 +73,11 @@ impl View {
     }
 
     /// Which pixels of its image, of that size, count; none where all do.
-    pub fn read_mask(&self, input: &artifact::GivenInput, size: (usize, usize)) -> Result<Option<Mask>, PixelError> {
+    pub fn read_mask(
+        &self,
+        input: &artifact::GivenInput,
+        size: (usize, usize),
+    ) -> Result<Option<Mask>, PixelError> {
         self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
     }
 }
@@ -126,11 +134,14 @@ pub struct Conventions {
 impl Default for Conventions {
     fn default() -> Self {
         Self {
-            camera: "OpenGL: x right, y up, looking along -z; camera_to_world = [R | t] row by row".into(),
+            camera: "OpenGL: x right, y up, looking along -z; camera_to_world = [R | t] row by \
+                row"
+            .into(),
             pixels: "pixel (i, j), row 0 on top, has its centre at (i + 0.5, j + 0.5)".into(),
             depth: "camera-space z-depth in scene units".into(),
             colour:
-                "display-encoded sRGB; PNG has straight alpha, EXR premultiplied; composite on the background in floating point"
+                "display-encoded sRGB; PNG has straight alpha, EXR premultiplied; composite on \
+                the background in floating point"
                     .into(),
         }
     }
@@ -146,14 +157,14 @@ pub enum Background {
     Black,
     /// Kept open: alpha is data, colours are premultiplied.
     Alpha,
-    /// Nothing: every ray ends on something, as in photographs. Training puts another colour there each time, so that nothing can
-    /// pretend to be it.
+    /// Nothing: every ray ends on something, as in photographs. Training puts another colour there
+    /// each time, so that nothing can pretend to be it.
     Opaque,
 }
 
 impl Background {
-    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white, what is left open of an opaque scene on
-    /// the mean of all colours.
+    /// The colour behind the scene when it has to be shown: open backgrounds are shown on white,
+    /// what is left open of an opaque scene on the mean of all colours.
     pub fn shown(self) -> f32 {
         match self {
             Self::Black => 0.0,
@@ -163,7 +174,8 @@ impl Background {
     }
 }
 
-/// An axis-aligned box around the scene, the range of distances along rays at which it lies, and how a field sees it.
+/// An axis-aligned box around the scene, the range of distances along rays at which it lies, and
+/// how a field sees it.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Bounds {
@@ -183,8 +195,10 @@ pub struct Bounds {
 impl Bounds {
     /// Whether box, range and space have an inside, all numbers finite.
     pub fn is_valid(&self) -> bool {
-        let finite = self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
-        let inside = (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far;
+        let finite =
+            self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
+        let inside =
+            (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far;
         let space = if let Space::Ndc(frustum) = &self.space { frustum.is_valid() } else { true };
         finite && inside && space
     }
@@ -226,9 +240,12 @@ impl Views {
         Self { conventions: Conventions::default(), background, bounds, views }
     }
 
-    /// The view that has a camera's name and pose. Names alone say little: Blender's training and test views have the same.
+    /// The view that has a camera's name and pose. Names alone say little: Blender's training and
+    /// test views have the same.
     pub fn taken_by(&self, camera: &Camera) -> Option<&View> {
-        self.views.iter().find(|v| v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world)
+        self.views.iter().find(|v| {
+            v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world
+        })
     }
 
     /// Reads and checks the `views.json` of an input.
@@ -249,7 +266,8 @@ impl Views {
         Ok(views)
     }
 
-    /// Refuses what can't be: no views, impossible cameras, names or paths that leave the folder, an empty box.
+    /// Refuses what can't be: no views, impossible cameras, names or paths that leave the folder,
+    /// an empty box.
     pub fn check(&self) -> Result<(), ViewsError> {
         if self.views.is_empty() {
             return Err(ViewsError::Empty);
@@ -260,12 +278,17 @@ impl Views {
         let mut names = BTreeSet::new();
         for view in &self.views {
             let name = &view.camera.name;
-            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1) && !name.contains(char::is_control);
+            let plain = relative_path(name).is_ok_and(|p| p.components().count() == 1)
+                && !name.contains(char::is_control);
             if !plain || !names.insert(name) {
                 return Err(ViewsError::Name(name.clone()));
             }
-            view.camera.check().map_err(|source| ViewsError::Camera { name: name.clone(), source })?;
-            for path in [&view.image, &view.mask, &view.depth, &view.low_resolution].into_iter().flatten() {
+            view.camera
+                .check()
+                .map_err(|source| ViewsError::Camera { name: name.clone(), source })?;
+            for path in
+                [&view.image, &view.mask, &view.depth, &view.low_resolution].into_iter().flatten()
+            {
                 check_path(path)?;
             }
         }
@@ -273,10 +296,15 @@ impl Views {
     }
 }
 
-/// Refuses paths that leave the folder, or that would do something to a terminal where they are printed.
+/// Refuses paths that leave the folder, or that would do something to a terminal where they are
+/// printed.
 fn check_path(path: &str) -> Result<(), ViewsError> {
     relative_path(path).map_err(ViewsError::Path)?;
-    if path.contains(char::is_control) { Err(ViewsError::Path(format!("{path:?} has control characters"))) } else { Ok(()) }
+    if path.contains(char::is_control) {
+        Err(ViewsError::Path(format!("{path:?} has control characters")))
+    } else {
+        Ok(())
+    }
 }
 
 #[cfg(test)]

@@ -26,37 +26,47 @@ pub struct Visibility {
 
 /// Two depths of one surface differ by at most this share of them,
 const SAME: f64 = 0.02;
-/// or what one view sees at the other's depth it sees in the same pixel, at most so many pixels away: of a far wall views from nearly one place
-/// tell depth badly, and it matters as little.
+/// or what one view sees at the other's depth it sees in the same pixel, at most so many pixels
+/// away: of a far wall views from nearly one place tell depth badly, and it matters as little.
 const SAME_PLACE: f64 = 0.5;
 
 impl Surface<'_> {
-    /// Where another view sees what this one sees at each pixel, row by row: [`Surface::visibility`]'s places.
+    /// Where another view sees what this one sees at each pixel, row by row:
+    /// [`Surface::visibility`]'s places.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel.
     pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
-        (0..width * height).map(|i| self.visibility(i % width, i / width, other).map(|s| s.place)).collect()
+        (0..width * height)
+            .map(|i| self.visibility(i % width, i / width, other).map(|s| s.place))
+            .collect()
     }
 
-    /// How another view sees what this one sees at a pixel. `None` where this view sees no surface, the other doesn't look, or something
-    /// stands between.
+    /// How another view sees what this one sees at a pixel. `None` where this view sees no surface,
+    /// the other doesn't look, or something stands between.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
     pub fn visibility(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Visibility> {
         let (visibility, point) = self.look(column, row, other.camera)?;
         let place = [column as f64 + 0.5, row as f64 + 0.5];
-        other.shows(point, visibility.place.map(f64::from), (self.camera, place)).then_some(visibility)
+        other
+            .shows(point, visibility.place.map(f64::from), (self.camera, place))
+            .then_some(visibility)
     }
 
     /// The same, were nothing between: how a camera would see it through whatever stands there.
     ///
     /// # Panics
     /// Where a list hasn't one number a pixel, or the pixel lies outside.
-    pub fn visibility_through(&self, column: usize, row: usize, other: &Camera) -> Option<Visibility> {
+    pub fn visibility_through(
+        &self,
+        column: usize,
+        row: usize,
+        other: &Camera,
+    ) -> Option<Visibility> {
         self.look(column, row, other).map(|(visibility, _)| visibility)
     }
 
@@ -77,15 +87,17 @@ impl Surface<'_> {
         let visibility = Visibility {
             place: [x as f32, y as f32],
             cosine: (ray.direction.dot(way) / way.length()) as f32,
-            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length())) as f32,
+            detail: (other.intrinsics.fx * distance / (self.camera.intrinsics.fx * way.length()))
+                as f32,
         };
         is_inside.then_some((visibility, point))
     }
 
-    /// Whether what this view sees at a position is a point that another sees at a place: by the depth of one of the four pixels around,
-    /// which all lie in the image or at its border.
+    /// Whether what this view sees at a position is a point that another sees at a place: by the
+    /// depth of one of the four pixels around, which all lie in the image or at its border.
     fn shows(&self, point: DVec3, [x, y]: [f64; 2], (other, place): (&Camera, [f64; 2])) -> bool {
-        let (width, height) = (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
+        let (width, height) =
+            (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
         let around = |v: f64, size: usize| {
             let low = (v - 0.5).floor().max(0.0) as usize;
             [low.min(size - 1), (low + 1).min(size - 1)]
@@ -116,10 +128,15 @@ mod tests {
     fn camera(centre: DVec3, turn: f64) -> Camera {
         let r = DMat3::from_axis_angle(DVec3::Y, turn);
         let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
-        Camera { name: "c".into(), intrinsics: Intrinsics::from_angle_x(64, 48, 0.9), camera_to_world: [row(0), row(1), row(2)] }
+        Camera {
+            name: "c".into(),
+            intrinsics: Intrinsics::from_angle_x(64, 48, 0.9),
+            camera_to_world: [row(0), row(1), row(2)],
+        }
     }
 
-    /// A wall at z = 0 and, before it, a plate at z = 1 over x in -0.3..=0.3: depth along each pixel's ray.
+    /// A wall at z = 0 and, before it, a plate at z = 1 over x in -0.3..=0.3: depth along each
+    /// pixel's ray.
     fn depths(camera: &Camera, has_plate: bool) -> Vec<f32> {
         (0..64 * 48)
             .map(|i| {
@@ -133,12 +150,15 @@ mod tests {
 
     #[test]
     fn places_are_those_of_the_same_surface_point() {
-        let (a, b) = (camera(DVec3::new(-0.3, 0.0, 4.0), -0.05), camera(DVec3::new(0.5, 0.2, 4.5), 0.1));
+        let (a, b) =
+            (camera(DVec3::new(-0.3, 0.0, 4.0), -0.05), camera(DVec3::new(0.5, 0.2, 4.5), 0.1));
         let opacity = vec![1.0; 64 * 48];
         for has_plate in [false, true] {
             let (da, db) = (depths(&a, has_plate), depths(&b, has_plate));
-            let (from_a, from_b) =
-                (Surface { camera: &a, depth: &da, opacity: &opacity }, Surface { camera: &b, depth: &db, opacity: &opacity });
+            let (from_a, from_b) = (
+                Surface { camera: &a, depth: &da, opacity: &opacity },
+                Surface { camera: &b, depth: &db, opacity: &opacity },
+            );
             let mut seen = 0;
             for (i, place) in from_a.seen_from(&from_b).into_iter().enumerate() {
                 let ray = a.ray((i % 64) as f64 + 0.5, (i / 64) as f64 + 0.5);
@@ -150,11 +170,18 @@ mod tests {
                 let at_plate = b.centre() + way * ((1.0 - b.centre().z) / way.z);
                 let hidden = has_plate && point.z < 0.5 && at_plate.x.abs() <= 0.3;
                 let at_edge = has_plate && (at_plate.x.abs() - 0.3).abs() < 0.1;
-                let through = from_a.visibility_through(i % 64, i / 64, &b).map(|visibility| visibility.place);
-                assert!(through.is_some() == inside && (place.is_none() || place == through), "pixel {i} through what hides it");
+                let through = from_a
+                    .visibility_through(i % 64, i / 64, &b)
+                    .map(|visibility| visibility.place);
+                assert!(
+                    through.is_some() == inside && (place.is_none() || place == through),
+                    "pixel {i} through what hides it"
+                );
                 match place {
                     Some([px, py]) => {
-                        assert!((f64::from(px) - x).abs() < 1e-3 && (f64::from(py) - y).abs() < 1e-3);
+                        assert!(
+                            (f64::from(px) - x).abs() < 1e-3 && (f64::from(py) - y).abs() < 1e-3
+                        );
                         assert!(inside && (!hidden || at_edge), "pixel {i} is hidden");
                         seen += 1;
                     }
@@ -166,22 +193,34 @@ mod tests {
         let nothing = vec![0.0; 64 * 48];
         let (da, db) = (depths(&a, false), depths(&b, false));
         let empty = Surface { camera: &a, depth: &da, opacity: &nothing };
-        assert!(empty.seen_from(&Surface { camera: &b, depth: &db, opacity: &opacity }).iter().all(Option::is_none));
+        assert!(
+            empty
+                .seen_from(&Surface { camera: &b, depth: &db, opacity: &opacity })
+                .iter()
+                .all(Option::is_none)
+        );
     }
 
-    /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place: then it is seen in the same pixel.
+    /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place:
+    /// then it is seen in the same pixel.
     #[test]
     fn depth_matters_as_far_as_it_moves_what_is_seen() {
         let opacity = vec![1.0; 64 * 48];
         let a = camera(DVec3::new(0.0, 0.0, 4.0), 0.0);
         let seen = |baseline: f64, off: f32| {
             let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
-            let (da, db): (Vec<f32>, Vec<f32>) = (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
+            let (da, db): (Vec<f32>, Vec<f32>) =
+                (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
             let other = Surface { camera: &b, depth: &db, opacity: &opacity };
-            Surface { camera: &a, depth: &da, opacity: &opacity }.seen_from(&other).iter().flatten().count()
+            Surface { camera: &a, depth: &da, opacity: &opacity }
+                .seen_from(&other)
+                .iter()
+                .flatten()
+                .count()
         };
         let all = 64 * 48;
-        // 66 pixels of focal length: from 0.5 units aside 5 % of 4 units are 0.4 pixels, from 2 units 1.6.
+        // 66 pixels of focal length: from 0.5 units aside 5 % of 4 units are 0.4 pixels, from 2
+        // units 1.6.
         assert!(seen(0.5, 1.05) > all * 3 / 4 && seen(0.5, 1.05) == seen(0.5, 1.0));
         assert_eq!(seen(2.0, 1.05), 0);
         assert!(seen(2.0, 1.015) > 0);
@@ -189,7 +228,8 @@ mod tests {
 
     #[test]
     fn any_depth_is_no_panic() {
-        let (a, b) = (camera(DVec3::new(0.0, 0.0, 4.0), 0.0), camera(DVec3::new(0.5, 0.2, 4.5), 3.0));
+        let (a, b) =
+            (camera(DVec3::new(0.0, 0.0, 4.0), 0.0), camera(DVec3::new(0.5, 0.2, 4.5), 3.0));
         let opacity = vec![1.0; 64 * 48];
         for depth in [f32::NAN, f32::INFINITY, -1.0, 0.0, 1e38, 1e-38] {
             let depth = vec![depth; 64 * 48];

@@ -39,7 +39,9 @@ impl FromStr for Memory {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let problem = || format!("{text:?} is no amount of memory; write a number with M, G or T, such as 8G");
+        let problem = || {
+            format!("{text:?} is no amount of memory; write a number with M, G or T, such as 8G")
+        };
         let (count, last) = split_unit(text).ok_or_else(problem)?;
         let unit = MEMORY_UNITS.iter().find(|(unit, _)| *unit == last).ok_or_else(problem)?.1;
         let mib = count.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
@@ -52,7 +54,8 @@ impl FromStr for Period {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let problem = || format!("{text:?} is no time; write numbers with d, h, m or s, such as 2h or 1h30m");
+        let problem =
+            || format!("{text:?} is no time; write numbers with d, h, m or s, such as 2h or 1h30m");
         let mut units = PERIOD_UNITS.iter();
         let mut seconds = 0u64;
         for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
@@ -75,7 +78,10 @@ fn split_unit(text: &str) -> Option<(&str, char)> {
 
 impl Display for Memory {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        let (name, unit) = MEMORY_UNITS.iter().find(|(_, unit)| self.mib.is_multiple_of(*unit)).unwrap_or(&('M', 1));
+        let (name, unit) = MEMORY_UNITS
+            .iter()
+            .find(|(_, unit)| self.mib.is_multiple_of(*unit))
+            .unwrap_or(&('M', 1));
         write!(f, "{}{name}", self.mib / unit)
     }
 }
@@ -94,7 +100,9 @@ impl Display for Period {
 }
 
 /// Reads an amount; a bare number gets the amount's own error, which says what is missing.
-pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = String>>(deserializer: D) -> Result<T, D::Error> {
+pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = String>>(
+    deserializer: D,
+) -> Result<T, D::Error> {
     struct Words<T>(PhantomData<T>);
     impl<T: FromStr<Err = String>> Visitor<'_> for Words<T> {
         type Value = T;
@@ -145,13 +153,19 @@ mod tests {
 
     #[test]
     fn amounts_of_memory() {
-        for (text, mib, shown) in
-            [("512M", 512, "512M"), ("8G", 8192, "8G"), ("1024M", 1024, "1G"), ("1T", 1 << 20, "1T"), ("1500M", 1500, "1500M")]
-        {
+        for (text, mib, shown) in [
+            ("512M", 512, "512M"),
+            ("8G", 8192, "8G"),
+            ("1024M", 1024, "1G"),
+            ("1T", 1 << 20, "1T"),
+            ("1500M", 1500, "1500M"),
+        ] {
             let memory: Memory = text.parse().unwrap();
             assert_eq!((memory.mib, memory.to_string().as_str()), (mib, shown));
         }
-        for text in ["", "G", "8", "0G", "-8G", "8GB", "8g", "1.5G", "8 G", "18446744073709551615T", "８G"] {
+        for text in
+            ["", "G", "8", "0G", "-8G", "8GB", "8g", "1.5G", "8 G", "18446744073709551615T", "８G"]
+        {
             assert!(text.parse::<Memory>().unwrap_err().contains("such as 8G"), "{text}");
         }
     }
@@ -166,9 +180,25 @@ mod tests {
             ("1h30m", 5400, 90, "1h30m"),
         ] {
             let period: Period = text.parse().unwrap();
-            assert_eq!((period.seconds, period.minutes(), period.to_string().as_str()), (seconds, minutes, shown));
+            assert_eq!(
+                (period.seconds, period.minutes(), period.to_string().as_str()),
+                (seconds, minutes, shown)
+            );
         }
-        for text in ["", "2", "h", "0m", "-2h", "2H", "30m1h", "1h1h", "2:00:00", "1.5h", "1h ", "99999999999999999999d"] {
+        for text in [
+            "",
+            "2",
+            "h",
+            "0m",
+            "-2h",
+            "2H",
+            "30m1h",
+            "1h1h",
+            "2:00:00",
+            "1.5h",
+            "1h ",
+            "99999999999999999999d",
+        ] {
             assert!(text.parse::<Period>().unwrap_err().contains("such as 2h"), "{text}");
         }
     }

@@ -26,9 +26,16 @@ pub(crate) struct Order<'a> {
 impl Order<'_> {
     pub(crate) fn arguments(&self) -> Vec<OsString> {
         let Self { resources, site, .. } = self;
-        let name: String = self.name.chars().map(|c| if c.is_control() { ' ' } else { c }).take(LONGEST_NAME).collect();
+        let name: String = self
+            .name
+            .chars()
+            .map(|c| if c.is_control() { ' ' } else { c })
+            .take(LONGEST_NAME)
+            .collect();
         let mut words: Vec<OsString> =
-            ["--parsable", "--nodes=1", "--ntasks=1", "--requeue", "--open-mode=append"].map(OsString::from).into();
+            ["--parsable", "--nodes=1", "--ntasks=1", "--requeue", "--open-mode=append"]
+                .map(OsString::from)
+                .into();
         words.push(pair("--job-name", name));
         words.push(pair("--chdir", self.folder));
         words.push(pair("--output", verbatim(self.log)));
@@ -39,7 +46,8 @@ impl Order<'_> {
             ("--gres", resources.gpus.filter(|&n| n > 0).map(|n| format!("gpu:{n}"))),
             ("--time", resources.time.map(|time| time.minutes().to_string())),
         ];
-        let places = [("--partition", &site.partition), ("--account", &site.account), ("--qos", &site.qos)];
+        let places =
+            [("--partition", &site.partition), ("--account", &site.account), ("--qos", &site.qos)];
         let given = numbers.into_iter().chain(places.map(|(name, value)| (name, value.clone())));
         words.extend(given.filter_map(|(name, value)| Some(pair(name, value?))));
         if !self.after.is_empty() {
@@ -65,7 +73,9 @@ fn pair(name: &str, value: impl AsRef<std::ffi::OsStr>) -> OsString {
 fn verbatim(path: &Path) -> OsString {
     use std::os::unix::ffi::{OsStrExt as _, OsStringExt as _};
     let bytes = path.as_os_str().as_bytes().iter();
-    OsString::from_vec(bytes.flat_map(|&b| if b == b'%' { vec![b'%', b'%'] } else { vec![b] }).collect())
+    OsString::from_vec(
+        bytes.flat_map(|&b| if b == b'%' { vec![b'%', b'%'] } else { vec![b] }).collect(),
+    )
 }
 
 #[cfg(test)]
@@ -85,7 +95,8 @@ mod tests {
             script: Path::new("/s/job.sh"),
             number: 7,
         };
-        let words: Vec<String> = order.arguments().into_iter().map(|word| word.into_string().unwrap()).collect();
+        let words: Vec<String> =
+            order.arguments().into_iter().map(|word| word.into_string().unwrap()).collect();
         words.join("|")
     }
 
@@ -96,7 +107,12 @@ mod tests {
     fn each_wish_is_an_argument() {
         for (resources, site, after, expected) in [
             ("{}", "{}", &[][..], ""),
-            ("{cpus: 4, mem: 8G, gpus: 1, time: 2h}", "{}", &[], "|--cpus-per-task=4|--mem=8192M|--gres=gpu:1|--time=120"),
+            (
+                "{cpus: 4, mem: 8G, gpus: 1, time: 2h}",
+                "{}",
+                &[],
+                "|--cpus-per-task=4|--mem=8192M|--gres=gpu:1|--time=120",
+            ),
             ("{gpus: 0, time: 61s}", "{}", &[], "|--time=2"),
             ("{}", "{partition: a, account: b, qos: c}", &[], "|--partition=a|--account=b|--qos=c"),
             ("{}", "{}", &["5", "6"], "|--dependency=afterok:5:6|--kill-on-invalid-dep=yes"),

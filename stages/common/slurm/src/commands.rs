@@ -23,7 +23,10 @@ pub fn this_job() -> Option<String> {
 
 /// The cores that this job may use; outside of a job all of the machine.
 pub fn cores() -> usize {
-    let given = std::env::var("SLURM_CPUS_ON_NODE").ok().and_then(|text| text.parse().ok()).filter(|&n| n > 0);
+    let given = std::env::var("SLURM_CPUS_ON_NODE")
+        .ok()
+        .and_then(|text| text.parse().ok())
+        .filter(|&n| n > 0);
     given.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, std::num::NonZero::get))
 }
 
@@ -40,7 +43,10 @@ impl Slurm {
         let last = said.trim().lines().last().unwrap_or_default();
         let id = last.split(';').next().unwrap_or_default();
         if id.is_empty() || !id.bytes().all(|b| b.is_ascii_digit()) {
-            return Err(SlurmError::Refused { program: "sbatch", said: format!("it gave no job's number but {last:?}") });
+            return Err(SlurmError::Refused {
+                program: "sbatch",
+                said: format!("it gave no job's number but {last:?}"),
+            });
         }
         Ok(id.to_owned())
     }
@@ -60,19 +66,32 @@ impl Slurm {
         self.call("scontrol", &["requeue", id]).map(drop)
     }
 
-    fn call(&self, program: &'static str, arguments: &[impl AsRef<OsStr>]) -> Result<String, SlurmError> {
-        let path = self.folder.as_ref().map_or_else(|| PathBuf::from(program), |folder| folder.join(program));
+    fn call(
+        &self,
+        program: &'static str,
+        arguments: &[impl AsRef<OsStr>],
+    ) -> Result<String, SlurmError> {
+        let path = self
+            .folder
+            .as_ref()
+            .map_or_else(|| PathBuf::from(program), |folder| folder.join(program));
         let mut command = Command::new(path);
         // What a user wants to see of the queue by default hides nothing here.
-        for (name, _) in std::env::vars_os().filter(|(name, _)| name.as_encoded_bytes().starts_with(b"SQUEUE_")) {
+        for (name, _) in
+            std::env::vars_os().filter(|(name, _)| name.as_encoded_bytes().starts_with(b"SQUEUE_"))
+        {
             command.env_remove(name);
         }
-        let output = command.args(arguments).output().map_err(|source| SlurmError::Absent { program, source })?;
+        let output = command
+            .args(arguments)
+            .output()
+            .map_err(|source| SlurmError::Absent { program, source })?;
         if output.status.success() {
             return Ok(String::from_utf8_lossy(&output.stdout).into_owned());
         }
         let said = String::from_utf8_lossy(&output.stderr);
-        let lines: Vec<&str> = said.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+        let lines: Vec<&str> =
+            said.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
         let said = lines.join("; ").replace(&format!("{program}: "), "");
         let said = if said.is_empty() { format!("it failed ({})", output.status) } else { said };
         Err(SlurmError::Refused { program, said })

@@ -1,11 +1,15 @@
 //! Slurm from outside: tasks that need one another become jobs, and nobody stays to watch them.
 //!
-//! * [`Resources`]: what a stage needs, as a pipeline file says it. [`Site`]: what a cluster wants besides.
-//! * [`Submission`]: a folder with the tasks, the job's script and the jobs' logs; a task is known again by its identity.
-//! * [`Queue`]: the jobs of a store, asked for once. Slurm's queue is the only place in which it stands what is queued.
+//! * [`Resources`]: what a stage needs, as a pipeline file says it. [`Site`]: what a cluster wants
+//!   besides.
+//! * [`Submission`]: a folder with the tasks, the job's script and the jobs' logs; a task is known
+//!   again by its identity.
+//! * [`Queue`]: the jobs of a store, asked for once. Slurm's queue is the only place in which it
+//!   stands what is queued.
 //! * [`Submission::submit`]: a job for each task that isn't done and isn't queued.
 //!
-//! This crate knows neither stages nor artifacts. What a job does is the command's affair that its script runs.
+//! This crate knows neither stages nor artifacts. What a job does is the command's affair that its
+//! script runs.
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 

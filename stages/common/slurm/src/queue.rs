@@ -39,7 +39,8 @@ pub struct Queue {
 impl Job {
     /// Whether the task may still become done by it.
     fn is_live(&self) -> bool {
-        !["COMPLETING", "STAGE_OUT"].contains(&self.state.as_str()) && self.reason != "DependencyNeverSatisfied"
+        !["COMPLETING", "STAGE_OUT"].contains(&self.state.as_str())
+            && self.reason != "DependencyNeverSatisfied"
     }
 
     /// As people read it: `job 17 pending: Dependency`.
@@ -54,9 +55,11 @@ impl Job {
     /// A line of the queue, where it is of a job of this store.
     fn parse(line: &str, root: &str) -> Option<Self> {
         let mut fields = line.splitn(4, '|');
-        let (id, state, reason, command) = (fields.next()?, fields.next()?, fields.next()?, fields.next()?);
+        let (id, state, reason, command) =
+            (fields.next()?, fields.next()?, fields.next()?, fields.next()?);
         let (script, number) = command.trim_end().rsplit_once(' ')?;
-        let submission = script.strip_prefix(root)?.strip_prefix("/slurm/")?.strip_suffix("/job.sh")?;
+        let submission =
+            script.strip_prefix(root)?.strip_prefix("/slurm/")?.strip_suffix("/job.sh")?;
         if submission.contains('/') {
             return None;
         }
@@ -72,10 +75,12 @@ impl Job {
 }
 
 impl Queue {
-    /// Asks Slurm once for the jobs of all who have submitted from this store; not at all where nobody has.
+    /// Asks Slurm once for the jobs of all who have submitted from this store; not at all where
+    /// nobody has.
     pub fn look(slurm: &Slurm, root: &Path) -> Result<Self, SlurmError> {
         let folders = all(root)?;
-        let users: BTreeSet<u32> = folders.iter().filter_map(|(_, folder)| Some(folder.metadata().ok()?.uid())).collect();
+        let users: BTreeSet<u32> =
+            folders.iter().filter_map(|(_, folder)| Some(folder.metadata().ok()?.uid())).collect();
         if users.is_empty() {
             return Ok(Self::default());
         }
@@ -87,7 +92,9 @@ impl Queue {
         let read = |id: &str| Some((id.to_owned(), Submission::read(root, id)?));
         let submissions: BTreeMap<String, Submission> = ids.into_iter().filter_map(read).collect();
         for job in &mut jobs {
-            let task = submissions.get(&job.submission).and_then(|submission| submission.tasks.get(job.number));
+            let task = submissions
+                .get(&job.submission)
+                .and_then(|submission| submission.tasks.get(job.number));
             job.task = task.cloned().unwrap_or_default();
         }
         Ok(Self { jobs })
@@ -111,9 +118,18 @@ mod tests {
     #[test]
     fn lines_of_the_queue() {
         for (line, expected) in [
-            ("17|PENDING|Dependency|/a b/s/slurm/1-2-0/job.sh 4", Some(("17", "1-2-0", 4, "job 17 pending: Dependency", true))),
-            ("18|RUNNING|None|/a b/s/slurm/1-2-0/job.sh 0", Some(("18", "1-2-0", 0, "job 18 running", true))),
-            ("18|COMPLETING|None|/a b/s/slurm/1-2-0/job.sh 0", Some(("18", "1-2-0", 0, "job 18 completing", false))),
+            (
+                "17|PENDING|Dependency|/a b/s/slurm/1-2-0/job.sh 4",
+                Some(("17", "1-2-0", 4, "job 17 pending: Dependency", true)),
+            ),
+            (
+                "18|RUNNING|None|/a b/s/slurm/1-2-0/job.sh 0",
+                Some(("18", "1-2-0", 0, "job 18 running", true)),
+            ),
+            (
+                "18|COMPLETING|None|/a b/s/slurm/1-2-0/job.sh 0",
+                Some(("18", "1-2-0", 0, "job 18 completing", false)),
+            ),
             (
                 "19|PENDING|DependencyNeverSatisfied|/a b/s/slurm/x/job.sh 12",
                 Some(("19", "x", 12, "job 19 pending: DependencyNeverSatisfied", false)),
@@ -127,8 +143,20 @@ mod tests {
             ("", None),
         ] {
             let job = Job::parse(line, "/a b/s");
-            let found = job.as_ref().map(|j| (j.id.as_str(), j.submission.as_str(), j.number, j.words(), j.is_live()));
-            assert_eq!(found, expected.map(|(id, run, number, words, live)| (id, run, number, words.to_owned(), live)), "{line}");
+            let found = job
+                .as_ref()
+                .map(|j| (j.id.as_str(), j.submission.as_str(), j.number, j.words(), j.is_live()));
+            assert_eq!(
+                found,
+                expected.map(|(id, run, number, words, live)| (
+                    id,
+                    run,
+                    number,
+                    words.to_owned(),
+                    live
+                )),
+                "{line}"
+            );
         }
     }
 
@@ -137,7 +165,11 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         assert!(Queue::look(&Slurm::in_folder("/nowhere"), root.path()).unwrap().jobs.is_empty());
         std::fs::create_dir_all(root.path().join("slurm/1-2-0")).unwrap();
-        let problem = Queue::look(&Slurm::in_folder("/nowhere"), root.path()).unwrap_err().to_string();
-        assert!(problem.starts_with("squeue: No such file") && problem.ends_with("on PATH"), "{problem}");
+        let problem =
+            Queue::look(&Slurm::in_folder("/nowhere"), root.path()).unwrap_err().to_string();
+        assert!(
+            problem.starts_with("squeue: No such file") && problem.ends_with("on PATH"),
+            "{problem}"
+        );
     }
 }

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::amounts::{Memory, Period};
 
-/// What a stage needs of a machine. It changes no result and is in no key; a GPU does change the device.
+/// What a stage needs of a machine. It changes no result and is in no key; a GPU does change the
+/// device.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Resources {
@@ -29,7 +30,12 @@ impl Resources {
     /// These, where another doesn't say otherwise.
     #[must_use]
     pub fn changed(&self, by: &Self) -> Self {
-        Self { cpus: by.cpus.or(self.cpus), mem: by.mem.or(self.mem), gpus: by.gpus.or(self.gpus), time: by.time.or(self.time) }
+        Self {
+            cpus: by.cpus.or(self.cpus),
+            mem: by.mem.or(self.mem),
+            gpus: by.gpus.or(self.gpus),
+            time: by.time.or(self.time),
+        }
     }
 
     /// Whether it computes on a GPU.
@@ -50,7 +56,8 @@ mod tests {
     #[test]
     fn a_block_says_what_it_wants_otherwise() {
         let read = |text: &str| serde_yaml::from_str::<Resources>(text).unwrap();
-        let both = read("{cpus: 4, mem: 8G, gpus: 1}").changed(&read("{cpus: 8, gpus: 0, time: 2h}"));
+        let both =
+            read("{cpus: 4, mem: 8G, gpus: 1}").changed(&read("{cpus: 8, gpus: 0, time: 2h}"));
         assert_eq!(both, read("{cpus: 8, mem: 8G, gpus: 0, time: 2h}"));
         assert!(!both.has_gpu() && read("gpus: 2").has_gpu() && !Resources::default().has_gpu());
         let text = serde_json::to_string(&both).unwrap();

@@ -4,9 +4,11 @@ use std::ffi::OsStr;
 
 use crate::site::Site;
 
-/// The script: the site's lines, and then the command in the shell's place. So Slurm's signals reach the command.
+/// The script: the site's lines, and then the command in the shell's place. So Slurm's signals
+/// reach the command.
 pub(crate) fn script(site: &Site, command: &[&OsStr]) -> Vec<u8> {
-    let mut text = b"#!/bin/bash\n# One task of a submission; its number is the argument.\nset -e\n".to_vec();
+    let mut text =
+        b"#!/bin/bash\n# One task of a submission; its number is the argument.\nset -e\n".to_vec();
     for line in &site.setup {
         text.extend_from_slice(line.as_bytes());
         text.push(b'\n');
@@ -53,6 +55,9 @@ mod tests {
         assert_eq!(String::from_utf8_lossy(&output.stdout), format!("[good day][{awkward}][17]"));
         let failing = Site { setup: vec!["false".to_owned()], ..Site::default() };
         std::fs::write(&path, script(&failing, &[OsStr::new("true")])).unwrap();
-        assert!(!Command::new("bash").arg(&path).status().unwrap().success(), "a set-up line that fails ends the job");
+        assert!(
+            !Command::new("bash").arg(&path).status().unwrap().success(),
+            "a set-up line that fails ends the job"
+        );
     }
 }

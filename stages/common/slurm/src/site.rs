@@ -6,7 +6,8 @@ use crate::amounts::Period;
 use crate::error::SlurmError;
 use crate::resources::Resources;
 
-/// What a cluster wants that is no pipeline's affair: it stands outside of it, and outside every key.
+/// What a cluster wants that is no pipeline's affair: it stands outside of it, and outside every
+/// key.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Site {
@@ -49,14 +50,20 @@ impl Site {
         if let Some(file) = file {
             return Self::read(file);
         }
-        let usual = std::env::var_os("HOME").map(|home| PathBuf::from(home).join(".config/nerf-sr/slurm.yaml"));
-        usual.filter(|file| file.exists()).map_or_else(|| Ok(Self::default()), |file| Self::read(&file))
+        let usual = std::env::var_os("HOME")
+            .map(|home| PathBuf::from(home).join(".config/nerf-sr/slurm.yaml"));
+        usual
+            .filter(|file| file.exists())
+            .map_or_else(|| Ok(Self::default()), |file| Self::read(&file))
     }
 
     /// Why a job with these resources could never get anywhere.
     pub fn problem(&self, resources: &Resources) -> Option<String> {
         let time = resources.time.filter(|time| time.seconds <= self.notice.seconds)?;
-        Some(format!("resources: time: {time} is no longer than the site's notice of {}; give it more", self.notice))
+        Some(format!(
+            "resources: time: {time} is no longer than the site's notice of {}; give it more",
+            self.notice
+        ))
     }
 
     fn read(path: &Path) -> Result<Self, SlurmError> {
@@ -66,7 +73,10 @@ impl Site {
         }
         let site: Self = serde_yaml::from_str(&text).map_err(|e| SlurmError::file(path, e))?;
         if site.notice.seconds > LONGEST_NOTICE {
-            return Err(SlurmError::file(path, format!("notice: {} is too long; Slurm takes at most 18h", site.notice)));
+            return Err(SlurmError::file(
+                path,
+                format!("notice: {} is too long; Slurm takes at most 18h", site.notice),
+            ));
         }
         Ok(site)
     }
@@ -85,11 +95,20 @@ mod tests {
             Site::find(Some(&file))
         };
         assert_eq!(read("# nothing yet\n").unwrap(), Site::default());
-        let site =
-            read("partition: gpu\nsetup: [module load cuda]\narguments: [--exclusive]\nmax_submit: 5\nnotice: 5m\n").unwrap();
-        assert_eq!((site.partition.as_deref(), site.max_submit, site.notice.seconds), (Some("gpu"), 5, 300));
-        let problem = |time: &str| site.problem(&serde_yaml::from_str(&format!("time: {time}")).unwrap());
-        assert!(problem("6m").is_none() && problem("5m").unwrap().contains("the site's notice of 5m"));
+        let site = read(
+            "partition: gpu\nsetup: [module load cuda]\narguments: \
+                [--exclusive]\nmax_submit: 5\nnotice: 5m\n",
+        )
+        .unwrap();
+        assert_eq!(
+            (site.partition.as_deref(), site.max_submit, site.notice.seconds),
+            (Some("gpu"), 5, 300)
+        );
+        let problem =
+            |time: &str| site.problem(&serde_yaml::from_str(&format!("time: {time}")).unwrap());
+        assert!(
+            problem("6m").is_none() && problem("5m").unwrap().contains("the site's notice of 5m")
+        );
         for (text, words) in [
             ("partitions: gpu", "unknown field `partitions`"),
             ("notice: 90", "notice: \"90\" is no time"),
@@ -99,6 +118,11 @@ mod tests {
             let problem = read(text).unwrap_err().to_string();
             assert!(problem.contains(words) && problem.contains("slurm.yaml"), "{problem}");
         }
-        assert!(Site::find(Some(&folder.path().join("none"))).unwrap_err().to_string().contains("No such file"));
+        assert!(
+            Site::find(Some(&folder.path().join("none")))
+                .unwrap_err()
+                .to_string()
+                .contains("No such file")
+        );
     }
 }

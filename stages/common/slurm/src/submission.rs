@@ -80,10 +80,16 @@ impl Submission {
     }
 
     /// Writes the folder, whole or not at all. The command gets the folder and a task's number.
-    pub(crate) fn write(&self, plan: &[u8], site: &Site, command: &[&OsStr]) -> Result<(), SlurmError> {
+    pub(crate) fn write(
+        &self,
+        plan: &[u8],
+        site: &Site,
+        command: &[&OsStr],
+    ) -> Result<(), SlurmError> {
         let fresh = self.folder.with_file_name(format!(".{}.new", self.id));
         let command = [command, &[self.folder.as_os_str()]].concat();
-        let tasks = serde_json::to_vec(&self.tasks).map_err(|e| SlurmError::file(&self.folder, e))?;
+        let tasks =
+            serde_json::to_vec(&self.tasks).map_err(|e| SlurmError::file(&self.folder, e))?;
         fs::create_dir_all(&fresh)
             .and_then(|()| fs::write(fresh.join(TASKS), tasks))
             .and_then(|()| fs::write(Self::plan(&fresh), plan))
@@ -114,8 +120,16 @@ pub fn job_logs(root: &Path) -> Result<BTreeMap<String, PathBuf>, SlurmError> {
     let mut logs = BTreeMap::new();
     // Names begin with the time: the newest comes last.
     for submission in all(root)?.iter().filter_map(|(id, _)| Submission::read(root, id)) {
-        let numbered = submission.tasks.iter().enumerate().map(|(number, task)| (task, submission.log(number)));
-        logs.extend(numbered.filter(|(_, log)| log.is_file()).map(|(task, log)| (task.identity.clone(), log)));
+        let numbered = submission
+            .tasks
+            .iter()
+            .enumerate()
+            .map(|(number, task)| (task, submission.log(number)));
+        logs.extend(
+            numbered
+                .filter(|(_, log)| log.is_file())
+                .map(|(task, log)| (task.identity.clone(), log)),
+        );
     }
     Ok(logs)
 }
@@ -141,7 +155,12 @@ mod tests {
     use super::*;
 
     fn task(identity: &str) -> Task {
-        Task { stage: "prep".into(), label: "prep".into(), identity: identity.into(), ..Task::default() }
+        Task {
+            stage: "prep".into(),
+            label: "prep".into(),
+            identity: identity.into(),
+            ..Task::default()
+        }
     }
 
     #[test]

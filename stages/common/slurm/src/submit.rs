@@ -39,8 +39,9 @@ pub struct Submitted {
 }
 
 impl Submission {
-    /// Submits a job for each task that isn't done and isn't queued. `done` says what is; it is asked after the queue, so that
-    /// no task falls between both. The folder is written before the first job is submitted, and only then.
+    /// Submits a job for each task that isn't done and isn't queued. `done` says what is; it is
+    /// asked after the queue, so that no task falls between both. The folder is written before the
+    /// first job is submitted, and only then.
     pub fn submit<E: From<SlurmError>>(
         &self,
         root: &Path,
@@ -57,7 +58,10 @@ impl Submission {
         for number in (0..self.tasks.len()).filter(|&number| !done[number]) {
             let task = &self.tasks[number];
             // Two blocks of a pipeline may come to one task.
-            let before = queue.job_of(&task.identity).map(|job| &job.id).or_else(|| new.get(task.identity.as_str()));
+            let before = queue
+                .job_of(&task.identity)
+                .map(|job| &job.id)
+                .or_else(|| new.get(task.identity.as_str()));
             if let Some(id) = before {
                 ids[number] = Some(id.clone());
                 submitted.queued += 1;
@@ -87,9 +91,15 @@ impl Submission {
         Ok(submitted)
     }
 
-    fn submit_one(&self, number: usize, ids: &[Option<String>], terms: &Terms<'_>) -> Result<String, SlurmError> {
+    fn submit_one(
+        &self,
+        number: usize,
+        ids: &[Option<String>],
+        terms: &Terms<'_>,
+    ) -> Result<String, SlurmError> {
         let task = &self.tasks[number];
-        let mut after: Vec<&str> = task.parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
+        let mut after: Vec<&str> =
+            task.parents.iter().filter_map(|&parent| ids[parent].as_deref()).collect();
         after.sort_unstable_by_key(|id| (id.len(), *id));
         after.dedup();
         let order = Order {
@@ -113,7 +123,8 @@ mod tests {
     use std::path::PathBuf;
     use std::process::Command;
 
-    /// A store, and programs that play Slurm's: `sbatch` writes its arguments down and counts, `squeue` prints a file.
+    /// A store, and programs that play Slurm's: `sbatch` writes its arguments down and counts,
+    /// `squeue` prints a file.
     struct Fake {
         dir: tempfile::TempDir,
     }
@@ -124,7 +135,15 @@ mod tests {
             std::fs::create_dir(fake.path("bin")).unwrap();
             std::fs::write(fake.path("queue"), "").unwrap();
             let here = fake.dir.path().display();
-            fake.program("sbatch", &format!("echo \"$@\" >> {here}/argv\nn=$(wc -l < {here}/argv)\n[ \"$n\" -le ${{MOST:-3}} ] || {{ echo 'sbatch: error: QOSMaxSubmitJobPerUserLimit' >&2; exit 1; }}\necho $((100 + n))"));
+            fake.program(
+                "sbatch",
+                &format!(
+                    "echo \"$@\" >> {here}/argv\nn=$(wc -l < \
+                {here}/argv)\n[ \"$n\" -le ${{MOST:-3}} ] || \
+                {{ echo 'sbatch: error: QOSMaxSubmitJobPerUserLimit' >&2; exit 1; }}\necho $((100 \
+                + n))"
+                ),
+            );
             fake.program("squeue", &format!("echo \"$@\" >> {here}/asked\ncat {here}/queue"));
             fake
         }
@@ -137,7 +156,11 @@ mod tests {
         fn program(&self, name: &str, text: &str) {
             let source = self.path("source");
             std::fs::write(&source, format!("#!/bin/sh\n{text}\n")).unwrap();
-            let status = Command::new("install").args(["-m", "755"]).arg(source).arg(self.path("bin").join(name)).status();
+            let status = Command::new("install")
+                .args(["-m", "755"])
+                .arg(source)
+                .arg(self.path("bin").join(name))
+                .status();
             assert!(status.unwrap().success());
         }
 
@@ -151,7 +174,8 @@ mod tests {
                 ..Task::default()
             };
             let tasks = vec![task("prep", &[]), task("train", &[0, 0]), task("other", &[])];
-            let (slurm, site) = (Slurm::in_folder(self.path("bin")), Site { max_submit: most, ..Site::default() });
+            let (slurm, site) =
+                (Slurm::in_folder(self.path("bin")), Site { max_submit: most, ..Site::default() });
             let terms = Terms {
                 slurm: &slurm,
                 site: &site,
@@ -167,15 +191,21 @@ mod tests {
         /// What stands in the queue: jobs of the submission "one".
         fn queue(&self, jobs: &[(&str, &str, usize)]) {
             let here = self.dir.path().display();
-            let line = |(id, state, n): &(&str, &str, usize)| format!("{id}|{state}|None|{here}/slurm/one/job.sh {n}\n");
+            let line = |(id, state, n): &(&str, &str, usize)| {
+                format!("{id}|{state}|None|{here}/slurm/one/job.sh {n}\n")
+            };
             std::fs::write(self.path("queue"), jobs.iter().map(line).collect::<String>()).unwrap();
         }
 
         /// The arguments that tell jobs apart, a call each.
         fn argv(&self) -> Vec<String> {
             let text = std::fs::read_to_string(self.path("argv")).unwrap_or_default();
-            let tells = |w: &&str| w.starts_with("--job-name") || w.starts_with("--dep") || w.starts_with("--kill");
-            text.lines().map(|line| line.split(' ').filter(tells).collect::<Vec<_>>().join(" ")).collect()
+            let tells = |w: &&str| {
+                w.starts_with("--job-name") || w.starts_with("--dep") || w.starts_with("--kill")
+            };
+            text.lines()
+                .map(|line| line.split(' ').filter(tells).collect::<Vec<_>>().join(" "))
+                .collect()
         }
     }
 
@@ -183,11 +213,18 @@ mod tests {
     fn a_job_waits_for_those_that_were_submitted() {
         let fake = Fake::new();
         let submitted = fake.submit("one", [false; 3], 10);
-        assert_eq!(submitted.jobs, [(0, "101".to_owned()), (1, "102".to_owned()), (2, "103".to_owned())]);
+        assert_eq!(
+            submitted.jobs,
+            [(0, "101".to_owned()), (1, "102".to_owned()), (2, "103".to_owned())]
+        );
         let train = "--job-name=train --dependency=afterok:101 --kill-on-invalid-dep=yes";
         assert_eq!(fake.argv(), ["--job-name=prep", train, "--job-name=other"]);
         let script = std::fs::read_to_string(fake.path("slurm/one/job.sh")).unwrap();
-        assert!(script.ends_with(&format!("exec 'run' '{}' \"$1\"\n", fake.path("slurm/one").display())), "{script}");
+        assert!(
+            script
+                .ends_with(&format!("exec 'run' '{}' \"$1\"\n", fake.path("slurm/one").display())),
+            "{script}"
+        );
     }
 
     #[test]
@@ -196,7 +233,10 @@ mod tests {
         assert_eq!(fake.submit("one", [true, false, true], 10).jobs.len(), 1);
         assert_eq!(fake.argv(), ["--job-name=train"]);
         let nothing = fake.submit("two", [true; 3], 10);
-        assert!(nothing.jobs.is_empty() && all(fake.dir.path()).unwrap().len() == 1, "a submission without jobs leaves nothing");
+        assert!(
+            nothing.jobs.is_empty() && all(fake.dir.path()).unwrap().len() == 1,
+            "a submission without jobs leaves nothing"
+        );
     }
 
     #[test]
@@ -207,12 +247,23 @@ mod tests {
         let second = fake.submit("two", [false, false, false], 10);
         // The fake refuses a fourth call: train was cancelled, and waits for the queued job.
         assert_eq!((second.queued, second.left), (2, 1));
-        assert_eq!(fake.argv()[3], "--job-name=train --dependency=afterok:101 --kill-on-invalid-dep=yes");
+        assert_eq!(
+            fake.argv()[3],
+            "--job-name=train --dependency=afterok:101 --kill-on-invalid-dep=yes"
+        );
         assert_eq!(second.error.unwrap().to_string(), "sbatch: error: QOSMaxSubmitJobPerUserLimit");
         fake.queue(&[("101", "COMPLETING", 0)]);
-        assert_eq!(fake.submit("three", [false, true, true], 10).queued, 0, "a job at its end makes nothing any more");
+        assert_eq!(
+            fake.submit("three", [false, true, true], 10).queued,
+            0,
+            "a job at its end makes nothing any more"
+        );
         let asked = std::fs::read_to_string(fake.path("asked")).unwrap();
-        assert_eq!(asked.lines().count(), 2, "once a submission, and not before there was one: {asked}");
+        assert_eq!(
+            asked.lines().count(),
+            2,
+            "once a submission, and not before there was one: {asked}"
+        );
     }
 
     #[test]

@@ -9,7 +9,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Description, Event, KeyLock, SUMMARY_FILE, counted, printable, sized};
-use rustix::process::{Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid};
+use rustix::process::{
+    Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid,
+};
 use wait4::{ResUse, Wait4 as _};
 
 use crate::clock::seconds;
@@ -79,7 +81,8 @@ impl StageFailure {
 /// What a call took of the machine.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Usage {
-    /// Peak resident memory in bytes, of the stage or, where it is larger, of a program that it called.
+    /// Peak resident memory in bytes, of the stage or, where it is larger, of a program that it
+    /// called.
     pub peak_memory: u64,
     /// Processor time of all its threads, and of the programs that it called, in seconds.
     pub processor_seconds: f64,
@@ -94,9 +97,14 @@ pub trait Watcher: Sync {
 }
 
 impl Call<'_> {
-    /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When `stop` is set the stage is asked to
-    /// end, so that it leaves a checkpoint.
-    pub fn run(&self, log: &Path, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<Usage, StageFailure> {
+    /// Runs the stage; appends to `log` what it was given, what it says and how it ends. When
+    /// `stop` is set the stage is asked to end, so that it leaves a checkpoint.
+    pub fn run(
+        &self,
+        log: &Path,
+        watcher: &dyn Watcher,
+        stop: &AtomicBool,
+    ) -> Result<Usage, StageFailure> {
         let log = StageLog::open(log).map_err(|e| StageFailure::at(log, &e))?;
         self.log_start(&log);
         let started = Instant::now();
@@ -104,12 +112,18 @@ impl Call<'_> {
         let time = seconds(started.elapsed().as_secs_f64());
         match &result {
             Ok(usage) => {
-                let (memory, processor) = (sized(usage.peak_memory), seconds(usage.processor_seconds));
-                log.line(format_args!("done in {time}; {processor} of processor time, {memory} of memory at most"));
-                let summary = std::fs::read_to_string(self.output.join(SUMMARY_FILE)).unwrap_or_default();
+                let (memory, processor) =
+                    (sized(usage.peak_memory), seconds(usage.processor_seconds));
+                log.line(format_args!(
+                    "done in {time}; {processor} of processor time, {memory} of memory at most"
+                ));
+                let summary =
+                    std::fs::read_to_string(self.output.join(SUMMARY_FILE)).unwrap_or_default();
                 summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
             }
-            Err(StageFailure { code, message }) => log.line(format_args!("failed after {time} with {code}: {message}")),
+            Err(StageFailure { code, message }) => {
+                log.line(format_args!("failed after {time} with {code}: {message}"))
+            }
         }
         result
     }
@@ -123,15 +137,27 @@ impl Call<'_> {
             counted(self.threads, "thread")
         ));
         log.line(format_args!("device: {}", self.device));
-        let parameters = std::fs::read(self.params).ok().and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
+        let parameters = std::fs::read(self.params)
+            .ok()
+            .and_then(|b| serde_json::from_slice::<serde_json::Value>(&b).ok());
         log.line(format_args!("parameters: {}", parameters.unwrap_or_default()));
         for (name, folder) in self.inputs {
-            let hash = self.hashes.iter().find(|(of, _)| of == name).map(|(_, hash)| format!(" ({hash})")).unwrap_or_default();
+            let hash = self
+                .hashes
+                .iter()
+                .find(|(of, _)| of == name)
+                .map(|(_, hash)| format!(" ({hash})"))
+                .unwrap_or_default();
             log.line(format_args!("input {name}: {}{hash}", folder.display()));
         }
     }
 
-    fn carry_out(&self, log: &StageLog, watcher: &dyn Watcher, stop: &AtomicBool) -> Result<Usage, StageFailure> {
+    fn carry_out(
+        &self,
+        log: &StageLog,
+        watcher: &dyn Watcher,
+        stop: &AtomicBool,
+    ) -> Result<Usage, StageFailure> {
         let fail = |e: std::io::Error| StageFailure::at(self.program, &e);
         let stdin = match self.lock {
             Some(lock) => Stdio::from(lock.share().map_err(fail)?),
@@ -156,7 +182,8 @@ impl Call<'_> {
             Err(end.failure(&self.description.name))
         };
         // Not twice: as what it said, and as the reason.
-        let is_reason = |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
+        let is_reason =
+            |line: &String| result.as_ref().is_err_and(|failure| line.ends_with(&failure.message));
         if let Some(last) = last.filter(|line| !is_reason(line)) {
             watcher.said(&last);
         }
@@ -174,11 +201,25 @@ impl Call<'_> {
         if let Some(work) = self.work {
             command.arg("--work").arg(work);
         }
-        command.args(["--device", self.device, "--threads", &self.threads.to_string(), "--progress", "json"]);
+        command.args([
+            "--device",
+            self.device,
+            "--threads",
+            &self.threads.to_string(),
+            "--progress",
+            "json",
+        ]);
         let declared = self.description.environment.iter().map(String::as_str);
-        let passed = ENVIRONMENT.into_iter().chain(declared).filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
-        command.env_clear().envs(passed).env(artifact::RUNNER_VARIABLE, std::process::id().to_string());
-        // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end, once.
+        let passed = ENVIRONMENT
+            .into_iter()
+            .chain(declared)
+            .filter_map(|name| Some((name.to_owned(), std::env::var_os(name)?)));
+        command
+            .env_clear()
+            .envs(passed)
+            .env(artifact::RUNNER_VARIABLE, std::process::id().to_string());
+        // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end,
+        // once.
         command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped());
         command
     }
@@ -191,15 +232,16 @@ struct Ear<'a> {
 }
 
 impl Ear<'_> {
-    /// Hears stdout: events, and what a plain script prints, which is for the log alone. Returns the reason of a failure, where
-    /// one is stated.
+    /// Hears stdout: events, and what a plain script prints, which is for the log alone. Returns
+    /// the reason of a failure, where one is stated.
     fn hear_events(&self, stdout: Option<impl Read>) -> Option<String> {
         let (mut stated, mut tenths) = (None, Tenths::default());
         for line in lines(stdout) {
             match serde_json::from_str(&line) {
                 Ok(Event::Failed { message }) => stated = Some(printable(&message).into_owned()),
                 Ok(Event::Progress { label, done, total, note }) => {
-                    let (label, note) = (printable(&label).into_owned(), printable(&note).into_owned());
+                    let (label, note) =
+                        (printable(&label).into_owned(), printable(&note).into_owned());
                     if let Some(told) = tenths.told(&label, done, total, &note) {
                         self.log.line(told);
                     }
@@ -211,7 +253,8 @@ impl Ear<'_> {
         stated
     }
 
-    /// Hears stderr, and passes on all but the last line, which may be the reason of a failure. Returns the last lines.
+    /// Hears stderr, and passes on all but the last line, which may be the reason of a failure.
+    /// Returns the last lines.
     fn hear_words(&self, stderr: Option<impl Read>) -> Vec<String> {
         let mut tail: VecDeque<String> = VecDeque::new();
         for line in lines(stderr) {
@@ -231,12 +274,22 @@ impl Ear<'_> {
     }
 }
 
-/// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open and write unseen.
+/// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open
+/// and write unseen.
 fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ResUse> {
-    let pid = i32::try_from(child.id()).ok().and_then(Pid::from_raw).ok_or(std::io::ErrorKind::InvalidInput)?;
+    let pid = i32::try_from(child.id())
+        .ok()
+        .and_then(Pid::from_raw)
+        .ok_or(std::io::ErrorKind::InvalidInput)?;
     let mut asked = false;
-    // It is looked at and not taken yet, so that its number remains its own until its group is ended.
-    while waitid(WaitId::Pid(pid), WaitIdOptions::EXITED | WaitIdOptions::NOWAIT | WaitIdOptions::NOHANG)?.is_none() {
+    // It is looked at and not taken yet, so that its number remains its own until its group is
+    // ended.
+    while waitid(
+        WaitId::Pid(pid),
+        WaitIdOptions::EXITED | WaitIdOptions::NOWAIT | WaitIdOptions::NOHANG,
+    )?
+    .is_none()
+    {
         if stop.load(Ordering::Relaxed) && !asked {
             // It may just have ended by itself.
             kill_process(pid, Signal::TERM).ok();
@@ -246,11 +299,14 @@ fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ResUse> {
     }
     // Mostly there is nothing left of its group.
     kill_process_group(pid, Signal::KILL).ok();
-    child.try_wait4()?.ok_or_else(|| std::io::Error::other("a process that has ended is still there"))
+    child
+        .try_wait4()?
+        .ok_or_else(|| std::io::Error::other("a process that has ended is still there"))
 }
 
-/// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control characters spelled out. Of what was
-/// written over in place (a foreign progress bar) the last state counts.
+/// Lines of a pipe that hold something; bytes that aren't UTF-8 are replaced, and control
+/// characters spelled out. Of what was written over in place (a foreign progress bar) the last
+/// state counts.
 fn lines(pipe: Option<impl Read>) -> impl Iterator<Item = String> {
     let reader = pipe.map(BufReader::new);
     reader.into_iter().flat_map(|r| r.split(b'\n').map_while(Result::ok)).filter_map(|bytes| {

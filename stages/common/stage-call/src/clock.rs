@@ -17,7 +17,12 @@ pub fn utc(unix: u64) -> String {
     let day = day - (153 * month + 2) / 5 + 1;
     let (month, after) = if month < 10 { (month + 3, 0) } else { (month - 9, 1) };
     let year = era * 400 + year + after;
-    format!("{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02} UTC", seconds / 3600, seconds / 60 % 60, seconds % 60)
+    format!(
+        "{year:04}-{month:02}-{day:02} {:02}:{:02}:{:02} UTC",
+        seconds / 3600,
+        seconds / 60 % 60,
+        seconds % 60
+    )
 }
 
 #[cfg(test)]

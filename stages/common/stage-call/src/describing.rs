@@ -28,11 +28,14 @@ pub type Answers = BTreeMap<PathBuf, Result<Description, String>>;
 /// Asks programs, as many at once as there are cores.
 pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
     let is_stopped = || stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
-    let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
+    let threads =
+        std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
     let next = AtomicUsize::new(0);
     let (sender, receiver) = mpsc::channel();
     let work = |sender: mpsc::Sender<(PathBuf, Result<Description, String>)>| {
-        while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped()) {
+        while let Some(path) =
+            paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped())
+        {
             // The receiver lives as long as the scope.
             sender.send((path.clone(), ask(path, LONGEST, &is_stopped))).ok();
         }
@@ -60,10 +63,15 @@ pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, 
 }
 
 /// A program's answer, or what is wrong with it.
-fn ask(path: &Path, longest: Duration, is_stopped: &dyn Fn() -> bool) -> Result<Description, String> {
+fn ask(
+    path: &Path,
+    longest: Duration,
+    is_stopped: &dyn Fn() -> bool,
+) -> Result<Description, String> {
     let command = format!("`{} describe`", path.display());
     let fail = |problem: std::io::Error| format!("{command}: {problem}");
-    // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever it has started.
+    // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever
+    // it has started.
     let mut child = Command::new(path)
         .arg("describe")
         .stdin(Stdio::null())
@@ -76,21 +84,31 @@ fn ask(path: &Path, longest: Duration, is_stopped: &dyn Fn() -> bool) -> Result<
     let deadline = Instant::now() + longest;
     let ended = wait(&mut child, deadline, is_stopped).map_err(fail)?;
     let left = || deadline.saturating_duration_since(Instant::now());
-    let answer = ended.and_then(|status| Some((status, stdout.recv_timeout(left()).ok()?, stderr.recv_timeout(left()).ok()?)));
+    let answer = ended.and_then(|status| {
+        Some((status, stdout.recv_timeout(left()).ok()?, stderr.recv_timeout(left()).ok()?))
+    });
     let Some((status, stdout, stderr)) = answer else {
         end(&mut child);
-        return Err(format!("{command} gave no answer in {longest:?}; end what it waits for, or set `run:` to another program"));
+        return Err(format!(
+            "{command} gave no answer in {longest:?}; end what it waits for, or set `run:` to \
+            another program"
+        ));
     };
     if !status.success() {
         let said = String::from_utf8_lossy(&stderr);
-        let last = said.trim_end().lines().last().unwrap_or_default().replace(char::is_control, " ");
+        let last =
+            said.trim_end().lines().last().unwrap_or_default().replace(char::is_control, " ");
         return Err(format!("{command} failed ({status}): {last}"));
     }
     serde_json::from_slice(&stdout).map_err(|e| format!("{command} gave no description: {e}"))
 }
 
 /// Waits for a program to end; `None` where it is too late or nobody waits any more.
-fn wait(child: &mut Child, deadline: Instant, is_stopped: &dyn Fn() -> bool) -> std::io::Result<Option<ExitStatus>> {
+fn wait(
+    child: &mut Child,
+    deadline: Instant,
+    is_stopped: &dyn Fn() -> bool,
+) -> std::io::Result<Option<ExitStatus>> {
     while Instant::now() < deadline && !is_stopped() {
         if let Some(status) = child.try_wait()? {
             return Ok(Some(status));
@@ -127,11 +145,19 @@ fn read(pipe: Option<impl Read + Send + 'static>) -> mpsc::Receiver<Vec<u8>> {
 mod tests {
     use super::*;
 
-    /// A program, written by another process: while this one's threads start others, a file that it has open itself can't be run.
+    /// A program, written by another process: while this one's threads start others, a file that it
+    /// has open itself can't be run.
     fn program(folder: &Path, name: &str, text: &str) -> PathBuf {
         let (source, target) = (folder.join(format!("{name}.sh")), folder.join(name));
         std::fs::write(&source, text).unwrap();
-        assert!(Command::new("install").args(["-m", "755"]).args([&source, &target]).status().unwrap().success());
+        assert!(
+            Command::new("install")
+                .args(["-m", "755"])
+                .args([&source, &target])
+                .status()
+                .unwrap()
+                .success()
+        );
         target
     }
 
@@ -142,7 +168,11 @@ mod tests {
         for (text, longest, words) in [
             ("#!/bin/sh\nsleep 1000\n", Duration::from_millis(50), "gave no answer in 50ms"),
             ("#!/bin/sh\nsleep 1000 &\n", Duration::from_millis(200), "gave no answer in 200ms"),
-            ("#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n", LONGEST, "failed (exit status: 3): two [31m"),
+            (
+                "#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n",
+                LONGEST,
+                "failed (exit status: 3): two [31m",
+            ),
             ("#!/bin/sh\necho '{}'\n", LONGEST, "gave no description: missing field"),
             ("#!/nowhere/at/all\n", LONGEST, "describe`: No such file"),
         ] {

@@ -38,9 +38,13 @@ impl Display {
     /// Shows a stage from now on.
     pub fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
-            let style =
-                ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}").expect("the template is constant");
-            bars.add(ProgressBar::new(1).with_style(style.progress_chars("=> ")).with_prefix(printable(label).into_owned()))
+            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}")
+                .expect("the template is constant");
+            bars.add(
+                ProgressBar::new(1)
+                    .with_style(style.progress_chars("=> "))
+                    .with_prefix(printable(label).into_owned()),
+            )
         });
         if bar.is_none() {
             self.line(&format!("{label}: running"));
@@ -49,7 +53,11 @@ impl Display {
             display: self,
             label: label.to_owned(),
             bar,
-            shown: Mutex::new(LastShown { when: Instant::now(), label: String::new(), pace: Pace::default() }),
+            shown: Mutex::new(LastShown {
+                when: Instant::now(),
+                label: String::new(),
+                pace: Pace::default(),
+            }),
         }
     }
 }
@@ -92,7 +100,11 @@ impl Watcher for StageView<'_> {
             bar.set_message(format!("{label} {note} · {left} left"));
         } else if shown.when.elapsed() > Duration::from_secs(15) {
             shown.when = Instant::now();
-            self.display.line(&format!("{}: {label} {}% {note} · {left} left", self.label, done * 100 / total.max(&1)));
+            self.display.line(&format!(
+                "{}: {label} {}% {note} · {left} left",
+                self.label,
+                done * 100 / total.max(&1)
+            ));
         }
     }
 

@@ -1,8 +1,10 @@
 //! Calls of stages by their contract: what a runner does of which a stage knows the other half.
 //!
 //! * [`ask_all`]: what programs say of themselves.
-//! * [`Call`]: one run of a stage, with its log and its [`Usage`]. Who stops it asks the stage to end, so that it leaves a checkpoint.
-//! * [`StageFailure`]: why a stage failed, by what it says, by its allocator, by the signal that ended it.
+//! * [`Call`]: one run of a stage, with its log and its [`Usage`]. Who stops it asks the stage to
+//!   end, so that it leaves a checkpoint.
+//! * [`StageFailure`]: why a stage failed, by what it says, by its allocator, by the signal that
+//!   ended it.
 //! * [`Display`]: what a person sees meanwhile; any [`Watcher`] may watch.
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]

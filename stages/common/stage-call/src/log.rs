@@ -67,8 +67,14 @@ mod tests {
         for done in 0..=1000 {
             told.extend(tenths.told("training", done, 1000, "PSNR 20"));
         }
-        assert_eq!((told.len(), told[0].as_str(), told[9].as_str()), (10, "training: 10% PSNR 20", "training: 100% PSNR 20"));
+        assert_eq!(
+            (told.len(), told[0].as_str(), told[9].as_str()),
+            (10, "training: 10% PSNR 20", "training: 100% PSNR 20")
+        );
         // Other work begins anew; counts may be as large as can be.
-        assert_eq!(tenths.told("rendering", u64::MAX / 2, u64::MAX, ""), Some("rendering: 40%".to_owned()));
+        assert_eq!(
+            tenths.told("rendering", u64::MAX / 2, u64::MAX, ""),
+            Some("rendering: 40%".to_owned())
+        );
     }
 }

@@ -1,5 +1,5 @@
-//! Why a stage failed: by what it says itself, by what its memory allocator said, by the signal that ended it, and only then by
-//! the last line on its stderr.
+//! Why a stage failed: by what it says itself, by what its memory allocator said, by the signal
+//! that ended it, and only then by the last line on its stderr.
 
 use std::os::unix::process::ExitStatusExt as _;
 use std::process::ExitStatus;
@@ -36,11 +36,18 @@ impl End {
         if let Some(said) = self.tail.iter().rev().find_map(|line| out_of_memory(line)) {
             return said;
         }
-        let words = self.tail.iter().rev().map(|line| own_words(line, name)).find(|words| !words.is_empty());
+        let words = self
+            .tail
+            .iter()
+            .rev()
+            .map(|line| own_words(line, name))
+            .find(|words| !words.is_empty());
         match (self.status.signal(), words) {
             (Some(signal), words) => by_signal(signal, words),
             (None, Some(words)) => words.to_owned(),
-            (None, None) => format!("ended with exit code {} and said nothing", self.status.code().unwrap_or(1)),
+            (None, None) => {
+                format!("ended with exit code {} and said nothing", self.status.code().unwrap_or(1))
+            }
         }
     }
 }
@@ -50,20 +57,27 @@ fn own_words<'a>(line: &'a str, name: &str) -> &'a str {
     line.strip_prefix(name).and_then(|rest| rest.strip_prefix(": ")).unwrap_or(line).trim()
 }
 
-/// What Rust's runtime adds to a message: how to see more, or the frames of a backtrace. It is for the log alone.
+/// What Rust's runtime adds to a message: how to see more, or the frames of a backtrace. It is for
+/// the log alone.
 pub(crate) fn is_noise(line: &str) -> bool {
     let text = line.trim_start();
-    let is_frame = text.starts_with("at ") || text.trim_start_matches(|c: char| c.is_ascii_digit()).starts_with(": ");
-    let is_added = ["note: run with `RUST_BACKTRACE", "note: Some details are omitted", "stack backtrace:"];
+    let is_frame = text.starts_with("at ")
+        || text.trim_start_matches(|c: char| c.is_ascii_digit()).starts_with(": ");
+    let is_added =
+        ["note: run with `RUST_BACKTRACE", "note: Some details are omitted", "stack backtrace:"];
     (text.len() < line.len() && is_frame) || is_added.iter().any(|start| text.starts_with(start))
 }
 
 fn by_signal(signal: i32, words: Option<&str>) -> String {
-    let name = signal_hook::low_level::signal_name(signal).map_or_else(|| format!("signal {signal}"), str::to_owned);
+    let name = signal_hook::low_level::signal_name(signal)
+        .map_or_else(|| format!("signal {signal}"), str::to_owned);
     let after = words.map(|words| format!(" after it said: {words}")).unwrap_or_default();
     match name.as_str() {
         "SIGKILL" => {
-            format!("ended by SIGKILL{after}; maybe the kernel ended it because memory ran out (`dmesg` says): {MEMORY_REMEDY}")
+            format!(
+                "ended by SIGKILL{after}; maybe the kernel ended it because memory ran out \
+                (`dmesg` says): {MEMORY_REMEDY}"
+            )
         }
         "SIGTERM" | "SIGINT" | "SIGHUP" => format!("ended by {name}{after}; run again to go on"),
         _ => format!("crashed with {name}{after}; please report it"),
@@ -87,15 +101,37 @@ mod tests {
             (1 << 8, &["Traceback", "ValueError: bad"], 1, "ValueError: bad", "bad"),
             (101 << 8, &["thread 'main' panicked at x.rs:1:2:", "a name"], 101, "a name", "name"),
             (7 << 8, &[], 7, "ended with exit code 7 and said nothing", "nothing"),
-            (6, &["memory allocation of 99532800 bytes failed"], 1, "out of memory: 99.5 MB more were asked for;", "images"),
-            (6, &["free(): invalid pointer"], 1, "crashed with SIGABRT after it said: free(): invalid", "please report it"),
-            (9, &["LR images: 8"], 1, "ended by SIGKILL after it said: LR images: 8; maybe the kernel", "images"),
+            (
+                6,
+                &["memory allocation of 99532800 bytes failed"],
+                1,
+                "out of memory: 99.5 MB more were asked for;",
+                "images",
+            ),
+            (
+                6,
+                &["free(): invalid pointer"],
+                1,
+                "crashed with SIGABRT after it said: free(): invalid",
+                "please report it",
+            ),
+            (
+                9,
+                &["LR images: 8"],
+                1,
+                "ended by SIGKILL after it said: LR images: 8; maybe the kernel",
+                "images",
+            ),
             (11, &[], 1, "crashed with SIGSEGV; please report it", "it"),
             (15, &[], 1, "ended by SIGTERM; run again to go on", "on"),
         ] {
             let failure = end(status, tail).failure("eval");
             assert_eq!(failure.code, code, "{tail:?}");
-            assert!(failure.message.starts_with(starts) && failure.message.ends_with(ends), "{tail:?}: {}", failure.message);
+            assert!(
+                failure.message.starts_with(starts) && failure.message.ends_with(ends),
+                "{tail:?}: {}",
+                failure.message
+            );
         }
     }
 
@@ -110,16 +146,29 @@ mod tests {
         ] {
             assert!(is_noise(line), "{line}");
         }
-        for line in ["memory allocation of 5 bytes failed", "at last", "10: ten", "  indented: words", ": odd", ""] {
+        for line in [
+            "memory allocation of 5 bytes failed",
+            "at last",
+            "10: ten",
+            "  indented: words",
+            ": odd",
+            "",
+        ] {
             assert!(!is_noise(line), "{line}");
         }
     }
 
     #[test]
     fn what_a_stage_states_comes_before_what_it_printed() {
-        let stated = End { stated: Some("no space left".to_owned()), ..end(1 << 8, &["eval: no space left", "warning: slow"]) };
+        let stated = End {
+            stated: Some("no space left".to_owned()),
+            ..end(1 << 8, &["eval: no space left", "warning: slow"])
+        };
         assert_eq!(stated.failure("eval").message, "no space left");
         let asked = End { asked: true, ..end(15, &["working"]) };
-        assert_eq!((asked.failure("eval").code, asked.failure("eval").message.as_str()), (130, "interrupted"));
+        assert_eq!(
+            (asked.failure("eval").code, asked.failure("eval").message.as_str()),
+            (130, "interrupted")
+        );
     }
 }

@@ -1,4 +1,5 @@
-//! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make goldens`).
+//! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make
+//! goldens`).
 
 use counter_rng::uniform;
 use radiance::MlpArchitecture;
@@ -16,7 +17,9 @@ const GOLDENS: &[u8] = include_bytes!("goldens/mlp.safetensors");
 
 /// What the script's `draw` gives.
 fn draw(purpose: u64, shape: &[i64]) -> Tensor {
-    let values: Vec<f64> = (0..shape.iter().product::<i64>()).map(|i| f64::from(uniform(11, purpose, i as u64))).collect();
+    let values: Vec<f64> = (0..shape.iter().product::<i64>())
+        .map(|i| f64::from(uniform(11, purpose, i as u64)))
+        .collect();
     Tensor::from_slice(&values).reshape(shape)
 }
 
@@ -43,14 +46,19 @@ fn network(architecture: MlpArchitecture, purpose: u64, kind: Kind) -> MlpNetwor
     let read = MlpNetwork::read(architecture, |_, shape| {
         let drawn = draw(next, shape);
         next += 1;
-        Ok(if shape.len() == 2 { (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0) } else { 0.2 * drawn - 0.05 })
+        Ok(if shape.len() == 2 {
+            (6.0 / shape[1] as f64).sqrt() * (2.0 * drawn - 1.0)
+        } else {
+            0.2 * drawn - 0.05
+        })
     });
     read.unwrap().to(Device::Cpu, kind).unwrap()
 }
 
 #[test]
 fn published_size_forward_in_f32() {
-    let spread = |purpose, reach: f64| (draw(purpose, &[8, 3]) * (2.0 * reach) - reach).to_kind(Kind::Float);
+    let spread =
+        |purpose, reach: f64| (draw(purpose, &[8, 3]) * (2.0 * reach) - reach).to_kind(Kind::Float);
     let (position, direction) = (spread(1, 2.0), spread(2, 1.0));
     let code = encode(&position, 10).unwrap();
     close("encoding", &code, 1e-6);
@@ -72,7 +80,8 @@ fn small() -> (Mlp, Batch, SampleDraws) {
         fine_samples: 8,
         ndc_directions: false,
     };
-    let bounds = Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Default::default() };
+    let bounds =
+        Bounds { min: [-2.0; 3], max: [2.0; 3], near: 2.0, far: 6.0, ..Default::default() };
     let [coarse, fine] = [2000, 3000].map(|purpose| network(architecture, purpose, Kind::Double));
     let field = Mlp { architecture, bounds, coarse, fine, device: Device::Cpu };
     let origin = 0.5 * draw(3, &[8, 3]) + Tensor::from_slice(&[0.0, 0.0, 4.0f64]);
@@ -95,7 +104,8 @@ fn sampling_and_compositing_in_f64() {
     let inner = seen.coarse.weights.narrow(1, 1, 6);
     close("importance", &importance(&middles(&t).unwrap(), &inner, &draws.fine).unwrap(), 1e-9);
     let even = stratified(&ends[0], &ends[1], 8, None).unwrap();
-    let shares = Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
+    let shares =
+        Tensor::linspace(0, 1, 8, (Kind::Double, Device::Cpu)).expand([8, 8], false).contiguous();
     close("importance.even", &importance(&middles(&even).unwrap(), &inner, &shares).unwrap(), 1e-9);
     close("fine.weights", &seen.fine.weights, 1e-8);
     close("coarse.colour", &seen.coarse.colour, 1e-8);
@@ -117,7 +127,9 @@ fn gradients_and_three_steps_in_f64() {
     };
     let mut trainer = MlpTrainer::new(field, options).unwrap();
     let target = draw(6, &[2, 3]);
-    let flat = |tensors: &[Tensor]| Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0);
+    let flat = |tensors: &[Tensor]| {
+        Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0)
+    };
     for step in 0..3 {
         let seen = trainer.field().see(&batch, Some(&draws)).unwrap();
         let part = |colour: &Tensor| {

@@ -1,6 +1,6 @@
 use radiance::spec::{
-    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS, RAW_COLOUR, VIEW_FEATURE,
-    VIEW_FEATURES,
+    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS,
+    RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
 };
 use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, Strides};
 use scene::Bounds;
@@ -10,8 +10,8 @@ use crate::TorchFieldError;
 use crate::mlp::host;
 use crate::ray_maps::{RayMaps, fused};
 
-/// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same description and the same numbers, that
-/// judges the hand-written one, and its way to CUDA.
+/// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same
+/// description and the same numbers, that judges the hand-written one, and its way to CUDA.
 #[derive(Debug)]
 pub struct TorchGrid {
     pub(crate) architecture: Architecture,
@@ -79,8 +79,15 @@ fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
 const OUTPUTS: i64 = DENSITY_OUTPUTS as i64;
 
 fn layer_shapes(architecture: &Architecture) -> [(i64, i64); 5] {
-    let (features, hidden) = (FEATURES as i64 * i64::from(architecture.levels), i64::from(architecture.hidden));
-    [(features, hidden), (hidden, OUTPUTS), ((VIEW_FEATURES + BASIS) as i64, hidden), (hidden, hidden), (hidden, 3)]
+    let (features, hidden) =
+        (FEATURES as i64 * i64::from(architecture.levels), i64::from(architecture.hidden));
+    [
+        (features, hidden),
+        (hidden, OUTPUTS),
+        ((VIEW_FEATURES + BASIS) as i64, hidden),
+        (hidden, hidden),
+        (hidden, 3),
+    ]
 }
 
 /// Real spherical harmonics up to degree 2 of unit directions (n × 3): n × 9.
@@ -97,7 +104,10 @@ fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
             x.f_mul_scalar(-one)?,
             product(&x, &y, two)?,
             product(&y, &z, -two)?,
-            z.f_square()?.f_mul_scalar(3.0)?.f_sub_scalar(1.0)?.f_mul_scalar((5.0 / (16.0 * pi)).sqrt())?,
+            z.f_square()?
+                .f_mul_scalar(3.0)?
+                .f_sub_scalar(1.0)?
+                .f_mul_scalar((5.0 / (16.0 * pi)).sqrt())?,
             product(&x, &z, -two)?,
             x.f_square()?.f_sub(&y.f_square()?)?.f_mul_scalar(0.5 * two)?,
         ],
@@ -112,7 +122,10 @@ impl TorchGrid {
         let levels = levels(&field.architecture);
         let entries: i64 = levels.iter().map(|l| l.entries).sum();
         let own = |numbers: &[f32], shape: [i64; 2]| -> Result<Tensor, TchError> {
-            Ok(Tensor::f_from_slice(numbers)?.f_reshape(shape)?.f_to_device(device)?.set_requires_grad(true))
+            Ok(Tensor::f_from_slice(numbers)?
+                .f_reshape(shape)?
+                .f_to_device(device)?
+                .set_requires_grad(true))
         };
         let mut first = 0;
         let mut layers = Vec::with_capacity(5);
@@ -152,7 +165,9 @@ impl TorchGrid {
 
     /// Density for a cube side at positions in the unit cube (n × 3).
     pub(crate) fn densities(&self, positions: &Tensor) -> Result<Tensor, TchError> {
-        no_grad(|| self.outputs(positions)?.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp())
+        no_grad(|| {
+            self.outputs(positions)?.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()
+        })
     }
 
     /// Outputs of the density network at positions (n × 3): n × 16.
@@ -179,7 +194,11 @@ impl TorchGrid {
                 let mut share = None;
                 let mut index = Vec::with_capacity(3);
                 for ((fraction, cell), d) in axes.iter().zip(d) {
-                    let f = if d == 1 { fraction.shallow_clone() } else { fraction.f_neg()?.f_add_scalar(1.0)? };
+                    let f = if d == 1 {
+                        fraction.shallow_clone()
+                    } else {
+                        fraction.f_neg()?.f_add_scalar(1.0)?
+                    };
                     share = Some(match share {
                         None => f,
                         Some(product) => f.f_mul(&product)?,
@@ -195,10 +214,15 @@ impl TorchGrid {
                     mixed.f_bitwise_and(level.entries / BRICK as i64 - 1)?
                 } else {
                     let [across, down, _] = level.bricks;
-                    half(2)?.f_mul_scalar(down)?.f_add(&half(1)?)?.f_mul_scalar(across)?.f_add(&half(0)?)?
+                    half(2)?
+                        .f_mul_scalar(down)?
+                        .f_add(&half(1)?)?
+                        .f_mul_scalar(across)?
+                        .f_add(&half(0)?)?
                 };
                 let odd = |axis: usize| index[axis].f_bitwise_and(1);
-                let within = odd(2)?.f_mul_scalar(2)?.f_add(&odd(1)?)?.f_mul_scalar(2)?.f_add(&odd(0)?)?;
+                let within =
+                    odd(2)?.f_mul_scalar(2)?.f_add(&odd(1)?)?.f_mul_scalar(2)?.f_add(&odd(0)?)?;
                 let index = brick.f_mul_scalar(BRICK as i64)?.f_add(&within)?;
                 let entry = self.table.f_index_select(0, &index.f_add_scalar(level.first)?)?;
                 let part = entry.f_mul(&share.expect("three axes").f_unsqueeze(-1)?)?;
@@ -213,7 +237,12 @@ impl TorchGrid {
     }
 
     /// What rays see, with samples `offsets` (n) of a step along.
-    pub(crate) fn see(&self, rays: &[Ray], offsets: &Tensor, strides: Strides) -> Result<GridSeen, TchError> {
+    pub(crate) fn see(
+        &self,
+        rays: &[Ray],
+        offsets: &Tensor,
+        strides: Strides,
+    ) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
         let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
         let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
@@ -222,7 +251,9 @@ impl TorchGrid {
         let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
         let at = |k: &Tensor| fused(k, &k.f_full_like(self.step())?, &maps.enter);
         let t = at(&k)?;
-        let held = self.held(&maps.positions(&t)?)?.f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
+        let held = self
+            .held(&maps.positions(&t)?)?
+            .f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
         // Every other step of a thin cell is one sample, in the middle of both.
         let thin = match strides {
             // Nowhere.
@@ -230,7 +261,8 @@ impl TorchGrid {
             Strides::ByCell => held.f_eq(1.0)?,
         };
         let middle = at(&k.f_add_scalar(0.5)?)?;
-        let (t, length) = (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
+        let (t, length) =
+            (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
         let positions = maps.positions(&t)?;
         let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
         let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
@@ -240,8 +272,11 @@ impl TorchGrid {
 
         let outputs = self.outputs(&positions)?;
         let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
-        let density = outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
-        let spread = |of: &Tensor, like: &Tensor| like.f_index_put(&[Some(&kept)], of, false)?.f_reshape([n, count]);
+        let density =
+            outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
+        let spread = |of: &Tensor, like: &Tensor| {
+            like.f_index_put(&[Some(&kept)], of, false)?.f_reshape([n, count])
+        };
         let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
         let optical = |density: &Tensor| -> Result<[Tensor; 3], TchError> {
             let tau = spread(density, &nothing)?;
@@ -263,10 +298,17 @@ impl TorchGrid {
         let ray = at.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
-        let sum = |of: &Tensor| Tensor::f_zeros([n, of.size()[1]], (Kind::Float, self.device))?.f_index_add(0, &ray, of);
-        let features = sum(&weight.f_mul(&outputs.f_narrow(1, VIEW_FEATURE as i64, VIEW_FEATURES as i64)?)?)?;
+        let sum = |of: &Tensor| {
+            Tensor::f_zeros([n, of.size()[1]], (Kind::Float, self.device))?.f_index_add(0, &ray, of)
+        };
+        let features = sum(&weight.f_mul(&outputs.f_narrow(
+            1,
+            VIEW_FEATURE as i64,
+            VIEW_FEATURES as i64,
+        )?)?)?;
         let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
-        let hidden = input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
+        let hidden =
+            input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
         let added = hidden.f_matmul(&self.layers[4])?.f_index_select(0, &ray)?;
         let colour = outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&added)?.f_sigmoid()?;
         let premultiplied = sum(&weight.f_mul(&colour)?)?;
@@ -314,21 +356,32 @@ impl TorchGrid {
         let offsets = Tensor::f_full([rays.len() as i64], 0.5, (Kind::Float, self.device))?;
         let seen = self.see(rays, &offsets, Strides::Even)?;
         let weights = seen.weights.f_mul(&seen.counted)?;
-        let distances = seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
+        let distances =
+            seen.maps.distances(&seen.t)?.f_where_self(&seen.counted, &seen.t.f_zeros_like()?)?;
         let sum = |of: &Tensor| of.f_sum_dim_intlist([1i64].as_slice(), false, None::<Kind>);
-        let (weight, distance) = (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
+        let (weight, distance) =
+            (host(&sum(&weights)?)?, host(&sum(&weights.f_mul(&distances)?)?)?);
         let half = seen.weights.f_cumsum(1, None::<Kind>)?.f_ge(0.5)?;
-        let before = half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
+        let before =
+            half.f_logical_not()?.f_sum_dim_intlist([1i64].as_slice(), true, Kind::Int64)?;
         let last = seen.t.size()[1] - 1;
         let is_half = host(&before.f_le(last)?)?;
-        let median = host(&seen.maps.distances(&seen.t.f_gather(1, &before.f_clamp_max(last)?, false)?)?)?;
-        let (premultiplied, transmittance) = (host(&seen.premultiplied)?, host(&seen.transmittance)?);
-        let (hits, leave) = (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
+        let median = host(&seen.maps.distances(&seen.t.f_gather(
+            1,
+            &before.f_clamp_max(last)?,
+            false,
+        )?)?)?;
+        let (premultiplied, transmittance) =
+            (host(&seen.premultiplied)?, host(&seen.transmittance)?);
+        let (hits, leave) =
+            (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
         let pixel = |(i, ray): (usize, &Ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
             let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };
             Pixel {
-                colour: std::array::from_fn(|c| transmittance[i].mul_add(ray.background[c], own[c])),
+                colour: std::array::from_fn(|c| {
+                    transmittance[i].mul_add(ray.background[c], own[c])
+                }),
                 premultiplied: own,
                 opacity: 1.0 - transmittance[i],
                 depth: if weight[i] > 1e-4 { distance[i] / weight[i] } else { far },
@@ -378,16 +431,28 @@ mod tests {
         difference / norm(&mut judge.iter().map(|&b| f64::from(b))).max(1e-12)
     }
 
-    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and hashed levels, faint density
-    /// and walls, and the same field on a GPU where there is one.
+    /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and
+    /// hashed levels, faint density and walls, and the same field on a GPU where there is one.
     #[test]
     fn agrees_with_the_hand_written_field() {
-        let bounds = Bounds { min: [-1.0, -0.8, -1.0], max: [1.0, 1.0, 0.7], near: 1.0, far: 9.0, ..Default::default() };
+        let bounds = Bounds {
+            min: [-1.0, -0.8, -1.0],
+            max: [1.0, 1.0, 0.7],
+            near: 1.0,
+            far: 9.0,
+            ..Default::default()
+        };
         let mut devices = vec![Device::Cpu];
         devices.extend(nets::device("cuda").ok());
         for (spread, log2_entries, hidden) in [(0.0, 12, 16), (0.3, 12, 32), (3.0, 14, 64)] {
-            let architecture =
-                Architecture { finest: 96, finest_z: 40, log2_entries, hidden, steps: 256, ..Architecture::default() };
+            let architecture = Architecture {
+                finest: 96,
+                finest_z: 40,
+                log2_entries,
+                hidden,
+                steps: 256,
+                ..Architecture::default()
+            };
             let field = example(architecture, bounds, spread);
             let rays = rays(300, 1.0);
             let mut passes = Passes::new(&field);
@@ -398,7 +463,9 @@ mod tests {
             let own = field.render(&rays);
             for &device in &devices {
                 let judge = TorchGrid::new(&field, device).unwrap();
-                let seen = judge.see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even).unwrap();
+                let seen = judge
+                    .see(&rays, &Tensor::full([300], 0.5, (Kind::Float, device)), Strides::Even)
+                    .unwrap();
                 let background = seen.transmittance.unsqueeze(-1);
                 let gradients = Tensor::run_backward(
                     &[(seen.premultiplied + background).sum(Kind::Float)],
@@ -408,10 +475,18 @@ mod tests {
                 );
                 let flat: Vec<f32> = gradients[1..].iter().flat_map(|g| host(g).unwrap()).collect();
                 let said = format!("spread {spread} on {device:?}");
-                let (by_table, by_network) = (error(&table, &host(&gradients[0]).unwrap()), error(&network[..flat.len()], &flat));
-                assert!(by_table < 1e-4 && by_network < 1e-4, "{said}: gradients {by_table} {by_network}");
+                let (by_table, by_network) = (
+                    error(&table, &host(&gradients[0]).unwrap()),
+                    error(&network[..flat.len()], &flat),
+                );
+                assert!(
+                    by_table < 1e-4 && by_network < 1e-4,
+                    "{said}: gradients {by_table} {by_network}"
+                );
                 let theirs = judge.render(&rays).unwrap();
-                let all = |pixels: &[Pixel], of: &dyn Fn(&Pixel) -> Vec<f32>| pixels.iter().flat_map(of).collect::<Vec<f32>>();
+                let all = |pixels: &[Pixel], of: &dyn Fn(&Pixel) -> Vec<f32>| {
+                    pixels.iter().flat_map(of).collect::<Vec<f32>>()
+                };
                 for (what, of) in [
                     ("colour", &(|p: &Pixel| p.colour.to_vec()) as &dyn Fn(&Pixel) -> Vec<f32>),
                     ("opacity", &|p| vec![p.opacity]),
@@ -430,8 +505,15 @@ mod tests {
     /// What misses the box, runs along its faces, begins inside, has no length or isn't finite.
     #[test]
     fn extreme_rays_are_finite_alike() {
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
-        let architecture = Architecture { finest: 64, log2_entries: 12, hidden: 16, steps: 64, ..Architecture::default() };
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 1e6, ..Default::default() };
+        let architecture = Architecture {
+            finest: 64,
+            log2_entries: 12,
+            hidden: 16,
+            steps: 64,
+            ..Architecture::default()
+        };
         let field = example(architecture, bounds, 1.0);
         let judge = TorchGrid::new(&field, Device::Cpu).unwrap();
         let rays: Vec<Ray> = [
@@ -447,8 +529,12 @@ mod tests {
         ]
         .map(|(origin, direction)| Ray { origin, direction, background: [0.3, 0.6, 0.9] })
         .to_vec();
-        for (i, (ours, theirs)) in field.render(&rays).iter().zip(judge.render(&rays).unwrap()).enumerate() {
-            let finite = |p: &Pixel| p.colour.iter().chain(&[p.opacity, p.depth, p.median_depth]).all(|x| x.is_finite());
+        for (i, (ours, theirs)) in
+            field.render(&rays).iter().zip(judge.render(&rays).unwrap()).enumerate()
+        {
+            let finite = |p: &Pixel| {
+                p.colour.iter().chain(&[p.opacity, p.depth, p.median_depth]).all(|x| x.is_finite())
+            };
             assert!(finite(ours) && finite(&theirs), "{i}: {ours:?} {theirs:?}");
             let close = ours.colour.iter().zip(&theirs.colour).all(|(a, b)| (a - b).abs() < 1e-4);
             assert!(close, "{i}: {ours:?} {theirs:?}");

@@ -1,15 +1,20 @@
 //! Radiance fields through libtorch's operations and autograd, on the CPU or on CUDA.
 //!
-//! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020): positional encoding, a coarse and a fine
-//!   network of eight layers, stratified and importance sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
-//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same [`radiance::Supervisor`] as the fast field's.
+//! * [`Mlp`]: NeRF-SR's own field as published (Wang et al. 2022; Mildenhall et al. 2020):
+//!   positional encoding, a coarse and a fine network of eight layers, stratified and importance
+//!   sampling. [`Mlp::render`] gives colour, opacity and depth of rays.
+//! * [`MlpTrainer`], [`MlpTraining`], [`Schedule`]: its training, driven by the same
+//!   [`radiance::Supervisor`] as the fast field's.
 //!
-//! * [`TorchGrid`], [`GridTrainer`]: the fast field of `radiance` and its training, on the same numbers: their judge, and their way to CUDA.
+//! * [`TorchGrid`], [`GridTrainer`]: the fast field of `radiance` and its training, on the same
+//!   numbers: their judge, and their way to CUDA.
 //!
-//! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one thread, and their gradients are added in
-//! order: bytes don't depend on the number of threads. On CUDA results hold to a tolerance.
+//! On the CPU a batch is cut into shards by index, each of which goes through libtorch in one
+//! thread, and their gradients are added in order: bytes don't depend on the number of threads. On
+//! CUDA results hold to a tolerance.
 //!
-//! Units: positions and distances are scene units, directions have unit length, colours are display-encoded sRGB.
+//! Units: positions and distances are scene units, directions have unit length, colours are
+//! display-encoded sRGB.
 //!
 //! ```no_run
 //! use radiance::{MlpArchitecture, Ray};
@@ -60,7 +65,10 @@ pub enum TorchFieldError {
         reason: String,
     },
     /// Numbers went wrong twice within a hundred steps.
-    #[error("step {step}: the gradient is not finite, for the second time within 100 steps; lower the rate")]
+    #[error(
+        "step {step}: the gradient is not finite, for the second time within 100 steps; lower the \
+        rate"
+    )]
     NotFinite {
         /// The step.
         step: u64,

@@ -13,9 +13,10 @@ use crate::network::{MlpNetwork, normal};
 use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};
 
-/// The paper's field: a coarse network that says where to look and a fine one that is looked at. In a box, positions are scene units, as
-/// they come, and rays run from `near` to `far` of the bounds; in NDC and in a contraction they are those of the unit cube stretched to
-/// -1..1, and rays run through it evenly, as the paper has it for forward-facing scenes. Directions are the world's.
+/// The paper's field: a coarse network that says where to look and a fine one that is looked at. In
+/// a box, positions are scene units, as they come, and rays run from `near` to `far` of the bounds;
+/// in NDC and in a contraction they are those of the unit cube stretched to -1..1, and rays run
+/// through it evenly, as the paper has it for forward-facing scenes. Directions are the world's.
 #[derive(Debug)]
 pub struct Mlp {
     pub(crate) architecture: MlpArchitecture,
@@ -25,7 +26,8 @@ pub struct Mlp {
     pub(crate) device: Device,
 }
 
-/// What a training step draws for its rays; without it samples lie at equal steps and at equal shares of what stops the light.
+/// What a training step draws for its rays; without it samples lie at equal steps and at equal
+/// shares of what stops the light.
 #[derive(Debug)]
 pub(crate) struct SampleDraws {
     /// In 0..1: n × coarse samples.
@@ -61,20 +63,32 @@ const NOISE: u64 = 203;
 
 impl SampleDraws {
     /// Those of the rays `first..first + n` of a training.
-    pub(crate) fn new(field: &Mlp, seed: u64, first: u64, n: usize, noise: f64) -> Result<Self, TchError> {
-        let (coarse, fine) = (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
+    pub(crate) fn new(
+        field: &Mlp,
+        seed: u64,
+        first: u64,
+        n: usize,
+        noise: f64,
+    ) -> Result<Self, TchError> {
+        let (coarse, fine) =
+            (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
         let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut CounterRng) -> f32| {
             let row = |ray: u64| {
                 let mut rng = CounterRng::new(seed, purpose, ray);
                 (0..width).map(|_| draw(&mut rng)).collect::<Vec<_>>()
             };
             let values: Vec<f32> = (first..first + n as u64).flat_map(row).collect();
-            Tensor::f_from_slice(&values)?.f_reshape([n as i64, width as i64])?.f_to_device(field.device)
+            Tensor::f_from_slice(&values)?
+                .f_reshape([n as i64, width as i64])?
+                .f_to_device(field.device)
         };
         let scaled = |rng: &mut CounterRng| (noise * normal(rng)) as f32;
         let noise = if noise > 0.0 {
             let all = rows(NOISE, 2 * coarse + fine, &scaled)?;
-            Some([all.f_narrow(1, 0, coarse as i64)?, all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?])
+            Some([
+                all.f_narrow(1, 0, coarse as i64)?,
+                all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?,
+            ])
         } else {
             None
         };
@@ -89,7 +103,8 @@ impl SampleDraws {
 impl Batch {
     /// Rays as a field sees them.
     pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
-        let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } = *field;
+        let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } =
+            *field;
         let rows = |of: &dyn Fn(&Ray) -> [f32; 3]| {
             let values: Vec<f32> = rays.iter().flat_map(of).collect();
             Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, 3])?.f_to_device(device)
@@ -98,26 +113,47 @@ impl Batch {
             origin: rows(&|r| r.origin)?,
             direction: rows(&|r| r.direction)?,
             background: rows(&|r| r.background)?,
-            maps: (bounds.space != Space::Box).then(|| RayMaps::new(&bounds, rays, device, ndc_directions)).transpose()?,
+            maps: (bounds.space != Space::Box)
+                .then(|| RayMaps::new(&bounds, rays, device, ndc_directions))
+                .transpose()?,
         })
     }
 }
 
 impl Mlp {
     /// A field before training, drawn from a seed.
-    pub fn new(architecture: MlpArchitecture, bounds: Bounds, seed: u64, device: Device) -> Result<Self, TorchFieldError> {
+    pub fn new(
+        architecture: MlpArchitecture,
+        bounds: Bounds,
+        seed: u64,
+        device: Device,
+    ) -> Result<Self, TorchFieldError> {
         let network = |index| MlpNetwork::new(architecture, seed, index, device);
         Ok(Self { architecture, bounds, coarse: network(0)?, fine: network(1)?, device })
     }
 
-    /// Reads what [`Mlp::write`] wrote, or `scripts/convert-checkpoint.py` made of the reference's files.
-    pub fn read(path: &Path, architecture: MlpArchitecture, bounds: Bounds, device: Device) -> Result<Self, TorchFieldError> {
-        architecture.check().map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
+    /// Reads what [`Mlp::write`] wrote, or `scripts/convert-checkpoint.py` made of the reference's
+    /// files.
+    pub fn read(
+        path: &Path,
+        architecture: MlpArchitecture,
+        bounds: Bounds,
+        device: Device,
+    ) -> Result<Self, TorchFieldError> {
+        architecture
+            .check()
+            .map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
         let weights = nets::Weights::read(path)?;
         let network = |prefix: &str| -> Result<MlpNetwork, TorchFieldError> {
-            let read = MlpNetwork::read(architecture, |name, shape| Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?))?;
-            let finite = |t: &Tensor| -> Result<bool, TchError> { Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0) };
-            for (parameter, (name, _)) in read.parameters.iter().zip(MlpNetwork::names(&architecture)) {
+            let read = MlpNetwork::read(architecture, |name, shape| {
+                Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?)
+            })?;
+            let finite = |t: &Tensor| -> Result<bool, TchError> {
+                Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0)
+            };
+            for (parameter, (name, _)) in
+                read.parameters.iter().zip(MlpNetwork::names(&architecture))
+            {
                 if !finite(parameter)? {
                     let reason = format!("tensor {prefix}.{name} is not finite");
                     return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
@@ -125,10 +161,17 @@ impl Mlp {
             }
             Ok(read.to(device, Kind::Float)?)
         };
-        Ok(Self { architecture, bounds, coarse: network("coarse")?, fine: network("fine")?, device })
+        Ok(Self {
+            architecture,
+            bounds,
+            coarse: network("coarse")?,
+            fine: network("fine")?,
+            device,
+        })
     }
 
-    /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the reference's names of layers.
+    /// Writes both networks as safetensors: `coarse.NAME` and `fine.NAME`, with the reference's
+    /// names of layers.
     pub fn write(&self, path: &Path) -> Result<(), TorchFieldError> {
         nets::write(path, &self.named())?;
         Ok(())
@@ -138,7 +181,10 @@ impl Mlp {
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
         let names = || MlpNetwork::names(&self.architecture).map(|(name, _)| name);
         let named = |prefix: &'static str, network: &MlpNetwork| {
-            names().zip(network.share().parameters).map(move |(name, t)| (format!("{prefix}.{name}"), t)).collect::<Vec<_>>()
+            names()
+                .zip(network.share().parameters)
+                .map(move |(name, t)| (format!("{prefix}.{name}"), t))
+                .collect::<Vec<_>>()
         };
         named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
     }
@@ -186,9 +232,9 @@ impl Mlp {
         let fine_count = i64::from(self.architecture.fine_samples);
         let shares = match draws {
             Some(draws) => draws.fine.shallow_clone(),
-            None => {
-                Tensor::f_linspace(0, 1, fine_count, (t.kind(), self.device))?.f_expand([n, fine_count], false)?.f_contiguous()?
-            }
+            None => Tensor::f_linspace(0, 1, fine_count, (t.kind(), self.device))?
+                .f_expand([n, fine_count], false)?
+                .f_contiguous()?,
         };
         let inner = coarse.weights.f_detach()?.f_narrow(1, 1, count - 2)?;
         let finer = importance(&middles(&t)?, &inner, &shares)?;
@@ -212,13 +258,17 @@ impl Mlp {
     ) -> Result<Composite, TchError> {
         let (n, m) = (t.size()[0], t.size()[1]);
         let positions = match &batch.maps {
-            None => t.f_unsqueeze(-1)?.f_mul(&batch.direction.f_unsqueeze(1)?)?.f_add(&batch.origin.f_unsqueeze(1)?)?,
+            None => t
+                .f_unsqueeze(-1)?
+                .f_mul(&batch.direction.f_unsqueeze(1)?)?
+                .f_add(&batch.origin.f_unsqueeze(1)?)?,
             Some(maps) => maps.positions(t)?.f_mul_scalar(2.0)?.f_sub_scalar(1.0)?,
         };
         let positions = positions.f_reshape([n * m, 3])?;
         let code = encode(&positions, self.architecture.position_octaves)?;
         let width = direction.size()[1];
-        let directions = direction.f_unsqueeze(1)?.f_expand([n, m, width], false)?.f_reshape([n * m, width])?;
+        let directions =
+            direction.f_unsqueeze(1)?.f_expand([n, m, width], false)?.f_reshape([n * m, width])?;
         let (colour, raw) = network.forward(&code, &directions)?;
         let mut raw = raw.f_reshape([n, m])?;
         if let Some(noise) = noise {
@@ -227,13 +277,15 @@ impl Mlp {
         composite(t, &colour.f_reshape([n, m, 3])?, &raw, &batch.background)
     }
 
-    /// Colour, opacity and depth of each ray. On the CPU in parallel, with results that don't depend on the number of threads; on
-    /// a GPU in pieces as large as its memory allows.
+    /// Colour, opacity and depth of each ray. On the CPU in parallel, with results that don't
+    /// depend on the number of threads; on a GPU in pieces as large as its memory allows.
     pub fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TorchFieldError> {
         const CPU_RAYS: usize = 32;
         if self.device == Device::Cpu {
-            let pieces: Vec<(Self, &[Ray])> = rays.chunks(CPU_RAYS).map(|rays| (self.share(), rays)).collect();
-            let rendered: Result<Vec<_>, TchError> = pieces.into_par_iter().map(|(field, rays)| field.pixels(rays)).collect();
+            let pieces: Vec<(Self, &[Ray])> =
+                rays.chunks(CPU_RAYS).map(|rays| (self.share(), rays)).collect();
+            let rendered: Result<Vec<_>, TchError> =
+                pieces.into_par_iter().map(|(field, rays)| field.pixels(rays)).collect();
             return Ok(rendered?.concat());
         }
         let mut pixels = Vec::with_capacity(rays.len());
@@ -250,21 +302,38 @@ impl Mlp {
     }
 
     fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
-        let usable = |r: &Ray| r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3];
-        let tame: Vec<Ray> =
-            rays.iter().map(|r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } }).collect();
+        let usable = |r: &Ray| {
+            r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3]
+        };
+        let tame: Vec<Ray> = rays
+            .iter()
+            .map(
+                |r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } },
+            )
+            .collect();
         let batch = Batch::new(&tame, self)?;
         let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
         let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
-        let [colour, premultiplied, weights, t] = no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
-            let seen = self.see(&batch, None)?;
-            Ok([host(&seen.fine.colour)?, host(&seen.fine.premultiplied)?, host(&seen.fine.weights)?, host(&seen.distances)?])
-        })?;
+        let [colour, premultiplied, weights, t] =
+            no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
+                let seen = self.see(&batch, None)?;
+                Ok([
+                    host(&seen.fine.colour)?,
+                    host(&seen.fine.premultiplied)?,
+                    host(&seen.fine.weights)?,
+                    host(&seen.distances)?,
+                ])
+            })?;
         let samples = weights.len() / rays.len().max(1);
         let far = self.bounds.far as f32;
         let pixel = |(i, ray): (usize, &Ray)| {
             if !usable(i, ray) {
-                return Pixel { colour: ray.background, depth: far, median_depth: far, ..Pixel::default() };
+                return Pixel {
+                    colour: ray.background,
+                    depth: far,
+                    median_depth: far,
+                    ..Pixel::default()
+                };
             }
             let three = |of: &[f32]| std::array::from_fn(|c| of[3 * i + c]);
             let (weights, t) = (&weights[i * samples..][..samples], &t[i * samples..][..samples]);
@@ -295,7 +364,12 @@ impl RayField for Mlp {
 
 /// A tensor's numbers in f32.
 pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    let flat = tensor.f_detach()?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_contiguous()?.f_view([-1])?;
+    let flat = tensor
+        .f_detach()?
+        .f_to_device(Device::Cpu)?
+        .f_to_kind(Kind::Float)?
+        .f_contiguous()?
+        .f_view([-1])?;
     Vec::<f32>::try_from(flat)
 }
 
@@ -306,16 +380,24 @@ mod tests {
 
     use super::*;
 
-    /// In NDC and in a contraction rays are sampled from where they enter to where they leave, nearer things first and more of them; what
-    /// misses the space sees its background.
+    /// In NDC and in a contraction rays are sampled from where they enter to where they leave,
+    /// nearer things first and more of them; what misses the space sees its background.
     #[test]
     fn rays_are_sampled_in_every_space() {
         let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
-        let frustum = Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
-        let architecture =
-            MlpArchitecture { depth: 5, width: 16, coarse_samples: 16, fine_samples: 8, ..MlpArchitecture::default() };
-        let ray = |origin, direction: [f32; 3]| Ray { origin, direction, background: [0.1, 0.2, 0.3] };
-        let rays = [ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]), ray([0.2, -0.1, 4.1], [0.28, 0.0, -0.96])];
+        let frustum =
+            Frustum { camera_to_world: pose, min: [-0.5; 2], max: [0.5; 2], near: 2.0, far: 90.0 };
+        let architecture = MlpArchitecture {
+            depth: 5,
+            width: 16,
+            coarse_samples: 16,
+            fine_samples: 8,
+            ..MlpArchitecture::default()
+        };
+        let ray =
+            |origin, direction: [f32; 3]| Ray { origin, direction, background: [0.1, 0.2, 0.3] };
+        let rays =
+            [ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0]), ray([0.2, -0.1, 4.1], [0.28, 0.0, -0.96])];
         for space in [Space::Ndc(frustum), Space::Contraction] {
             let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space };
             let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
@@ -324,13 +406,30 @@ mod tests {
                 let ray = clip(&bounds, &rays[i]);
                 let ends = [ray.distance(ray.enter), ray.distance(ray.leave)];
                 let close = |a: f32, b: f32| (a / b - 1.0).abs() < 2e-3;
-                assert!(close(distances[0], ends[0]) && close(distances[23], ends[1]), "{distances:?} {ends:?}");
-                assert!(distances.is_sorted() && distances[12] < 0.5 * (ends[0] + ends[1]), "{distances:?}");
+                assert!(
+                    close(distances[0], ends[0]) && close(distances[23], ends[1]),
+                    "{distances:?} {ends:?}"
+                );
+                assert!(
+                    distances.is_sorted() && distances[12] < 0.5 * (ends[0] + ends[1]),
+                    "{distances:?}"
+                );
             }
             let pixels = field.render(&rays).unwrap();
-            assert!(pixels.iter().all(|p| (0.5..91.0).contains(&p.depth) && p.colour.iter().all(|c| c.is_finite())));
+            assert!(
+                pixels
+                    .iter()
+                    .all(|p| (0.5..91.0).contains(&p.depth)
+                        && p.colour.iter().all(|c| c.is_finite()))
+            );
         }
-        let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 90.0, space: Space::Ndc(frustum) };
+        let bounds = Bounds {
+            min: [-1.0; 3],
+            max: [1.0; 3],
+            near: 0.5,
+            far: 90.0,
+            space: Space::Ndc(frustum),
+        };
         let field = Mlp::new(architecture, bounds, 3, Device::Cpu).unwrap();
         let away = field.render(&[ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0])]).unwrap()[0];
         assert_eq!((away.colour, away.opacity), ([0.1, 0.2, 0.3], 0.0));
@@ -340,11 +439,16 @@ mod tests {
     #[test]
     fn fields_are_averaged() {
         let architecture = MlpArchitecture { depth: 5, width: 16, ..MlpArchitecture::default() };
-        let [a, b, mean] = [3, 4, 3].map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
+        let [a, b, mean] = [3, 4, 3]
+            .map(|seed| Mlp::new(architecture, Bounds::default(), seed, Device::Cpu).unwrap());
         mean.average_with(&b).unwrap();
         for ((mean, a), b) in mean.parameters().zip(a.parameters()).zip(b.parameters()) {
             let (mean, a, b) = (host(&mean).unwrap(), host(&a).unwrap(), host(&b).unwrap());
-            assert!(mean.iter().zip(a.iter().zip(&b)).all(|(m, (a, b))| (m - 0.5 * (a + b)).abs() < 1e-6));
+            assert!(
+                mean.iter()
+                    .zip(a.iter().zip(&b))
+                    .all(|(m, (a, b))| (m - 0.5 * (a + b)).abs() < 1e-6)
+            );
         }
     }
 }

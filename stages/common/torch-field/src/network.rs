@@ -7,8 +7,8 @@ use tch::{Device, Kind, TchError, Tensor};
 use crate::TorchFieldError;
 use crate::encoding::encoded;
 
-/// One of the two networks: position → density and a feature, that and direction → colour. Parameters are weight and bias of
-/// each layer, in the order of [`MlpNetwork::layers`].
+/// One of the two networks: position → density and a feature, that and direction → colour.
+/// Parameters are weight and bias of each layer, in the order of [`MlpNetwork::layers`].
 #[derive(Debug)]
 pub(crate) struct MlpNetwork {
     architecture: MlpArchitecture,
@@ -41,24 +41,38 @@ impl MlpNetwork {
             ("dir_encoding.0", width + direction, width / 2),
             ("rgb.0", width / 2, 3),
         ];
-        trunk.chain(heads.map(|(name, inputs, outputs)| (name.to_owned(), inputs, outputs))).collect()
+        trunk
+            .chain(heads.map(|(name, inputs, outputs)| (name.to_owned(), inputs, outputs)))
+            .collect()
     }
 
     /// Names of the parameters.
-    pub(crate) fn names(architecture: &MlpArchitecture) -> impl Iterator<Item = (String, Vec<i64>)> {
+    pub(crate) fn names(
+        architecture: &MlpArchitecture,
+    ) -> impl Iterator<Item = (String, Vec<i64>)> {
         let both = |(name, inputs, outputs): Layer| {
-            [(format!("{name}.weight"), vec![outputs, inputs]), (format!("{name}.bias"), vec![outputs])]
+            [
+                (format!("{name}.weight"), vec![outputs, inputs]),
+                (format!("{name}.bias"), vec![outputs]),
+            ]
         };
         Self::layers(architecture).into_iter().flat_map(both)
     }
 
-    /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells the networks of a seed apart.
-    pub(crate) fn new(architecture: MlpArchitecture, seed: u64, index: u64, device: Device) -> Result<Self, TchError> {
+    /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells
+    /// the networks of a seed apart.
+    pub(crate) fn new(
+        architecture: MlpArchitecture,
+        seed: u64,
+        index: u64,
+        device: Device,
+    ) -> Result<Self, TchError> {
         let mut rng = CounterRng::new(seed, WEIGHTS, index);
         let mut parameters = Vec::new();
         for (_, inputs, outputs) in Self::layers(&architecture) {
             let deviation = (2.0 / inputs as f64).sqrt();
-            let values: Vec<f32> = (0..inputs * outputs).map(|_| (deviation * normal(&mut rng)) as f32).collect();
+            let values: Vec<f32> =
+                (0..inputs * outputs).map(|_| (deviation * normal(&mut rng)) as f32).collect();
             parameters.push(Tensor::f_from_slice(&values)?.f_reshape([outputs, inputs])?);
             parameters.push(Tensor::f_zeros([outputs], (Kind::Float, Device::Cpu))?);
         }
@@ -70,7 +84,9 @@ impl MlpNetwork {
         architecture: MlpArchitecture,
         mut tensor: impl FnMut(&str, &[i64]) -> Result<Tensor, TorchFieldError>,
     ) -> Result<Self, TorchFieldError> {
-        let parameters = Self::names(&architecture).map(|(name, shape)| tensor(&name, &shape)).collect::<Result<_, _>>()?;
+        let parameters = Self::names(&architecture)
+            .map(|(name, shape)| tensor(&name, &shape))
+            .collect::<Result<_, _>>()?;
         Ok(Self { architecture, parameters })
     }
 
@@ -79,18 +95,29 @@ impl MlpNetwork {
         let moved = |t: &Tensor| -> Result<Tensor, TchError> {
             Ok(t.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
         };
-        Ok(Self { architecture: self.architecture, parameters: self.parameters.iter().map(moved).collect::<Result<_, _>>()? })
+        Ok(Self {
+            architecture: self.architecture,
+            parameters: self.parameters.iter().map(moved).collect::<Result<_, _>>()?,
+        })
     }
 
     /// Another handle on the same parameters, for another thread.
     pub(crate) fn share(&self) -> Self {
-        Self { architecture: self.architecture, parameters: self.parameters.iter().map(Tensor::shallow_clone).collect() }
+        Self {
+            architecture: self.architecture,
+            parameters: self.parameters.iter().map(Tensor::shallow_clone).collect(),
+        }
     }
 
     /// Colour (n × 3, in 0..1) and raw density (n) of encoded positions and directions.
-    pub(crate) fn forward(&self, position: &Tensor, direction: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    pub(crate) fn forward(
+        &self,
+        position: &Tensor,
+        direction: &Tensor,
+    ) -> Result<(Tensor, Tensor), TchError> {
         let depth = self.architecture.depth as usize;
-        let linear = |x: &Tensor, i: usize| linear(x, &self.parameters[2 * i], &self.parameters[2 * i + 1]);
+        let linear =
+            |x: &Tensor, i: usize| linear(x, &self.parameters[2 * i], &self.parameters[2 * i + 1]);
         let mut x = position.shallow_clone();
         for i in 0..depth {
             if i == SKIP as usize {
@@ -105,8 +132,9 @@ impl MlpNetwork {
     }
 }
 
-/// A linear layer. In f32 on a CPU by oneDNN, where libtorch has it: MKL's products use half of the vectors on processors that aren't
-/// Intel's (92 against 216 GFLOP/s on a core of the machine this was measured on), and oneDNN's are as exact.
+/// A linear layer. In f32 on a CPU by oneDNN, where libtorch has it: MKL's products use half of the
+/// vectors on processors that aren't Intel's (92 against 216 GFLOP/s on a core of the machine this
+/// was measured on), and oneDNN's are as exact.
 fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
     static HAS_ONEDNN: LazyLock<bool> = LazyLock::new(|| {
         let one = Tensor::ones([1, 1], (Kind::Float, Device::Cpu));

@@ -2,12 +2,14 @@ use radiance::{NormalizedRay, Ray, RayMap, clip};
 use scene::{Bounds, Space};
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 
-/// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips in f64 and on the host.
+/// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips
+/// in f64 and on the host.
 #[derive(Debug)]
 pub(crate) struct RayMaps {
     origin: Tensor,
     direction: Tensor,
-    /// What colours depend on: n × 3. The direction in the world, of unit length, or that in NDC, of which z goes from -1 to 1.
+    /// What colours depend on: n × 3. The direction in the world, of unit length, or that in NDC,
+    /// of which z goes from -1 to 1.
     pub(crate) view: Tensor,
     /// Where they enter and leave, by their parameter t: n × 1. Equal where they meet nothing.
     pub(crate) enter: Tensor,
@@ -18,12 +20,19 @@ pub(crate) struct RayMaps {
 }
 
 impl RayMaps {
-    pub(crate) fn new(bounds: &Bounds, rays: &[Ray], device: Device, ndc_directions: bool) -> Result<Self, TchError> {
+    pub(crate) fn new(
+        bounds: &Bounds,
+        rays: &[Ray],
+        device: Device,
+        ndc_directions: bool,
+    ) -> Result<Self, TchError> {
         let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
         let columns = |width: i64, of: &dyn Fn(&NormalizedRay, &mut Vec<f32>)| {
             let mut values = Vec::with_capacity(rays.len() * width as usize);
             rays.iter().for_each(|r| of(r, &mut values));
-            Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, width])?.f_to_device(device)
+            Tensor::f_from_slice(&values)?
+                .f_reshape([rays.len() as i64, width])?
+                .f_to_device(device)
         };
         let three = |of: fn(&NormalizedRay) -> [f32; 3]| columns(3, &|r, to| to.extend(of(r)));
         let one = |of: &dyn Fn(&NormalizedRay) -> f32| columns(1, &|r, to| to.push(of(r)));
@@ -56,7 +65,11 @@ impl RayMaps {
         }
         let along = sinh4(t)?.f_mul(&self.distance[2])?;
         let u = fused(&direction, &along.f_unsqueeze(-1)?, &origin)?;
-        let length = u.f_square()?.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?.f_sqrt()?.f_clamp_min(1.0)?;
+        let length = u
+            .f_square()?
+            .f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?
+            .f_sqrt()?
+            .f_clamp_min(1.0)?;
         // (2 - 1 / length) / length, which is 1 where the length is.
         let factor = length.f_reciprocal()?.f_neg()?.f_add_scalar(2.0)?.f_div(&length)?;
         u.f_mul(&factor)?.f_mul_scalar(0.25)?.f_add_scalar(0.5)
@@ -77,7 +90,8 @@ impl RayMaps {
     }
 }
 
-/// a·b + c rounded once, as the hand-written field does it by fused multiply-adds, for which f64 stands here.
+/// a·b + c rounded once, as the hand-written field does it by fused multiply-adds, for which f64
+/// stands here.
 pub(crate) fn fused(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
     let wide = |t: &Tensor| t.f_to_kind(Kind::Double);
     wide(a)?.f_mul(&wide(b)?)?.f_add(&wide(c)?)?.f_to_kind(Kind::Float)
@@ -95,24 +109,39 @@ mod tests {
 
     use super::*;
 
-    /// In NDC a direction goes from the near to the far plane, as the reference computes it: d' = to - from with z from -1 to 1.
+    /// In NDC a direction goes from the near to the far plane, as the reference computes it: d' =
+    /// to - from with z from -1 to 1.
     #[test]
     fn ndc_directions_are_the_references() {
         let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 0.]];
-        let frustum = Frustum { camera_to_world, min: [-0.5, -0.4], max: [0.5, 0.4], near: 1.0, far: 1e9 };
-        let bounds = Bounds { min: [-9.; 3], max: [9.; 3], near: 0.0, far: 1e9, space: Space::Ndc(frustum) };
-        let (origin, direction) = (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
-        let ray = Ray { origin: origin.as_vec3().to_array(), direction: direction.as_vec3().to_array(), background: [1.0; 3] };
+        let frustum =
+            Frustum { camera_to_world, min: [-0.5, -0.4], max: [0.5, 0.4], near: 1.0, far: 1e9 };
+        let bounds =
+            Bounds { min: [-9.; 3], max: [9.; 3], near: 0.0, far: 1e9, space: Space::Ndc(frustum) };
+        let (origin, direction) =
+            (DVec3::new(0.05, -0.02, 0.1), DVec3::new(0.1, 0.05, -1.0).normalize());
+        let ray = Ray {
+            origin: origin.as_vec3().to_array(),
+            direction: direction.as_vec3().to_array(),
+            background: [1.0; 3],
+        };
         let view = |ndc: bool| {
             let maps = RayMaps::new(&bounds, &[ray], Device::Cpu, ndc).unwrap();
             [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
         };
-        // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W / 2) is 1 / 0.5, which our NDC, as wide as high, has
-        // for y, too.
+        // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W /
+        // 2) is 1 / 0.5, which our NDC, as wide as high, has for y, too.
         let start = origin + direction * ((-1.0 - origin.z) / direction.z);
-        let slope = [direction.x / direction.z - start.x / start.z, direction.y / direction.z - start.y / start.z];
+        let slope = [
+            direction.x / direction.z - start.x / start.z,
+            direction.y / direction.z - start.y / start.z,
+        ];
         let expected = [-slope[0] / 0.5, -slope[1] / 0.5, 2.0];
-        assert!(view(true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5), "{:?} {expected:?}", view(true));
+        assert!(
+            view(true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5),
+            "{:?} {expected:?}",
+            view(true)
+        );
         assert!(view(false).iter().zip(direction.to_array()).all(|(a, b)| (a - b).abs() < 1e-6));
     }
 }

@@ -1,9 +1,14 @@
 use tch::{Kind, TchError, Tensor};
 
-/// Distances of `count` samples from `near` to `far` (n × 1 each) at equal steps: n × count. With `draws` in 0..1 (n × count)
-/// each moves within its share of the ray, between the middles to its neighbours (Mildenhall et al. 2020, eq. 2, as the reference
-/// has it: the ends stay inside).
-pub(crate) fn stratified(near: &Tensor, far: &Tensor, count: i64, draws: Option<&Tensor>) -> Result<Tensor, TchError> {
+/// Distances of `count` samples from `near` to `far` (n × 1 each) at equal steps: n × count. With
+/// `draws` in 0..1 (n × count) each moves within its share of the ray, between the middles to its
+/// neighbours (Mildenhall et al. 2020, eq. 2, as the reference has it: the ends stay inside).
+pub(crate) fn stratified(
+    near: &Tensor,
+    far: &Tensor,
+    count: i64,
+    draws: Option<&Tensor>,
+) -> Result<Tensor, TchError> {
     let share = Tensor::f_linspace(0, 1, count, (near.kind(), near.device()))?;
     let t = near.f_mul(&share.f_neg()?.f_add_scalar(1)?)?.f_add(&far.f_mul(&share)?)?;
     let Some(draws) = draws else { return Ok(t) };
@@ -19,11 +24,17 @@ pub(crate) fn middles(t: &Tensor) -> Result<Tensor, TchError> {
     t.f_narrow(1, 1, m - 1)?.f_add(&t.f_narrow(1, 0, m - 1)?)?.f_mul_scalar(0.5)
 }
 
-/// Draws distances where `weights` (n × m) say that light is stopped, from the piecewise constant density over `edges`
-/// (n × m + 1), by inverting its cumulative sum at `draws` in 0..1 (n × k): n × k.
-pub(crate) fn importance(edges: &Tensor, weights: &Tensor, draws: &Tensor) -> Result<Tensor, TchError> {
+/// Draws distances where `weights` (n × m) say that light is stopped, from the piecewise constant
+/// density over `edges` (n × m + 1), by inverting its cumulative sum at `draws` in 0..1 (n × k): n
+/// × k.
+pub(crate) fn importance(
+    edges: &Tensor,
+    weights: &Tensor,
+    draws: &Tensor,
+) -> Result<Tensor, TchError> {
     let weights = weights.f_add_scalar(1e-5)?;
-    let density = weights.f_div(&weights.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?)?;
+    let density =
+        weights.f_div(&weights.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)?)?;
     let cumulative = density.f_cumsum(-1, None::<Kind>)?;
     let zero = cumulative.f_narrow(1, 0, 1)?.f_zeros_like()?;
     let cumulative = Tensor::f_cat(&[&zero, &cumulative], -1)?;

@@ -3,8 +3,9 @@
 pub enum Schedule {
     /// Exponentially with every step, as the paper's text has it.
     Exponential,
-    /// As the reference's code does it: by epochs, flat until the last ten, of which each takes an eleventh of the way on a logarithmic
-    /// scale, so that the end is never quite reached. A training of fewer than twenty goes through the same twenty in less time.
+    /// As the reference's code does it: by epochs, flat until the last ten, of which each takes an
+    /// eleventh of the way on a logarithmic scale, so that the end is never quite reached. A
+    /// training of fewer than twenty goes through the same twenty in less time.
     Epochs {
         /// Epochs in all.
         epochs: u64,
@@ -22,7 +23,8 @@ impl Schedule {
             Self::Epochs { epochs } => {
                 let epochs = epochs.max(2 * Self::FALLING);
                 let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
-                (epoch + 1 + Self::FALLING).saturating_sub(epochs) as f64 / (Self::FALLING + 1) as f64
+                (epoch + 1 + Self::FALLING).saturating_sub(epochs) as f64
+                    / (Self::FALLING + 1) as f64
             }
         };
         highest * decay.powf(progress)
@@ -39,14 +41,23 @@ mod tests {
         let schedule = Schedule::Epochs { epochs: 20 };
         let rate = |epoch: u64| schedule.rate(5e-4, 1e-2, (epoch as f64 + 0.5) / 20.0);
         assert!((0..10).all(|e| rate(e) == 5e-4));
-        let falling = [3.29e-4, 2.16e-4, 1.42e-4, 9.37e-5, 6.16e-5, 4.06e-5, 2.67e-5, 1.76e-5, 1.16e-5, 7.60e-6];
+        let falling = [
+            3.29e-4, 2.16e-4, 1.42e-4, 9.37e-5, 6.16e-5, 4.06e-5, 2.67e-5, 1.76e-5, 1.16e-5,
+            7.60e-6,
+        ];
         for (e, expected) in (10..).zip(falling) {
             assert!((rate(e) / expected - 1.0).abs() < 5e-3, "{e}: {}", rate(e));
         }
         assert_eq!(schedule.rate(5e-4, 1e-2, 1.0), rate(19));
         let short = Schedule::Epochs { epochs: 3 };
-        assert!((0u32..20).all(|e| short.rate(5e-4, 1e-2, (f64::from(e) + 0.5) / 20.0) == rate(u64::from(e))));
+        assert!(
+            (0u32..20)
+                .all(|e| short.rate(5e-4, 1e-2, (f64::from(e) + 0.5) / 20.0) == rate(u64::from(e)))
+        );
         let text = Schedule::Exponential;
-        assert!((text.rate(5e-4, 1e-2, 0.5) - 5e-5).abs() < 1e-9 && (text.rate(5e-4, 1e-2, 1.0) - 5e-6).abs() < 1e-12);
+        assert!(
+            (text.rate(5e-4, 1e-2, 0.5) - 5e-5).abs() < 1e-9
+                && (text.rate(5e-4, 1e-2, 1.0) - 5e-6).abs() < 1e-12
+        );
     }
 }

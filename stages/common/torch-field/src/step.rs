@@ -36,7 +36,11 @@ impl Step {
     }
 
     /// The rays of some of its bundles.
-    pub(crate) fn sample_rays(self, supervision: &impl Supervisor, range: &Range<usize>) -> Vec<Ray> {
+    pub(crate) fn sample_rays(
+        self,
+        supervision: &impl Supervisor,
+        range: &Range<usize>,
+    ) -> Vec<Ray> {
         let mut rays = vec![Ray::default(); range.len() * self.bundle];
         for (g, rays) in range.clone().zip(rays.chunks_exact_mut(self.bundle)) {
             supervision.sample_rays(self.first_bundle + g as u64, rays);
@@ -54,20 +58,32 @@ impl Step {
         let colours = host(colour)?.as_chunks::<3>().0.to_vec();
         let mut gradients = vec![[0.0f32; 3]; colours.len()];
         let pairs = colours.chunks_exact(self.bundle).zip(gradients.chunks_exact_mut(self.bundle));
-        let judge = |(g, (colours, gradients))| supervision.loss_and_gradient(self.first_bundle + g as u64, colours, gradients);
+        let judge = |(g, (colours, gradients))| {
+            supervision.loss_and_gradient(self.first_bundle + g as u64, colours, gradients)
+        };
         let loss = range.clone().zip(pairs).map(judge).sum();
-        let scaled: Vec<f32> = gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
-        let gradients = Tensor::f_from_slice(&scaled)?.f_reshape([colours.len() as i64, 3])?.f_to_device(colour.device())?;
+        let scaled: Vec<f32> =
+            gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
+        let gradients = Tensor::f_from_slice(&scaled)?
+            .f_reshape([colours.len() as i64, 3])?
+            .f_to_device(colour.device())?;
         Ok(Judged { loss, colours, towards: colour.f_mul(&gradients)?.f_sum(None::<tch::Kind>)? })
     }
 
     /// Lets supervision keep what was seen.
-    pub(crate) fn remember<'a>(self, supervision: &mut impl Supervisor, colours: impl Iterator<Item = &'a [[f32; 3]]>) {
+    pub(crate) fn remember<'a>(
+        self,
+        supervision: &mut impl Supervisor,
+        colours: impl Iterator<Item = &'a [[f32; 3]]>,
+    ) {
         let bundles = colours.flat_map(|c| c.chunks_exact(self.bundle));
-        (self.first_bundle..).zip(bundles).for_each(|(bundle, colours)| supervision.remember(bundle, colours));
+        (self.first_bundle..)
+            .zip(bundles)
+            .for_each(|(bundle, colours)| supervision.remember(bundle, colours));
     }
 
-    /// Goes through its bundles in as few pieces as memory allows: where there isn't enough, the next ones are smaller.
+    /// Goes through its bundles in as few pieces as memory allows: where there isn't enough, the
+    /// next ones are smaller.
     pub(crate) fn in_pieces<T>(
         self,
         mut run: impl FnMut(Range<usize>) -> Result<T, TchError>,
@@ -97,7 +113,11 @@ mod tests {
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&Tally::default(), 17, 4);
         let run = |range: Range<usize>| {
-            if range.len() > 3 { Err(TchError::Torch("CUDA out of memory. Tried".to_owned())) } else { Ok(range) }
+            if range.len() > 3 {
+                Err(TchError::Torch("CUDA out of memory. Tried".to_owned()))
+            } else {
+                Ok(range)
+            }
         };
         let pieces = step.in_pieces(run).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);

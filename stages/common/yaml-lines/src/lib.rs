@@ -6,11 +6,17 @@ use std::fmt;
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_yaml::Value;
 
-/// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and what to do.
+/// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and
+/// what to do.
 pub fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
-    let is_utf16 = bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]) || bytes.iter().take(2).any(|b| *b == 0);
+    let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
+        || bytes.starts_with(&[0xfe, 0xff])
+        || bytes.iter().take(2).any(|b| *b == 0);
     if is_utf16 {
-        return Err((None, "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)".to_owned()));
+        return Err((
+            None,
+            "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)".to_owned(),
+        ));
     }
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     std::str::from_utf8(bytes).map_err(|e| {
@@ -32,7 +38,9 @@ pub fn merge(document: &mut Value) -> Result<bool, serde_yaml::Error> {
 
 fn has_merge_key(value: &Value) -> bool {
     match value {
-        Value::Mapping(entries) => entries.iter().any(|(key, value)| key.as_str() == Some("<<") || has_merge_key(value)),
+        Value::Mapping(entries) => {
+            entries.iter().any(|(key, value)| key.as_str() == Some("<<") || has_merge_key(value))
+        }
         Value::Sequence(items) => items.iter().any(has_merge_key),
         Value::Tagged(tagged) => has_merge_key(&tagged.value),
         _ => false,
@@ -54,7 +62,8 @@ pub fn not_finite(value: &Value) -> Option<Vec<String>> {
     }
 }
 
-/// What a search ends with: the parser says on which line an error came up, so what is found is reported as one.
+/// What a search ends with: the parser says on which line an error came up, so what is found is
+/// reported as one.
 const FOUND: &str = "the key that was looked for";
 
 fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
@@ -62,9 +71,12 @@ fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
     error.location().filter(|_| error.to_string().contains(FOUND)).map(|at| at.line())
 }
 
-/// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of the last one that is.
+/// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of
+/// the last one that is.
 pub fn line_of(text: &str, path: &[&str]) -> Option<usize> {
-    let search = |length: usize| Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text));
+    let search = |length: usize| {
+        Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text))
+    };
     (1..=path.len()).rev().find_map(|length| line_found(search(length)))
 }
 
@@ -93,7 +105,9 @@ impl<'de> Visitor<'de> for Search<'_> {
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
         let Some((first, rest)) = self.0.split_first() else { return Ok(()) };
-        while let Some(is_first) = map.next_key_seed(Key { name: first, is_last: rest.is_empty() })? {
+        while let Some(is_first) =
+            map.next_key_seed(Key { name: first, is_last: rest.is_empty() })?
+        {
             if is_first {
                 map.next_value_seed(Search(rest))?;
             } else {
@@ -216,7 +230,9 @@ mod tests {
 
     #[test]
     fn keys_are_found_on_their_lines() {
-        let text = "default: [a]\nstages:\n  a:\n    inputs: {x: b, y: c}\n    # b: a comment\n    parameters:\n      'x': 1\n      z:\n        - 2\n  b: {parameters: {\n    x: 2}}\n  inputs:\n    run: &r ./x\n  c:\n    run: *r\n";
+        let text = "default: [a]\nstages:\n  a:\n    inputs: {x: b, y: c}\n    # b: a \
+            comment\n    parameters:\n      'x': 1\n      z:\n        - 2\n  b: \
+            {parameters: {\n    x: 2}}\n  inputs:\n    run: &r ./x\n  c:\n    run: *r\n";
         for (path, line) in [
             (&["default"][..], Some(1)),
             (&["stages", "a"], Some(3)),
@@ -247,8 +263,14 @@ mod tests {
     fn encodings() {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
-        let utf16 = |bytes: &[u8]| decode(bytes).unwrap_err().1.contains("UTF-16; save it as UTF-8");
-        assert!(utf16(b"\xff\xfea\0:\0") && utf16(b"\xfe\xff\0a\0:") && utf16(b"a\0:\0") && utf16(b"\0a\0:"));
+        let utf16 =
+            |bytes: &[u8]| decode(bytes).unwrap_err().1.contains("UTF-16; save it as UTF-8");
+        assert!(
+            utf16(b"\xff\xfea\0:\0")
+                && utf16(b"\xfe\xff\0a\0:")
+                && utf16(b"a\0:\0")
+                && utf16(b"\0a\0:")
+        );
         let (line, problem) = decode(b"a: 1\nb: \xe4\n").unwrap_err();
         assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
     }
@@ -258,9 +280,13 @@ mod tests {
         for (text, expected) in [
             ("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}", "a: {x: 1, y: 2}\nb: {y: 3, x: 1}"),
             ("a: &a {x: 1}\nb: &b {<<: *a}\nc: {<<: *b}", "a: {x: 1}\nb: {x: 1}\nc: {x: 1}"),
-            ("a: &a {x: 1}\nb: &b {y: 1}\nc: {<<: [*a, *b]}", "a: {x: 1}\nb: {y: 1}\nc: {x: 1, y: 1}"),
+            (
+                "a: &a {x: 1}\nb: &b {y: 1}\nc: {<<: [*a, *b]}",
+                "a: {x: 1}\nb: {y: 1}\nc: {x: 1, y: 1}",
+            ),
         ] {
-            let [mut found, expected] = [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
+            let [mut found, expected] =
+                [text, expected].map(|t| serde_yaml::from_str::<Value>(t).unwrap());
             assert!(merge(&mut found).unwrap());
             assert_eq!(found, expected, "{text}");
         }

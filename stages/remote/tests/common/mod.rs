@@ -17,7 +17,12 @@ pub(crate) fn entered(store: &Store) -> Entered {
 }
 
 /// An action as a runner carries it out.
-pub(crate) fn make(store: &Store, stage: &str, made_of: &[&Record], files: &[(&str, Vec<u8>)]) -> Record {
+pub(crate) fn make(
+    store: &Store,
+    stage: &str,
+    made_of: &[&Record],
+    files: &[(&str, Vec<u8>)],
+) -> Record {
     let key_parts = json!({ "stage": stage }).as_object().unwrap().clone();
     let made_of: Vec<String> = made_of.iter().map(|record| record.key()).collect();
     let stage = stage.to_owned();
@@ -30,7 +35,14 @@ pub(crate) fn make(store: &Store, stage: &str, made_of: &[&Record], files: &[(&s
     }
     let checked = store.check(attempt, "text").unwrap();
     let Unfinished { stage, key_parts, made_of, started_unix, .. } = action;
-    let record = Record { stage, key_parts, made_of, started_unix, host: "here".into(), ..Record::default() };
+    let record = Record {
+        stage,
+        key_parts,
+        made_of,
+        started_unix,
+        host: "here".into(),
+        ..Record::default()
+    };
     store.publish(&entered(store), checked, record).unwrap()
 }
 
@@ -38,13 +50,15 @@ pub(crate) fn make(store: &Store, stage: &str, made_of: &[&Record], files: &[(&s
 pub(crate) fn bytes(count: usize, seed: u64) -> Vec<u8> {
     let mut state = seed;
     let mut next = || {
-        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        state =
+            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 56) as u8
     };
     (0..count).map(|_| next()).collect()
 }
 
-/// prep and again make one artifact, train is made of prep and has a file in several parts, eval is made of both.
+/// prep and again make one artifact, train is made of prep and has a file in several parts, eval is
+/// made of both.
 pub(crate) fn sample(folder: &Path) -> (Store, Vec<Record>) {
     let store = Store::open(folder).unwrap();
     let images = [
@@ -58,8 +72,14 @@ pub(crate) fn sample(folder: &Path) -> (Store, Vec<Record>) {
     let again = make(&store, "again", &[], &images);
     assert_eq!(prep.output, again.output);
     let long = format!("{}/{}.bin", "folder".repeat(15), "name".repeat(20));
-    let train = make(&store, "train", &[&prep], &[("field.bin", bytes((13 << 20) + 5, 4)), (&long, bytes(100, 5))]);
-    let eval = make(&store, "eval", &[&prep, &train], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
+    let train = make(
+        &store,
+        "train",
+        &[&prep],
+        &[("field.bin", bytes((13 << 20) + 5, 4)), (&long, bytes(100, 5))],
+    );
+    let eval =
+        make(&store, "eval", &[&prep, &train], &[("metrics.json", b"{\"psnr\": 31.25}".to_vec())]);
     (store, vec![prep, again, train, eval])
 }
 

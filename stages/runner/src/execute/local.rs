@@ -1,4 +1,5 @@
-//! The local executor: runs a plan's nodes whose parents are done, some at once, and then its sinks.
+//! The local executor: runs a plan's nodes whose parents are done, some at once, and then its
+//! sinks.
 
 use std::cell::OnceCell;
 use std::collections::BTreeSet;
@@ -37,13 +38,18 @@ impl Executor for Local {
         if stop.load(Ordering::Relaxed) {
             return Err(Failure::Interrupted.into());
         }
-        let showing = Showing { plan, store: &session.store, run, out, threads: self.budget.threads, stop };
+        let showing =
+            Showing { plan, store: &session.store, run, out, threads: self.budget.threads, stop };
         if let Some((index, failure)) = outcome.failures.first() {
             if self.keep_going {
                 show_partly(&showing, &outcome)?;
             }
             let node = &plan.nodes[*index];
-            report_text(&self.remedy.after_failure(&node.label(), &node.stage, outcome.skipped.len()));
+            report_text(&self.remedy.after_failure(
+                &node.label(),
+                &node.stage,
+                outcome.skipped.len(),
+            ));
             return Ok(ExitCode::from(failure.code));
         }
         say_results(session, plan, &outcome)?;
@@ -89,7 +95,8 @@ fn run(work: &Work<'_>, options: &Local) -> Outcome {
             schedule.look();
             for (job, index, action) in schedule.starting() {
                 let sender = sender.clone();
-                // The receiver lives as long as the scope. A panic doesn't come here: it ends the program (`panics`).
+                // The receiver lives as long as the scope. A panic doesn't come here: it ends the
+                // program (`panics`).
                 scope.spawn(move || sender.send((index, job.carry_out(action))).ok());
             }
             if schedule.places.is_idle() {
@@ -124,27 +131,49 @@ impl<'a> Schedule<'a> {
             progress: (0..count).map(|_| NodeProgress::Pending).collect(),
             places: Places::new(options.budget),
             records: OnceCell::new(),
-            outcome: Outcome { records: vec![None; count], ran: BTreeSet::new(), failures: Vec::new(), skipped: Vec::new() },
+            outcome: Outcome {
+                records: vec![None; count],
+                ran: BTreeSet::new(),
+                failures: Vec::new(),
+                skipped: Vec::new(),
+            },
         }
     }
 
     fn gives_up(&self) -> bool {
-        self.work.stop.load(Ordering::Relaxed) || (!self.options.keep_going && !self.outcome.failures.is_empty())
+        self.work.stop.load(Ordering::Relaxed)
+            || (!self.options.keep_going && !self.outcome.failures.is_empty())
     }
 
     fn job(&self, index: usize) -> NodeJob<'a> {
         let Work { session, plan, run: file, stop, .. } = *self.work;
         let node = &plan.nodes[index];
-        let parents = node.parents().filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?))).collect();
+        let parents = node
+            .parents()
+            .filter_map(|parent| Some((parent, self.outcome.records[parent].clone()?)))
+            .collect();
         let threads = self.options.budget.threads;
-        NodeJob { plan, node, parents, store: &session.store, file, threads, display: self.display, stop }
+        NodeJob {
+            plan,
+            node,
+            parents,
+            store: &session.store,
+            file,
+            threads,
+            display: self.display,
+            stop,
+        }
     }
 
-    /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass finds all that is cached.
+    /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass
+    /// finds all that is cached.
     fn look(&mut self) {
         for (index, node) in self.work.plan.nodes.iter().enumerate() {
             let is_pending = matches!(self.progress[index], NodeProgress::Pending);
-            if self.gives_up() || !is_pending || node.parents().any(|parent| self.outcome.records[parent].is_none()) {
+            if self.gives_up()
+                || !is_pending
+                || node.parents().any(|parent| self.outcome.records[parent].is_none())
+            {
                 continue;
             }
             match self.job(index).find() {
@@ -154,7 +183,9 @@ impl<'a> Schedule<'a> {
                 }
                 Ok(Found::ToDo(action)) => {
                     // Without records every stage counts as unknown.
-                    let records = self.records.get_or_init(|| self.work.session.store.records().unwrap_or_default());
+                    let records = self
+                        .records
+                        .get_or_init(|| self.work.session.store.records().unwrap_or_default());
                     let need = Need::of(action.key_parts(), &node.stage, records);
                     self.progress[index] = NodeProgress::Ready { action, need, said: false };
                 }
@@ -167,15 +198,21 @@ impl<'a> Schedule<'a> {
     fn starting(&mut self) -> Vec<(NodeJob<'a>, usize, Action)> {
         let mut starting = Vec::new();
         for index in 0..self.progress.len() {
-            let NodeProgress::Ready { need, ref mut said, .. } = self.progress[index] else { continue };
+            let NodeProgress::Ready { need, ref mut said, .. } = self.progress[index] else {
+                continue;
+            };
             match self.places.place(need) {
                 Place::LaterForMemory(why) if !*said => {
                     *said = true;
-                    self.display.line(&format!("{}: waits: {why}", self.work.plan.nodes[index].label()));
+                    self.display
+                        .line(&format!("{}: waits: {why}", self.work.plan.nodes[index].label()));
                 }
-                Place::Never(message) if !self.gives_up() => self.fail(index, StageFailure { code: 1, message }),
+                Place::Never(message) if !self.gives_up() => {
+                    self.fail(index, StageFailure { code: 1, message })
+                }
                 Place::Free if !self.gives_up() => {
-                    let progress = std::mem::replace(&mut self.progress[index], NodeProgress::Running);
+                    let progress =
+                        std::mem::replace(&mut self.progress[index], NodeProgress::Running);
                     let NodeProgress::Ready { action, .. } = progress else { continue };
                     self.places.take(index, need);
                     starting.push((self.job(index), index, action));
@@ -202,7 +239,11 @@ impl<'a> Schedule<'a> {
 
     fn fail(&mut self, index: usize, failure: StageFailure) {
         self.progress[index] = NodeProgress::Over;
-        self.display.line(&format!("{}: failed: {}", self.work.plan.nodes[index].label(), failure.message));
+        self.display.line(&format!(
+            "{}: failed: {}",
+            self.work.plan.nodes[index].label(),
+            failure.message
+        ));
         self.outcome.failures.push((index, failure));
     }
 
@@ -216,11 +257,14 @@ impl<'a> Schedule<'a> {
 
 /// Prints a few words on each result that nothing else is made of.
 fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Result<()> {
-    let ends: BTreeSet<usize> =
-        (0..plan.nodes.len()).filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i))).collect();
+    let ends: BTreeSet<usize> = (0..plan.nodes.len())
+        .filter(|&i| !plan.nodes.iter().any(|n| n.parents().any(|p| p == i)))
+        .collect();
     for index in ends {
         let record = outcome.records[index].as_ref().context("every node is done")?;
-        let stored = || std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).ok();
+        let stored = || {
+            std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).ok()
+        };
         if let Some(summary) = record.summary.clone().or_else(stored) {
             print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
         }
@@ -243,7 +287,9 @@ fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Re
     let shown = shown.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
     match &shown {
         Shown::Written(folder) => print_line!("{}: {}", sink.stage, page(folder).display()),
-        Shown::UpToDate(folder) => print_line!("{}: {} (up to date)", sink.stage, page(folder).display()),
+        Shown::UpToDate(folder) => {
+            print_line!("{}: {} (up to date)", sink.stage, page(folder).display())
+        }
         Shown::Missing => print_line!("{}: nothing to show", sink.stage),
     }
     Ok(matches!(shown, Shown::Written(_)))
@@ -257,7 +303,10 @@ fn show_all(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
         wrote |= show_one(showing, sink, outcome)?;
     }
     let (ran, all) = (outcome.ran.len(), plan.nodes.len());
-    print_line!("{}", if ran == 0 && !wrote { counts::all_cached(all) } else { counts::ran(ran, all) });
+    print_line!(
+        "{}",
+        if ran == 0 && !wrote { counts::all_cached(all) } else { counts::ran(ran, all) }
+    );
     Ok(())
 }
 

@@ -6,7 +6,8 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use artifact::{
-    Attempt, Entered, Holder, KeyLock, Record, RunFile, SUMMARY_FILE, Store, Unfinished, hash_json, host_name, unix_time,
+    Attempt, Entered, Holder, KeyLock, Record, RunFile, SUMMARY_FILE, Store, Unfinished, hash_json,
+    host_name, unix_time,
 };
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use serde_json::{Map, Value};
@@ -60,12 +61,15 @@ impl NodeJob<'_> {
         }
     }
 
-    /// Looks whether it is cached. Either way it is written down that this run needs it, so that it can't go meanwhile.
+    /// Looks whether it is cached. Either way it is written down that this run needs it, so that it
+    /// can't go meanwhile.
     pub(crate) fn find(&self) -> Result<Found, StageFailure> {
-        let hashes = input_hashes(self.node, self.store, |index| self.output_of(index)).map_err(|e| match e {
-            PlanError::Source(message) => StageFailure { code: 3, message },
-            other => fail(other),
-        })?;
+        let hashes = input_hashes(self.node, self.store, |index| self.output_of(index)).map_err(
+            |e| match e {
+                PlanError::Source(message) => StageFailure { code: 3, message },
+                other => fail(other),
+            },
+        )?;
         let key_parts = planning::parts(self.node, &hashes, self.device());
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
@@ -77,7 +81,10 @@ impl NodeJob<'_> {
     pub(crate) fn carry_out(&self, action: Action) -> Result<(Record, bool), StageFailure> {
         let Action { key_parts, hashes } = action;
         let key = hash_json(&key_parts);
-        let lock = until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || self.store.try_lock(&key))?;
+        let lock =
+            until_held(self.stop, &|holder, waited| self.say_waiting(holder, waited), || {
+                self.store.try_lock(&key)
+            })?;
         let action = Unfinished {
             stage: self.node.stage.clone(),
             point: self.node.point.clone(),
@@ -94,7 +101,12 @@ impl NodeJob<'_> {
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?
         };
-        let folders = self.node.inputs.iter().map(|input| (input.name.clone(), self.folder_of(input))).collect();
+        let folders = self
+            .node
+            .inputs
+            .iter()
+            .map(|input| (input.name.clone(), self.folder_of(input)))
+            .collect();
         self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
     }
 
@@ -107,16 +119,28 @@ impl NodeJob<'_> {
     }
 
     fn enter(&self) -> Result<Entered, StageFailure> {
-        enter(self.store, self.stop, &|text| self.display.line(&format!("{}: {text}", self.node.label())))
+        enter(self.store, self.stop, &|text| {
+            self.display.line(&format!("{}: {text}", self.node.label()))
+        })
     }
 
     fn say_waiting(&self, holder: Option<&Holder>, waited: Duration) {
         let waited = seconds(waited.as_secs_f64());
-        self.display.line(&format!("{}: is being made{}; waits for it, for {waited} now", self.node.label(), by(holder)));
+        self.display.line(&format!(
+            "{}: is being made{}; waits for it, for {waited} now",
+            self.node.label(),
+            by(holder)
+        ));
     }
 
     /// Calls the stage and takes in what it made.
-    fn make(&self, lock: &KeyLock, attempt: Attempt, action: Unfinished, inputs: &Inputs) -> Result<Record, StageFailure> {
+    fn make(
+        &self,
+        lock: &KeyLock,
+        attempt: Attempt,
+        action: Unfinished,
+        inputs: &Inputs,
+    ) -> Result<Record, StageFailure> {
         let label = self.node.label();
         let call = Call {
             label: &label,
@@ -150,9 +174,14 @@ impl NodeJob<'_> {
             host: host_name(),
             summary: std::fs::read_to_string(attempt.output.join(SUMMARY_FILE)).ok(),
         };
-        let checked = self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
+        let checked =
+            self.store.check(attempt, &self.node.program.description.output.kind).map_err(fail)?;
         let record = self.store.publish(&self.enter()?, checked, record).map_err(fail)?;
-        self.display.line(&format!("{label}: done in {} → {}", seconds(record.seconds), &record.output[..10]));
+        self.display.line(&format!(
+            "{label}: done in {} → {}",
+            seconds(record.seconds),
+            &record.output[..10]
+        ));
         Ok(record)
     }
 

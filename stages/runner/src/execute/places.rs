@@ -21,9 +21,13 @@ const UNKNOWN: Need = Need { cores: 1, memory: 0 };
 impl Need {
     /// What the nearest measured run of a stage took; one core and no memory where there is none.
     pub(crate) fn of(key_parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Self {
-        let measured = records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
+        let measured =
+            records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
         nearest(key_parts, measured).map_or(UNKNOWN, |record| Self {
-            cores: record.processor_seconds.map_or(1, |busy| (busy / record.seconds.max(1e-3)).round() as usize).max(1),
+            cores: record
+                .processor_seconds
+                .map_or(1, |busy| (busy / record.seconds.max(1e-3)).round() as usize)
+                .max(1),
             memory: record.peak_memory.unwrap_or(0),
         })
     }
@@ -38,7 +42,8 @@ impl Need {
 pub(crate) struct Budget {
     /// Stages at once.
     pub(crate) stages: usize,
-    /// Cores, and as many threads for every stage: stages side by side share the cores, and one that is left alone has them all.
+    /// Cores, and as many threads for every stage: stages side by side share the cores, and one
+    /// that is left alone has them all.
     pub(crate) threads: usize,
     /// Memory in bytes.
     pub(crate) memory: u64,
@@ -83,7 +88,11 @@ impl Places {
     pub(crate) fn place(&self, need: Need) -> Place {
         let memory = self.budget.memory;
         if need.memory > memory {
-            return Place::Never(format!("{}, and there are {}; --memory says otherwise", need.memory_in_words(), sized(memory)));
+            return Place::Never(format!(
+                "{}, and there are {}; --memory says otherwise",
+                need.memory_in_words(),
+                sized(memory)
+            ));
         }
         let cores: usize = self.running.values().map(|need| need.cores).sum();
         if self.running.len() >= self.budget.stages || cores >= self.budget.threads {
@@ -131,9 +140,16 @@ mod tests {
             other => panic!("{other:?}"),
         };
         let later = said(place_beside(&[need(1, 5)], need(1, 4)));
-        assert_eq!(later, "it took 4.0 GB of memory when it last ran, and 3.0 GB of 8.0 GB are left");
+        assert_eq!(
+            later,
+            "it took 4.0 GB of memory when it last ran, and 3.0 GB of 8.0 GB are left"
+        );
         let never = said(place_beside(&[], need(1, 9)));
-        assert_eq!(never, "it took 9.0 GB of memory when it last ran, and there are 8.0 GB; --memory says otherwise");
+        assert_eq!(
+            never,
+            "it took 9.0 GB of memory when it last ran, and there are 8.0 GB; --memory says \
+            otherwise"
+        );
     }
 
     #[test]
@@ -147,7 +163,9 @@ mod tests {
 
     #[test]
     fn the_nearest_measured_run_tells() {
-        let parts = |scale: u64, seed: u64| json!({"scale": scale, "seed": seed}).as_object().unwrap().clone();
+        let parts = |scale: u64, seed: u64| {
+            json!({"scale": scale, "seed": seed}).as_object().unwrap().clone()
+        };
         let record = |stage: &str, key_parts, gb: Option<u64>| Record {
             stage: stage.to_owned(),
             key_parts,

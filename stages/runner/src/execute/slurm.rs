@@ -1,4 +1,5 @@
-//! The Slurm executor: a job for each node that isn't known to be cached, and for each sink. Then it leaves.
+//! The Slurm executor: a job for each node that isn't known to be cached, and for each sink. Then
+//! it leaves.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -27,16 +28,22 @@ impl Executor for Cluster {
     fn carry_out(&self, work: &Work<'_>) -> anyhow::Result<ExitCode> {
         let root = work.session.store.root();
         let out = std::path::absolute(work.out)?;
-        let submission = Submission::new(root, work.run.id(), tasks(work.plan, &work.session.store, &out)?);
-        if let Some((task, problem)) = submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?))) {
+        let submission =
+            Submission::new(root, work.run.id(), tasks(work.plan, &work.session.store, &out)?);
+        if let Some((task, problem)) =
+            submission.tasks.iter().find_map(|t| Some((t, self.site.problem(&t.resources)?)))
+        {
             return Err(PlanError::Usage(format!("stage {}: {problem}", task.stage)).into());
         }
-        let runner = std::env::current_exe().and_then(|exe| exe.canonicalize()).context("the runner's own path")?;
+        let runner = std::env::current_exe()
+            .and_then(|exe| exe.canonicalize())
+            .context("the runner's own path")?;
         let terms = Terms {
             slurm: &Slurm::default(),
             site: &self.site,
             command: &[runner.as_os_str(), JOB_VERB.as_ref()],
-            plan: &serde_json::to_vec(&Frozen::new(work.plan, &out)).context("the plan can't be written down")?,
+            plan: &serde_json::to_vec(&Frozen::new(work.plan, &out))
+                .context("the plan can't be written down")?,
             folder: &std::env::current_dir()?,
             is_stopped: &|| work.stop.load(Ordering::Relaxed),
         };
@@ -46,7 +53,12 @@ impl Executor for Cluster {
 }
 
 impl Cluster {
-    fn say(&self, work: &Work<'_>, submission: &Submission, submitted: &Submitted) -> anyhow::Result<ExitCode> {
+    fn say(
+        &self,
+        work: &Work<'_>,
+        submission: &Submission,
+        submitted: &Submitted,
+    ) -> anyhow::Result<ExitCode> {
         let Submitted { jobs, queued, left, error } = submitted;
         for (number, id) in jobs {
             print_line!("{}: job {id}", submission.tasks[*number].label);
@@ -61,9 +73,10 @@ impl Cluster {
         }
         if *left > 0 {
             let most = self.site.max_submit;
-            let why = error
-                .as_ref()
-                .map_or_else(|| format!("at most {most} jobs are queued at once (max_submit)"), ToString::to_string);
+            let why = error.as_ref().map_or_else(
+                || format!("at most {most} jobs are queued at once (max_submit)"),
+                ToString::to_string,
+            );
             report_line!("nerf-sr: {} left: {why}; run this again to go on", counted(*left, "job"));
         }
         Ok(if error.is_some() { ExitCode::FAILURE } else { ExitCode::SUCCESS })
@@ -84,7 +97,8 @@ fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError>
     let sinks = plan.sinks.iter().map(|sink| {
         let shows: Vec<&String> = sink.shows.iter().map(|&index| &identities[index]).collect();
         let code = &sink.program.description.code;
-        let parts = json!({"sink": sink.stage, "code": code, "parameters": sink.parameters, "shows": shows, "out": out});
+        let parts = json!({"sink": sink.stage, "code": code, "parameters": sink.parameters,
+            "shows": shows, "out": out});
         Task {
             stage: sink.stage.clone(),
             label: sink.stage.clone(),
@@ -96,7 +110,8 @@ fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError>
     Ok(nodes.chain(sinks).collect())
 }
 
-/// By what nodes are known before their keys are: a key's parts, with what a parent is in the place of what it made.
+/// By what nodes are known before their keys are: a key's parts, with what a parent is in the place
+/// of what it made.
 pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, PlanError> {
     let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
     for node in &plan.nodes {
@@ -119,6 +134,7 @@ pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, Plan
 fn done(work: &Work<'_>, out: &Path) -> anyhow::Result<Vec<bool>> {
     let (plan, store) = (work.plan, &work.session.store);
     let records: Vec<Option<Record>> = plan.states(store)?.into_iter().map(State::record).collect();
-    let sinks: Vec<bool> = plan.sinks.iter().map(|sink| is_shown(plan, sink, &records, store, out)).collect();
+    let sinks: Vec<bool> =
+        plan.sinks.iter().map(|sink| is_shown(plan, sink, &records, store, out)).collect();
     Ok(records.iter().map(Option::is_some).chain(sinks).collect())
 }

@@ -7,7 +7,8 @@ use slurm::{Queue, Slurm};
 pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitCode> {
     let slurm = Slurm::default();
     let queue = Queue::look(&slurm, store.root())?;
-    let jobs: Vec<_> = queue.jobs.iter().filter(|job| stage.is_none_or(|stage| job.task.stage == stage)).collect();
+    let jobs: Vec<_> =
+        queue.jobs.iter().filter(|job| stage.is_none_or(|stage| job.task.stage == stage)).collect();
     slurm.cancel(&jobs.iter().map(|job| job.id.as_str()).collect::<Vec<_>>())?;
     for job in &jobs {
         print_line!("{}: {}", job.task.label, job.words());

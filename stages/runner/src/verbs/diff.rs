@@ -12,7 +12,12 @@ const MOST_FILES: usize = 4;
 const SHORTEST: usize = 6;
 
 /// Tells what differs between two results and all that they were made of.
-pub(crate) fn diff(session: &Session, before: &str, now: &str, json: bool) -> anyhow::Result<ExitCode> {
+pub(crate) fn diff(
+    session: &Session,
+    before: &str,
+    now: &str,
+    json: bool,
+) -> anyhow::Result<ExitCode> {
     let (before, now) = (side(session, before)?, side(session, now)?);
     let differences = now.differences(&before, &session.store);
     if json {
@@ -29,7 +34,8 @@ pub(crate) fn diff(session: &Session, before: &str, now: &str, json: bool) -> an
 fn lines(difference: &StageDifference) -> Vec<String> {
     let (files, others): (Vec<&Change>, Vec<&Change>) =
         difference.changes.iter().partition(|change| change.name.starts_with("file "));
-    let mut lines: Vec<String> = others.iter().map(|change| format!("{}: {change}", difference.stage)).collect();
+    let mut lines: Vec<String> =
+        others.iter().map(|change| format!("{}: {change}", difference.stage)).collect();
     if files.len() > MOST_FILES {
         let first = files[0].name.trim_start_matches("file ");
         lines.push(format!("{}: {} files differ, such as {first}", difference.stage, files.len()));
@@ -39,7 +45,8 @@ fn lines(difference: &StageDifference) -> Vec<String> {
     lines
 }
 
-/// A side of the comparison: a recorded run or pin, the beginning of an artifact's hash or of a key, or a stage with `-p` and `-i`.
+/// A side of the comparison: a recorded run or pin, the beginning of an artifact's hash or of a
+/// key, or a stage with `-p` and `-i`.
 fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let store = &session.store;
     if let Some(run) = store.runs()?.into_iter().chain(store.pins()?).find(|run| run.id == text) {
@@ -48,10 +55,15 @@ fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let is_hash = text.len() >= SHORTEST && text.bytes().all(|b| b.is_ascii_hexdigit());
     if is_hash {
         let records = store.records()?;
-        let mut found = records.iter().filter(|record| record.output.starts_with(text) || record.key().starts_with(text));
+        let mut found = records
+            .iter()
+            .filter(|record| record.output.starts_with(text) || record.key().starts_with(text));
         if let Some(record) = found.next() {
             if found.any(|other| other.output != record.output) {
-                return Err(PlanError::Usage(format!("{text}: more than one artifact begins so; give more of it")).into());
+                return Err(PlanError::Usage(format!(
+                    "{text}: more than one artifact begins so; give more of it"
+                ))
+                .into());
             }
             return Ok(Lineage::of(store, [record.key()]));
         }
@@ -63,13 +75,20 @@ fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
 fn stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let usage = |problem: String| PlanError::Usage(format!("{text:?}: {problem}"));
     let mut words = text.split_whitespace().map(str::to_owned);
-    let stage = words.next().ok_or_else(|| usage("expected a stage, an artifact's hash, or a run".to_owned()))?;
+    let stage = words
+        .next()
+        .ok_or_else(|| usage("expected a stage, an artifact's hash, or a run".to_owned()))?;
     let mut what = Request { targets: vec![stage.clone()], ..Request::default() };
     while let Some(word) = words.next() {
         let list = match word.as_str() {
             "-p" => &mut what.parameters,
             "-i" => &mut what.inputs,
-            _ => return Err(usage(format!("{word} is neither -p nor -i; quote each side as one word of the shell")).into()),
+            _ => {
+                return Err(usage(format!(
+                    "{word} is neither -p nor -i; quote each side as one word of the shell"
+                ))
+                .into());
+            }
         };
         list.push(words.next().ok_or_else(|| usage(format!("{word} needs NAME=VALUE")))?);
     }
@@ -80,6 +99,9 @@ fn stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
             State::Cached(record) => Ok(Lineage::of(&session.store, [record.key()])),
             _ => Err(Failure::BadInput(format!("{text} isn't made yet; run it first")).into()),
         },
-        _ => Err(usage("a sweep has several results; give one value for each parameter".to_owned()).into()),
+        _ => {
+            Err(usage("a sweep has several results; give one value for each parameter".to_owned())
+                .into())
+        }
     }
 }

@@ -10,7 +10,12 @@ use crate::session::Session;
 use crate::waiting::until_held;
 
 /// Removes what nothing needs any more.
-pub(crate) fn gc(session: &Session, what: &Request, choice: Choice, style: Style) -> anyhow::Result<ExitCode> {
+pub(crate) fn gc(
+    session: &Session,
+    what: &Request,
+    choice: Choice,
+    style: Style,
+) -> anyhow::Result<ExitCode> {
     let store = &session.store;
     let needed = needed(session, what)?;
     if style.dry_run {
@@ -18,7 +23,10 @@ pub(crate) fn gc(session: &Session, what: &Request, choice: Choice, style: Style
     }
     let stop = stop_on_signals()?;
     let say = |_: Option<&_>, waited: std::time::Duration| {
-        report_line!("nerf-sr: waits until no run looks for artifacts, for {} now", seconds(waited.as_secs_f64()));
+        report_line!(
+            "nerf-sr: waits until no run looks for artifacts, for {} now",
+            seconds(waited.as_secs_f64())
+        );
     };
     let closed = match until_held(&stop, &say, || store.try_close()) {
         Ok(closed) => closed,
@@ -45,12 +53,19 @@ impl Style {
     fn tell(self, verdict: &Verdict) -> anyhow::Result<ExitCode> {
         let (goes, stays) = verdict.bytes();
         if self.json {
-            let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays, "items": verdict.fates()});
+            let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays,
+                "items": verdict.fates()});
             return super::print_json(&told);
         }
         verdict.fates().iter().for_each(|fate| print_line!("{fate}"));
         let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };
-        print_line!("{:.1} MB {}, {:.1} MB {}", goes as f64 / 1e6, verbs.0, stays as f64 / 1e6, verbs.1);
+        print_line!(
+            "{:.1} MB {}, {:.1} MB {}",
+            goes as f64 / 1e6,
+            verbs.0,
+            stays as f64 / 1e6,
+            verbs.1
+        );
         Ok(ExitCode::SUCCESS)
     }
 }

@@ -14,19 +14,22 @@ use super::run::register;
 use crate::execute::NodeJob;
 use crate::sink::{Showing, Shown, show};
 
-/// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a sink.
+/// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a
+/// sink.
 pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
     let is_time_up = Arc::new(AtomicBool::new(false));
     for flag in [&stop, &is_time_up] {
         signal_hook::flag::register(SIGUSR1, Arc::clone(flag))?;
     }
-    let root = folder.ancestors().nth(2).context("a submission lies in a store's folder `slurm`")?;
+    let root =
+        folder.ancestors().nth(2).context("a submission lies in a store's folder `slurm`")?;
     let store = Store::open(root)?;
     let frozen = Frozen::read(&Submission::plan(folder))?;
     let plan = frozen.part(number)?;
     let result = register(&store, &plan, &stop).and_then(|run| {
-        let result = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop }.carry_out();
+        let result = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop }
+            .carry_out();
         run.end().ok();
         result
     });
@@ -41,13 +44,19 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
 /// Puts the job into the queue once more, where its stage has left something to go on from.
 fn go_on_later(plan: &Plan, store: &Store) -> anyhow::Result<()> {
     let state = plan.states(store)?.pop();
-    let has_checkpoint = state.and_then(|state| state.key()).is_some_and(|key| store.has_checkpoint(&key));
+    let has_checkpoint =
+        state.and_then(|state| state.key()).is_some_and(|key| store.has_checkpoint(&key));
     let Some(id) = slurm::this_job().filter(|_| has_checkpoint) else {
-        report_line!("nerf-sr: its time is up, and it left no checkpoint to go on from; give it more (resources: time)");
+        report_line!(
+            "nerf-sr: its time is up, and it left no checkpoint to go on from; give it more \
+            (resources: time)"
+        );
         return Ok(());
     };
     report_line!("nerf-sr: its time is up; job {id} goes on from the checkpoint later");
-    Slurm::default().requeue(&id).context("it can't be put into the queue again; run it again to go on")
+    Slurm::default()
+        .requeue(&id)
+        .context("it can't be put into the queue again; run it again to go on")
 }
 
 /// What a job does.
@@ -61,7 +70,10 @@ struct Task<'a> {
 
 impl Task<'_> {
     fn carry_out(&self) -> Result<(), StageFailure> {
-        let states = self.plan.states(self.store).map_err(|e| StageFailure { code: 3, message: e.to_string() })?;
+        let states = self
+            .plan
+            .states(self.store)
+            .map_err(|e| StageFailure { code: 3, message: e.to_string() })?;
         let records: Vec<Option<Record>> = states.into_iter().map(State::record).collect();
         match (self.plan.sinks.first(), self.plan.nodes.last()) {
             (Some(sink), _) => self.show(sink, &records),
@@ -77,10 +89,13 @@ impl Task<'_> {
         }
         self.check(&node.label(), node.parents(), records)?;
         self.check_program(&node.program)?;
-        let parents = node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
+        let parents =
+            node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
         let (threads, display) = (slurm::cores(), Display::new());
         let Self { plan, store, run: file, stop, .. } = *self;
-        NodeJob { plan, node, parents, store, file, threads, display: &display, stop }.run().map(drop)
+        NodeJob { plan, node, parents, store, file, threads, display: &display, stop }
+            .run()
+            .map(drop)
     }
 
     fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
@@ -94,13 +109,21 @@ impl Task<'_> {
         Ok(())
     }
 
-    /// Checks that what it needs is there. That its turn has come says little: Slurm takes a forgotten job for one that went well.
-    fn check(&self, label: &str, parents: impl Iterator<Item = usize>, records: &[Option<Record>]) -> Result<(), StageFailure> {
+    /// Checks that what it needs is there. That its turn has come says little: Slurm takes a
+    /// forgotten job for one that went well.
+    fn check(
+        &self,
+        label: &str,
+        parents: impl Iterator<Item = usize>,
+        records: &[Option<Record>],
+    ) -> Result<(), StageFailure> {
         let mut missing = parents.filter(|&parent| records[parent].is_none());
         missing.next().map_or(Ok(()), |parent| {
             let parent = self.plan.nodes[parent].label();
-            let message =
-                format!("{label} needs {parent}, which isn't there: its job failed, was cancelled or is forgotten; run it again");
+            let message = format!(
+                "{label} needs {parent}, which isn't there: its job failed, was cancelled \
+                    or is forgotten; run it again"
+            );
             Err(StageFailure { code: 3, message })
         })
     }
@@ -108,11 +131,14 @@ impl Task<'_> {
     /// Checks that the program is the one that was submitted; its code is in the key.
     fn check_program(&self, program: &StageProgram) -> Result<(), StageFailure> {
         let path = std::slice::from_ref(&program.path);
-        let answers =
-            ask_all(path, Some(self.stop)).map_err(|_| StageFailure { code: 130, message: "interrupted".to_owned() })?;
+        let answers = ask_all(path, Some(self.stop))
+            .map_err(|_| StageFailure { code: 130, message: "interrupted".to_owned() })?;
         let message = match &answers[&program.path] {
             Ok(now) if now.code == program.description.code => return Ok(()),
-            Ok(_) => format!("{} was built anew since this was submitted; run it again", program.path.display()),
+            Ok(_) => format!(
+                "{} was built anew since this was submitted; run it again",
+                program.path.display()
+            ),
             Err(problem) => problem.clone(),
         };
         Err(StageFailure { code: 2, message })

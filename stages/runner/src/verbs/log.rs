@@ -9,7 +9,8 @@ use stage_call::utc;
 use crate::execute::identities;
 use crate::session::{Session, of_stage};
 
-/// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with other arguments.
+/// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with
+/// other arguments.
 pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let nodes = of_stage(&plan, stage);
@@ -27,7 +28,10 @@ pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Res
         print_line!("{stage}: it has not run yet");
         return Ok(ExitCode::SUCCESS);
     };
-    print_line!("{stage}: not run with these arguments; this is of its last run, {}", utc(last.unix));
+    print_line!(
+        "{stage}: not run with these arguments; this is of its last run, {}",
+        utc(last.unix)
+    );
     print_line!("{} ({}):", last.label, last.path.display());
     print_lines(&text_of(&last.path));
     Ok(ExitCode::SUCCESS)
@@ -44,7 +48,11 @@ fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, Path
             State::Cached(_) => session.store.action(&key, "log"),
             _ => attempt_log(&session.store, &key),
         });
-        for path in stages.into_iter().chain(jobs.get(node).cloned().flatten()).filter(|path| path.is_file()) {
+        for path in stages
+            .into_iter()
+            .chain(jobs.get(node).cloned().flatten())
+            .filter(|path| path.is_file())
+        {
             let text = text_of(&path);
             logs.push((plan.nodes[node].label(), path, text));
         }
@@ -56,7 +64,8 @@ fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, Path
 fn job_logs(session: &Session, plan: &Plan) -> Vec<Option<PathBuf>> {
     let logs = slurm::job_logs(session.store.root()).unwrap_or_default();
     // Without submissions no source is hashed.
-    let identities = (!logs.is_empty()).then(|| identities(plan, &session.store).unwrap_or_default());
+    let identities =
+        (!logs.is_empty()).then(|| identities(plan, &session.store).unwrap_or_default());
     identities.into_iter().flatten().map(|identity| logs.get(&identity).cloned()).collect()
 }
 
@@ -78,15 +87,29 @@ fn last_of(store: &Store, stage: &str) -> Result<Option<StageRun>, StoreError> {
         let unix = record.started_unix + record.seconds as u64;
         (
             record.stage.clone(),
-            StageRun { unix, label: label(&record.stage, &record.point), path: store.action(&record.key(), "log") },
+            StageRun {
+                unix,
+                label: label(&record.stage, &record.point),
+                path: store.action(&record.key(), "log"),
+            },
         )
     });
     let unfinished = store.partials()?.into_iter().filter_map(|key| {
         let (action, path) = (store.unfinished(&key)?, attempt_log(store, &key));
-        let unix = std::fs::metadata(&path).ok()?.modified().ok()?.duration_since(UNIX_EPOCH).ok()?.as_secs();
-        Some((action.stage.clone(), StageRun { unix, label: label(&action.stage, &action.point), path }))
+        let unix = std::fs::metadata(&path)
+            .ok()?
+            .modified()
+            .ok()?
+            .duration_since(UNIX_EPOCH)
+            .ok()?
+            .as_secs();
+        Some((
+            action.stage.clone(),
+            StageRun { unix, label: label(&action.stage, &action.point), path },
+        ))
     });
-    let of_stage = finished.chain(unfinished).filter(|(name, run)| name == stage && run.path.is_file());
+    let of_stage =
+        finished.chain(unfinished).filter(|(name, run)| name == stage && run.path.is_file());
     Ok(of_stage.map(|(_, run)| run).max_by_key(|run| run.unix))
 }
 

@@ -16,7 +16,10 @@ pub(crate) fn pin(session: &Session, name: &str, what: &Request) -> anyhow::Resu
         match state {
             State::Cached(record) => actions.push((node.stage.clone(), record.key())),
             _ => {
-                let message = format!("{} isn't cached, and only what is made can be pinned; run it first", node.label());
+                let message = format!(
+                    "{} isn't cached, and only what is made can be pinned; run it first",
+                    node.label()
+                );
                 return Err(PlanError::Usage(message).into());
             }
         }
@@ -34,7 +37,11 @@ pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let known: Vec<String> = session.store.pins()?.into_iter().map(|pin| pin.id).collect();
-    let known = if known.is_empty() { "nothing is pinned".to_owned() } else { format!("pinned: {}", known.join(", ")) };
+    let known = if known.is_empty() {
+        "nothing is pinned".to_owned()
+    } else {
+        format!("pinned: {}", known.join(", "))
+    };
     Err(PlanError::Usage(format!("no pin {name:?}; {known}")).into())
 }
 

@@ -11,7 +11,12 @@ use crate::session::{Session, command_line};
 use crate::waiting::enter;
 
 /// Makes what the targets need and shows it.
-pub(crate) fn run(session: &Session, what: &Request, out: &Path, executor: &dyn Executor) -> anyhow::Result<ExitCode> {
+pub(crate) fn run(
+    session: &Session,
+    what: &Request,
+    out: &Path,
+    executor: &dyn Executor,
+) -> anyhow::Result<ExitCode> {
     let stop = stop_on_signals()?;
     let plan = session.plan_to_run(what, &stop)?;
     let file = match register(&session.store, &plan, &stop) {
@@ -26,11 +31,16 @@ pub(crate) fn run(session: &Session, what: &Request, out: &Path, executor: &dyn 
 }
 
 /// Writes down what the run needs, as far as is known before it starts.
-pub(super) fn register(store: &Store, plan: &Plan, stop: &AtomicBool) -> Result<RunFile, StageFailure> {
+pub(super) fn register(
+    store: &Store,
+    plan: &Plan,
+    stop: &AtomicBool,
+) -> Result<RunFile, StageFailure> {
     let fail = |e: artifact::StoreError| StageFailure { code: 1, message: e.to_string() };
     let entered = enter(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
     let file = store.begin_run(&entered, command_line()).map_err(fail)?;
-    // A source that can't be read is said when the stage's turn comes; other stages may not need it.
+    // A source that can't be read is said when the stage's turn comes; other stages may not need
+    // it.
     let states = plan.states(store).unwrap_or_default();
     for (index, node) in plan.nodes.iter().enumerate() {
         match states.get(index).and_then(State::key) {

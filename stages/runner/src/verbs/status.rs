@@ -24,18 +24,33 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
         let detail = match &state {
             State::Cached(record) => {
                 let size = session.store.manifest(&record.output).map_or(0, |m| m.size());
-                format!("{}  {:>9}  {:>9}  {}", &record.output[..10], sized(size), seconds(record.seconds), age(record))
+                format!(
+                    "{}  {:>9}  {:>9}  {}",
+                    &record.output[..10],
+                    sized(size),
+                    seconds(record.seconds),
+                    age(record)
+                )
             }
-            State::WillRun { key_parts } if session.store.partial(&hash_json(key_parts)).join("work").exists() => {
+            State::WillRun { key_parts }
+                if session.store.partial(&hash_json(key_parts)).join("work").exists() =>
+            {
                 "has a checkpoint to go on from".to_owned()
             }
             _ => String::new(),
         };
-        let detail = job.into_iter().chain((!detail.is_empty()).then_some(detail)).collect::<Vec<_>>().join("; ");
+        let detail = job
+            .into_iter()
+            .chain((!detail.is_empty()).then_some(detail))
+            .collect::<Vec<_>>()
+            .join("; ");
         print_line!("{:<40} {:<9} {detail}", node.label(), state.word());
     }
     if besides > 0 {
-        print_line!("queued besides: {}, of pages or of runs with other arguments", counted(besides, "job"));
+        print_line!(
+            "queued besides: {}, of pages or of runs with other arguments",
+            counted(besides, "job")
+        );
     }
     Ok(ExitCode::SUCCESS)
 }

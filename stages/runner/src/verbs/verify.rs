@@ -13,7 +13,10 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
     for path in &foreign {
         print_line!("{}: not an artifact; it is left alone, move it elsewhere", path.display());
     }
-    let sizes: Vec<u64> = objects.iter().map(|object| store.manifest(object).map_or(0, |manifest| manifest.size())).collect();
+    let sizes: Vec<u64> = objects
+        .iter()
+        .map(|object| store.manifest(object).map_or(0, |manifest| manifest.size()))
+        .collect();
     let bar = bar(sizes.iter().sum());
     let mut damaged = 0;
     for (object, size) in objects.iter().zip(sizes) {
@@ -21,7 +24,8 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
             damaged += 1;
             bar.suspend(|| print_line!("{damage}"));
             if remove {
-                // What is damage to this program may be whole to a newer one, which has the store by now.
+                // What is damage to this program may be whole to a newer one, which has the store
+                // by now.
                 let _entered = enter_at_once(store)?;
                 store.remove_object(object)?;
                 bar.suspend(|| print_line!("  removed; the next run makes it again"));
@@ -36,8 +40,10 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
 
 /// Shows itself on a terminal alone.
 fn bar(bytes: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("reading [{bar:30}] {bytes} of {total_bytes}, {eta} left");
-    ProgressBar::new(bytes).with_style(style.expect("the template is constant").progress_chars("=> "))
+    let style =
+        ProgressStyle::with_template("reading [{bar:30}] {bytes} of {total_bytes}, {eta} left");
+    ProgressBar::new(bytes)
+        .with_style(style.expect("the template is constant").progress_chars("=> "))
 }
 
 /// Names of artifacts, and what else lies beside them, both sorted.

@@ -12,7 +12,10 @@ static FOLDERS: LazyLock<[Folder; 2]> = LazyLock::new(|| {
         binary.write(&format!("sparse/0/{name}"), bytes);
     }
     text.write("sparse/0/cameras.txt", b"1 PINHOLE 4 3 5 5 2 1.5\n");
-    text.write("sparse/0/images.txt", b"1 1 0 0 0 0.1 0.2 1 1 a.png\n\n2 1 0 0 0 0.1 0.2 2 1 b.png\n\n");
+    text.write(
+        "sparse/0/images.txt",
+        b"1 1 0 0 0 0.1 0.2 1 1 a.png\n\n2 1 0 0 0 0.1 0.2 2 1 b.png\n\n",
+    );
     text.write("sparse/0/points3D.txt", b"1 0 0 5 9 9 9 0.5 1 0\n");
     [binary, text]
 });

@@ -12,7 +12,14 @@ static FOLDER: LazyLock<Folder> = LazyLock::new(Folder::new);
 
 fuzz_target!(|data: &[u8]| {
     FOLDER.write("field.safetensors", data);
-    let architecture = Architecture { levels: 1, coarsest: 2, finest: 2, log2_entries: 8, hidden: 16, ..Architecture::default() };
+    let architecture = Architecture {
+        levels: 1,
+        coarsest: 2,
+        finest: 2,
+        log2_entries: 8,
+        hidden: 16,
+        ..Architecture::default()
+    };
     let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 5.0, ..Bounds::default() };
     Field::read(&FOLDER.path("field.safetensors"), architecture, bounds).ok();
 });

@@ -1,5 +1,5 @@
-//! What the runner reads: pipeline.yaml, a stage's description, the command line, records. The first byte says which of them the rest is; the
-//! others are the seeds that `seeds.py` writes.
+//! What the runner reads: pipeline.yaml, a stage's description, the command line, records. The
+//! first byte says which of them the rest is; the others are the seeds that `seeds.py` writes.
 #![no_main]
 
 use std::collections::BTreeMap;
@@ -19,7 +19,10 @@ macro_rules! seed {
 /// Targets, parameters and inputs, a line each after a letter that says which.
 fn request(data: &[u8]) -> Request {
     let mut request = Request::default();
-    for line in String::from_utf8_lossy(data).split('\n').filter(|line| line.is_char_boundary(1) && !line.is_empty()) {
+    for line in String::from_utf8_lossy(data)
+        .split('\n')
+        .filter(|line| line.is_char_boundary(1) && !line.is_empty())
+    {
         let (kind, rest) = line.split_at(1);
         match kind {
             "p" => request.parameters.push(rest.to_owned()),
@@ -38,9 +41,12 @@ fn description(data: &[u8]) -> Option<Description> {
 /// Nodes of the plan.
 fn plan(pipeline: &[u8], train: &[u8], arguments: &[u8]) -> Option<usize> {
     let pipeline = Pipeline::parse(pipeline, Path::new("pipeline.yaml")).ok()?;
-    let stages = [("make", seed!("describe-make")), ("train", train), ("report", seed!("describe-report"))];
-    let descriptions: BTreeMap<String, Description> =
-        stages.iter().filter_map(|(name, data)| Some(((*name).to_owned(), description(data)?))).collect();
+    let stages =
+        [("make", seed!("describe-make")), ("train", train), ("report", seed!("describe-report"))];
+    let descriptions: BTreeMap<String, Description> = stages
+        .iter()
+        .filter_map(|(name, data)| Some(((*name).to_owned(), description(data)?)))
+        .collect();
     let plan = Plan::from_descriptions(&pipeline, &descriptions, &request(arguments)).ok()?;
     for node in &plan.nodes {
         assert!(!node.label().is_empty() && node.parameters.is_object());
@@ -54,10 +60,12 @@ static SEEDS: LazyLock<()> = LazyLock::new(|| {
     assert!(plan(seed!("pipeline"), seed!("describe-train"), seed!("arguments")).is_some());
 });
 
-/// A description's parameters: what they are resolved to is resolved to itself, so a key doesn't change by being read again.
+/// A description's parameters: what they are resolved to is resolved to itself, so a key doesn't
+/// change by being read again.
 fn resolve(data: &[u8]) {
     let Some(description) = description(data).filter(|d| d.check().is_ok()) else { return };
-    let schema = Schema::new(&description.name, &description.parameters).expect("the description was checked");
+    let schema = Schema::new(&description.name, &description.parameters)
+        .expect("the description was checked");
     let Ok(resolved) = schema.resolve(&serde_json::Map::new()) else { return };
     let again = schema.resolve(resolved.as_object().expect("parameters are an object"));
     assert_eq!(again.ok(), Some(resolved));
