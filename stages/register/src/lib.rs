@@ -7,14 +7,12 @@
 //! field gets wrong. Only LR photographs are looked at where there are any: HR ones are what views
 //! are scored by.
 
-use std::error::Error;
-
 use artifact::{
     Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings,
 };
 use pixels::{Image, PixelError};
 use poses::{CameraMove, Moved, Options, Pyramid, refine};
-use radiance::RayField;
+use radiance::{RayField, RenderError};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -117,7 +115,7 @@ impl Registered {
         image: &Image,
         params: &Params,
         background: f32,
-    ) -> Result<Self, Box<dyn Error + Send + Sync>> {
+    ) -> Result<Self, RenderError> {
         let pyramid = Pyramid::new(image, params.smaller);
         let moved = |camera: &Camera, level: u32, renderings: u32| {
             let options = Options { renderings, background, ..Options::default() };

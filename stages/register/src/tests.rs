@@ -1,5 +1,5 @@
 use glam::DVec3;
-use radiance::{Pixel, Ray};
+use radiance::{Pixel, Ray, RenderError};
 use scene::Intrinsics;
 
 use super::*;
@@ -12,7 +12,7 @@ struct Wall {
 }
 
 impl RayField for Wall {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let is_whole = rays.len() >= self.whole;
         let pixel = |ray: &Ray| {
             let (origin, direction) =

@@ -13,7 +13,7 @@ use std::ops::Range;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
-use fields::Members;
+use fields::{Members, middle};
 use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
 use radiance::{Ray, RayField};
 use scene::{Background, Camera, VIEWS_FILE, View, Views};
@@ -237,7 +237,7 @@ impl RenderJob<'_> {
             })
             .unzip();
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
-        let rendered = rendered.map_err(|e| anyhow::anyhow!(e))?;
+        let rendered = rendered.map_err(fields::rendering_failure)?;
         let mut subs = Vec::new();
         let shown = |i: usize| {
             let rays = i * n * n..(i + 1) * n * n;
@@ -257,9 +257,10 @@ impl RenderJob<'_> {
             subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share
         };
         let [r, g, b] = std::array::from_fn(|c| mean(&|p| p.premultiplied[c]));
-        let (distance, to_z) = middle(
-            &mut subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect::<Vec<_>>(),
-        );
+        let mut distances: Vec<(f32, f32)> =
+            subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect();
+        // A mean would invent a surface between two.
+        let (distance, to_z) = middle(&mut distances, |d| d.0).copied().unwrap_or_default();
         ViewPixel {
             channels: [r, g, b, mean(&|p| p.opacity), distance * to_z, distance],
             colour: std::array::from_fn(|c| mean(&|p| p.colour[c])),
@@ -309,13 +310,6 @@ impl Centres {
     }
 }
 
-/// The middle one of the sub-pixel rays' distances, and its z-depth per distance: a mean would
-/// invent a surface between two.
-fn middle(distances: &mut [(f32, f32)]) -> (f32, f32) {
-    distances.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-    distances[(distances.len() - 1) / 2]
-}
-
 /// Why writing a view ended early.
 enum Stopped {
     Pixels(PixelError),
@@ -330,7 +324,6 @@ impl From<PixelError> for Stopped {
 
 #[cfg(test)]
 mod tests {
-    use std::error::Error;
     use std::sync::Arc;
     use std::sync::atomic::{AtomicUsize, Ordering};
 
@@ -348,10 +341,7 @@ mod tests {
     }
 
     impl RayField for Picture {
-        fn render(
-            &self,
-            rays: &[Ray],
-        ) -> Result<Vec<radiance::Pixel>, Box<dyn Error + Send + Sync>> {
+        fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, radiance::RenderError> {
             self.rays.fetch_add(rays.len(), Ordering::Relaxed);
             let pixel = |ray: &Ray| {
                 let [x, y, z] = ray.direction.map(f64::from);

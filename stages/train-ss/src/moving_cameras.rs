@@ -1,6 +1,6 @@
 use pixels::Image;
 use poses::{CameraMove, Moved, Options, Pyramid, refine, take_back_common_motion};
-use radiance::RayField;
+use radiance::{RayField, RenderError};
 use scene::Camera;
 
 /// Cameras that move while the field learns, so that it renders what their photographs show.
@@ -56,7 +56,7 @@ impl MovingCameras {
         done: f64,
         background: f32,
         exposure: impl Fn(usize) -> [f32; 3],
-    ) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+    ) -> Result<(), RenderError> {
         for (i, (camera, photograph)) in self.now.iter_mut().zip(&self.photographs).enumerate() {
             let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE);
             let options = Options { renderings: RENDERINGS, background, exposure: exposure(i) };
@@ -74,13 +74,12 @@ impl MovingCameras {
         field: &dyn RayField,
         count: usize,
         background: f32,
-    ) -> Result<Moved, Box<dyn std::error::Error + Send + Sync>> {
+    ) -> Result<Moved, RenderError> {
         let options = Options { renderings: 1, background, ..Options::default() };
         let seen = self.now.iter().zip(&self.photographs).take(count);
         let depths = seen
             .map(|(camera, photograph)| Ok(refine(field, camera, photograph, 0, &options)?.depth));
-        let depths =
-            depths.collect::<Result<Vec<_>, Box<dyn std::error::Error + Send + Sync>>>()?;
+        let depths = depths.collect::<Result<Vec<_>, RenderError>>()?;
         let steps = self
             .were
             .iter()

@@ -92,6 +92,6 @@ impl<'a> Judge<'a> {
         let shots: Vec<Shot<'_>> = shots
             .map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) })
             .collect();
-        photometric_error(&*field, &shots, self.background).map_err(|e| anyhow::anyhow!(e))
+        photometric_error(&*field, &shots, self.background).map_err(fields::rendering_failure)
     }
 }

@@ -276,7 +276,7 @@ impl Supersampling {
         };
         moving
             .step(&*field()?, done, self.background.shown(), exposure)
-            .map_err(|e| anyhow::anyhow!(e))?;
+            .map_err(fields::rendering_failure)?;
         self.place_views();
         Ok(())
     }
@@ -299,7 +299,7 @@ impl Supersampling {
         let Some(moving) = &self.moving else { return Ok(None) };
         let moved = moving
             .moved(&*field()?, self.lr_views, self.background.shown())
-            .map_err(|e| anyhow::anyhow!(e))?;
+            .map_err(fields::rendering_failure)?;
         Ok(Some(moved))
     }
 

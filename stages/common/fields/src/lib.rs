@@ -11,12 +11,10 @@
 //! println!("{} fields over {:?}", members.fields.len(), members.file.background);
 //! # Ok::<(), anyhow::Error>(())
 //! ```
-
-use std::error::Error;
 use std::path::PathBuf;
 
 use artifact::{Failure, FailureExt as _, GivenInput};
-use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField};
+use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
 
 /// Variables of the environment that change what fields render.
 pub const ENVIRONMENT: &[&str] = &[
@@ -44,32 +42,50 @@ impl Members {
     }
 }
 
-/// The mean of what all members see. A distance that half of the light stops at is the mean of
-/// theirs, too.
+/// The mean of what all members see. The distance that half of the light stops at is the middle one
+/// of theirs: a mean would invent a surface between two.
 impl RayField for Members {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
-        let mut rendered = self.fields.iter().map(|field| field.render(rays));
-        let mut sums = rendered.next().transpose()?.unwrap_or_default();
-        for pixels in rendered {
-            for (sum, pixel) in sums.iter_mut().zip(pixels?) {
-                for c in 0..3 {
-                    sum.colour[c] += pixel.colour[c];
-                    sum.premultiplied[c] += pixel.premultiplied[c];
-                }
-                sum.opacity += pixel.opacity;
-                sum.depth += pixel.depth;
-                sum.median_depth += pixel.median_depth;
-            }
-        }
-        let share = 1.0 / self.fields.len().max(1) as f32;
-        let mean = |p: Pixel| Pixel {
-            colour: p.colour.map(|v| share * v),
-            premultiplied: p.premultiplied.map(|v| share * v),
-            opacity: share * p.opacity,
-            depth: share * p.depth,
-            median_depth: share * p.median_depth,
-        };
-        Ok(sums.into_iter().map(mean).collect())
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        let rendered: Vec<Vec<Pixel>> =
+            self.fields.iter().map(|field| field.render(rays)).collect::<Result<_, _>>()?;
+        let mut seen = Vec::with_capacity(rendered.len());
+        let pixels: Vec<Pixel> = (0..rays.len())
+            .map(|ray| {
+                seen.clear();
+                seen.extend(rendered.iter().map(|pixels| pixels[ray]));
+                mean(&mut seen)
+            })
+            .collect();
+        if pixels.iter().all(Pixel::is_finite) { Ok(pixels) } else { Err(RenderError::NotFinite) }
+    }
+}
+
+/// The mean of what fields see along a ray.
+fn mean(seen: &mut [Pixel]) -> Pixel {
+    let share = 1.0 / seen.len().max(1) as f32;
+    let of = |value: &dyn Fn(&Pixel) -> f32| share * seen.iter().map(value).sum::<f32>();
+    let mut pixel = Pixel {
+        colour: [0, 1, 2].map(|c| of(&|p| p.colour[c])),
+        premultiplied: [0, 1, 2].map(|c| of(&|p| p.premultiplied[c])),
+        opacity: of(&|p| p.opacity),
+        depth: of(&|p| p.depth),
+        median_depth: 0.0,
+    };
+    pixel.median_depth = middle(seen, |p| p.median_depth).map_or(0.0, |p| p.median_depth);
+    pixel
+}
+
+/// The one in the middle by a distance; of two the nearer.
+pub fn middle<T>(items: &mut [T], distance: impl Fn(&T) -> f32) -> Option<&T> {
+    items.sort_unstable_by(|a, b| distance(a).total_cmp(&distance(b)));
+    items.get(items.len().saturating_sub(1) / 2)
+}
+
+/// A failure to render, with its exit code: 4 where numbers went wrong.
+pub fn rendering_failure(error: RenderError) -> anyhow::Error {
+    match error {
+        RenderError::NotFinite => Failure::Numerical(error.to_string()).into(),
+        RenderError::Backend(_) => error.into(),
     }
 }
 
@@ -132,6 +148,34 @@ mod tests {
     use radiance::Architecture;
     use scene::{Background, Bounds};
 
+    /// What isn't finite has exit code 4, and what a library refuses 1.
+    #[test]
+    fn rendering_failures_have_exit_codes() {
+        struct Broken(f32);
+        impl RayField for Broken {
+            fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+                Ok(vec![Pixel { opacity: self.0, ..Pixel::default() }; rays.len()])
+            }
+        }
+        let file = FieldFile {
+            format: radiance::FIELD_FORMAT,
+            field: FieldModel::Grid(Architecture::default()),
+            members: 1,
+            bounds: Bounds::default(),
+            background: Background::White,
+        };
+        let seen = |opacity| {
+            let members = Members { file: file.clone(), fields: vec![Box::new(Broken(opacity))] };
+            members.render(&[Ray::default()])
+        };
+        assert_eq!(seen(0.5).unwrap()[0].opacity, 0.5);
+        let failure = rendering_failure(seen(f32::NAN).unwrap_err());
+        assert_eq!(artifact::exit_code(&failure), 4);
+        let refused = rendering_failure(RenderError::Backend("out of memory".to_owned()));
+        assert_eq!(artifact::exit_code(&refused), 1);
+        assert_eq!(refused.to_string(), "the field can't be rendered: out of memory");
+    }
+
     /// All members are read, and what they see is averaged; one that is missing, and numbers that
     /// can't be, are refused.
     #[test]
@@ -178,6 +222,9 @@ mod tests {
                     && (pixel.opacity - mean(|p| p.opacity)).abs() < 1e-6
             );
             assert!((pixel.depth - mean(|p| p.depth)).abs() < 1e-5 && apart[0][i] != apart[1][i]);
+            // Of two the nearer: between them there may be nothing.
+            let nearer = apart[0][i].median_depth.min(apart[1][i].median_depth);
+            assert_eq!(pixel.median_depth, nearer);
         }
         for (members, expected) in [(3, "field-2.safetensors"), (0, "members = 0")] {
             write(members);

@@ -21,7 +21,7 @@
 //! ```
 //! use poses::{Pyramid, Refinement, refine};
 //! use pixels::Image;
-//! use radiance::{Architecture, Field};
+//! use radiance::{Architecture, Field, RenderError};
 //! use scene::{Bounds, Camera, Intrinsics};
 //! let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Default::default() };
 //! let field = Field::new(Architecture::default(), bounds, 7);
@@ -35,14 +35,12 @@
 //! ```
 
 mod photometric;
-
-use std::error::Error;
 use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix6, Vector6};
 use pixels::{Filter, Image, Resampling};
-use radiance::{Ray, RayField};
+use radiance::{Ray, RayField, RenderError};
 use scene::Camera;
 
 pub use photometric::{Shot, photometric_error};
@@ -169,7 +167,7 @@ pub fn refine(
     pyramid: &Pyramid,
     level: u32,
     options: &Options,
-) -> Result<Refinement, Box<dyn Error + Send + Sync>> {
+) -> Result<Refinement, RenderError> {
     let level = &pyramid.levels[(level as usize).min(pyramid.levels.len() - 1)];
     let start = Equations::of(field, camera, level, options)?;
     let before = start.error;
@@ -214,7 +212,7 @@ impl Equations {
         camera: &Camera,
         level: &PyramidLevel,
         options: &Options,
-    ) -> Result<Self, Box<dyn Error + Send + Sync>> {
+    ) -> Result<Self, RenderError> {
         let camera = camera.resized(level.width as u32, level.height as u32);
         let cast = |pixel: &Telling| {
             cast(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], options.background)

@@ -1,8 +1,6 @@
-use std::error::Error;
-
 use glam::DVec3;
 use pixels::Image;
-use radiance::RayField;
+use radiance::{RayField, RenderError};
 use scene::Camera;
 
 use crate::{PyramidLevel, cast, huber};
@@ -40,7 +38,7 @@ pub fn photometric_error(
     field: &dyn RayField,
     shots: &[Shot<'_>],
     background: f32,
-) -> Result<Option<f64>, Box<dyn Error + Send + Sync>> {
+) -> Result<Option<f64>, RenderError> {
     let (mut sum, mut count) = (0.0, 0usize);
     for i in (0..shots.len()).step_by(shots.len().div_ceil(VIEWS).max(1)) {
         let places = surfaces(field, &shots[i], background)?;
@@ -64,7 +62,7 @@ fn surfaces(
     field: &dyn RayField,
     shot: &Shot<'_>,
     background: f32,
-) -> Result<Vec<Place>, Box<dyn Error + Send + Sync>> {
+) -> Result<Vec<Place>, RenderError> {
     let telling = PyramidLevel::new(shot.photograph).telling;
     let every = telling.len().div_ceil(PIXELS).max(1);
     let pixels: Vec<_> = telling.into_iter().step_by(every).collect();
@@ -95,7 +93,7 @@ fn errors(
     places: &[Place],
     shot: &Shot<'_>,
     background: f32,
-) -> Result<Vec<f64>, Box<dyn Error + Send + Sync>> {
+) -> Result<Vec<f64>, RenderError> {
     let (camera, k) = (shot.camera, &shot.camera.intrinsics);
     let is_inside = |x: f64, y: f64| {
         (0.0..f64::from(k.width)).contains(&x) && (0.0..f64::from(k.height)).contains(&y)

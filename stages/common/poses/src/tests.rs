@@ -1,4 +1,4 @@
-use radiance::Pixel;
+use radiance::{Pixel, RenderError};
 use scene::{Distortion, Intrinsics};
 
 use super::*;
@@ -23,7 +23,7 @@ impl BallAndWall {
 }
 
 impl RayField for BallAndWall {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let pixel = |ray: &Ray| {
             let (origin, direction) = (
                 DVec3::from(ray.origin.map(f64::from)),
@@ -172,7 +172,7 @@ fn moved_cameras_come_back() {
 fn what_says_nothing_moves_nothing() {
     struct Everywhere(Pixel);
     impl RayField for Everywhere {
-        fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn Error + Send + Sync>> {
+        fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
             Ok(vec![self.0; rays.len()])
         }
     }

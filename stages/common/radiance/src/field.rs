@@ -143,20 +143,39 @@ pub struct Pixel {
     pub median_depth: f32,
 }
 
+impl Pixel {
+    /// Whether all of it is finite.
+    pub fn is_finite(&self) -> bool {
+        let depths = [self.opacity, self.depth, self.median_depth];
+        self.colour.iter().chain(&self.premultiplied).chain(&depths).all(|v| v.is_finite())
+    }
+}
+
+/// Rays that couldn't be cast.
+#[derive(Debug, thiserror::Error)]
+pub enum RenderError {
+    /// What the field is computed by refused: a library, or its device.
+    #[error("the field can't be rendered: {0}")]
+    Backend(String),
+    /// A pixel isn't finite.
+    #[error("the field renders numbers that aren't finite; train it again, with a lower rate")]
+    NotFinite,
+}
+
 /// Whatever rays can be cast through: what renders views needn't know which field it has.
 pub trait RayField {
     /// Colour, opacity and depth of each ray.
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>>;
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError>;
 }
 
 impl<F: RayField + ?Sized> RayField for &F {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         (**self).render(rays)
     }
 }
 
 impl RayField for Field {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         Ok(Self::render(self, rays))
     }
 }

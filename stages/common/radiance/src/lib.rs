@@ -57,7 +57,7 @@ mod tally;
 mod trainer;
 
 pub use composite::LIKE_BACKGROUND;
-pub use field::{Architecture, Field, FieldError, Pixel, RayField};
+pub use field::{Architecture, Field, FieldError, Pixel, RayField, RenderError};
 pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldModel, MlpArchitecture};
 pub use occupancy::{Occupancy, Strides};
 pub use passes::Passes;

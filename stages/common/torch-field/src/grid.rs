@@ -2,7 +2,7 @@ use radiance::spec::{
     BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS,
     RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
 };
-use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, Strides};
+use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
@@ -393,8 +393,8 @@ impl TorchGrid {
 }
 
 impl RayField for TorchGrid {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
-        Ok(Self::render(self, rays)?)
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        Self::render(self, rays).map_err(|e| RenderError::Backend(e.to_string()))
     }
 }
 

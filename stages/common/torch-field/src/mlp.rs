@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use counter_rng::CounterRng;
-use radiance::{MlpArchitecture, Pixel, Ray, RayField};
+use radiance::{MlpArchitecture, Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
@@ -357,8 +357,8 @@ impl Mlp {
 }
 
 impl RayField for Mlp {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, Box<dyn std::error::Error + Send + Sync>> {
-        Ok(Self::render(self, rays)?)
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        Self::render(self, rays).map_err(|e| RenderError::Backend(e.to_string()))
     }
 }
 
