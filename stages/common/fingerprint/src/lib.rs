@@ -53,35 +53,36 @@ pub fn emit() {
         hash.part("feature", feature.as_bytes());
     }
 
+    for dir in add_sources(&mut hash, &root, &crate_dir) {
+        println!("cargo:rerun-if-changed={}", dir.display());
+    }
+    println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
+}
+
+/// Adds what a crate of a workspace is made of: its sources and those of the workspace crates that it
+/// uses, the profiles, and the locked packages that they reach. Returns the folders of those crates.
+fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
     let workspace = read_toml(&root.join("Cargo.toml"));
-    hash.part(
-        "profile",
-        workspace.get("profile").map(ToString::to_string).unwrap_or_default().as_bytes(),
-    );
-    let crates = workspace_crates(&root, &workspace, &crate_dir);
+    let profile = workspace.get("profile").map(ToString::to_string).unwrap_or_default();
+    hash.part("profile", profile.as_bytes());
+    let crates = workspace_crates(root, &workspace, crate_dir);
     for (name, krate) in &crates {
-        println!("cargo:rerun-if-changed={}", krate.dir.display());
         hash.part("crate", name.as_bytes());
-        hash.part(
-            "Cargo.toml",
-            &fs::read(krate.dir.join("Cargo.toml")).expect("a crate has a manifest"),
-        );
+        let manifest = fs::read(krate.dir.join("Cargo.toml")).expect("a crate has a manifest");
+        hash.part("Cargo.toml", &manifest);
         for entry in walkdir::WalkDir::new(krate.dir.join("src")).sort_by_file_name() {
             let entry = entry.expect("sources can be listed");
             if entry.file_type().is_file() {
-                let path =
-                    entry.path().strip_prefix(&krate.dir).expect("a walk stays below its root");
-                hash.part(
-                    &path.to_string_lossy(),
-                    &fs::read(entry.path()).expect("sources can be read"),
-                );
+                let path = entry.path().strip_prefix(&krate.dir);
+                let path = path.expect("a walk stays below its root").to_string_lossy();
+                hash.part(&path, &fs::read(entry.path()).expect("sources can be read"));
             }
         }
     }
     for line in locked(&read_toml(&root.join("Cargo.lock")), &crates) {
         hash.part("locked", line.as_bytes());
     }
-    println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
+    crates.into_values().map(|krate| krate.dir).collect()
 }
 
 #[derive(Default)]
@@ -182,4 +183,96 @@ fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
         }
     }
     reached
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A workspace of three crates: `stage` uses `shared` and the package `used`; nothing uses `other`.
+    const FILES: [(&str, &str); 9] = [
+        (
+            "Cargo.toml",
+            "[workspace.dependencies]\nshared = {path = \"shared\"}\nused = \"1\"\n\
+             [profile.release]\nlto = true\n",
+        ),
+        (
+            "Cargo.lock",
+            "[[package]]\nname = \"stage\"\nversion = \"1.0.0\"\ndependencies = [\"shared\"]\n\
+             [[package]]\nname = \"used\"\nversion = \"1.0.0\"\nchecksum = \"aa\"\n\
+             dependencies = [\"deep\"]\n\
+             [[package]]\nname = \"deep\"\nversion = \"1.0.0\"\nchecksum = \"bb\"\n\
+             [[package]]\nname = \"stray\"\nversion = \"1.0.0\"\nchecksum = \"cc\"\n",
+        ),
+        (
+            "stage/Cargo.toml",
+            "[package]\nname = \"stage\"\n[dependencies]\nshared = {workspace = true}\n\
+             [dev-dependencies]\nstray = \"1\"\n",
+        ),
+        ("stage/src/main.rs", "fn main() {}"),
+        ("stage/tests/it.rs", "// a test"),
+        (
+            "shared/Cargo.toml",
+            "[package]\nname = \"shared\"\n[dependencies]\nused = {workspace = true}\n",
+        ),
+        ("shared/src/lib.rs", "// shared"),
+        ("other/Cargo.toml", "[package]\nname = \"other\"\n"),
+        ("other/src/lib.rs", "// other"),
+    ];
+
+    /// The fingerprint of `stage`, where `edit` replaces words in a file of that workspace.
+    fn fingerprint(edit: Option<(&str, &str, &str)>) -> String {
+        let root = tempfile::tempdir().unwrap();
+        for (file, text) in FILES {
+            let path = root.path().join(file);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            let text = match edit {
+                Some((edited, from, to)) if edited == file => {
+                    assert!(text.contains(from), "{file}: {from}");
+                    text.replace(from, to)
+                }
+                _ => text.to_owned(),
+            };
+            fs::write(path, text).unwrap();
+        }
+        let mut hash = Hash::default();
+        let folders = add_sources(&mut hash, root.path(), &root.path().join("stage"));
+        assert_eq!(folders, ["shared", "stage"].map(|name| root.path().join(name)));
+        hash.0.finalize().to_hex().to_string()
+    }
+
+    /// What a stage is made of is in its key, however far down; and nothing else, nor where it lies.
+    #[test]
+    fn an_edited_dependency_changes_it_and_an_unused_one_does_not() {
+        let own = fingerprint(None);
+        for edit in [
+            ("stage/src/main.rs", "main() {}", "main() { }"),
+            ("shared/src/lib.rs", "shared", "shared better"),
+            ("shared/Cargo.toml", "workspace = true", "workspace = true, features = []"),
+            ("Cargo.lock", "checksum = \"aa\"", "checksum = \"ab\""),
+            ("Cargo.lock", "checksum = \"bb\"", "checksum = \"bc\""),
+            ("Cargo.toml", "lto = true", "lto = false"),
+        ] {
+            assert_ne!(fingerprint(Some(edit)), own, "{edit:?}");
+        }
+        for edit in [
+            ("other/src/lib.rs", "other", "otherwise"),
+            ("other/Cargo.toml", "other", "another"),
+            ("stage/tests/it.rs", "a test", "another test"),
+            ("Cargo.lock", "checksum = \"cc\"", "checksum = \"cd\""),
+        ] {
+            assert_eq!(fingerprint(Some(edit)), own, "{edit:?}");
+        }
+    }
+
+    #[test]
+    fn parts_do_not_run_into_each_other() {
+        let of = |parts: &[(&str, &str)]| {
+            let mut hash = Hash::default();
+            parts.iter().for_each(|(name, bytes)| hash.part(name, bytes.as_bytes()));
+            hash.0.finalize()
+        };
+        assert_ne!(of(&[("a", "bc")]), of(&[("ab", "c")]));
+        assert_ne!(of(&[("a", "b"), ("c", "")]), of(&[("a", ""), ("b", "c")]));
+    }
 }
