@@ -269,7 +269,6 @@ fn a_stage_does_not_need_somebody_to_talk_to() {
         ("plain", &["--input", "dataset=nowhere", "--output", "none"], 3),
         ("json", &["--input", "dataset=nowhere", "--output", "none"], 3),
         ("plain", &["describe"], 0),
-        ("plain", &["completions", "bash"], 0),
         ("plain", &["--help"], 0),
     ] {
         let mut command = Command::new(bin("prep"));

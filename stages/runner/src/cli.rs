@@ -9,7 +9,7 @@ use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
-use crate::graph::{ascii, dot, svg};
+use crate::graph::{ascii, dot};
 use crate::limits::capped;
 use crate::remedy::Remedy;
 use crate::session::Session;
@@ -246,7 +246,6 @@ enum Verb {
 enum GraphFormat {
     Ascii,
     Dot,
-    Svg,
 }
 
 /// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or
@@ -327,7 +326,6 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             print_lines(&match format {
                 GraphFormat::Ascii => ascii(&plan, &states),
                 GraphFormat::Dot => dot(&plan, &states),
-                GraphFormat::Svg => svg(&plan, &states),
             });
             Ok(ExitCode::SUCCESS)
         }

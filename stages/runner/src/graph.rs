@@ -1,4 +1,4 @@
-//! Drawings of a plan: text, Graphviz, SVG.
+//! Drawings of a plan: text and Graphviz.
 
 use planning::{Origin, Plan, State};
 
@@ -35,14 +35,6 @@ impl Drawing {
             Self::WillRun => "will run",
             Self::Waits => "waits",
             Self::Sink => "shows the run",
-        }
-    }
-
-    fn colour(self) -> &'static str {
-        match self {
-            Self::Cached => "#dcefdc",
-            Self::WillRun | Self::Waits => "#f4e3c3",
-            Self::Sink => "#ffffff",
         }
     }
 }
@@ -100,50 +92,6 @@ pub(crate) fn dot(plan: &Plan, states: &[State]) -> String {
         }
     }
     text + "}\n"
-}
-
-/// Size of a box, and the space between two.
-const BOX: (usize, usize) = (190, 36);
-const GAP: (usize, usize) = (60, 20);
-
-pub(crate) fn svg(plan: &Plan, states: &[State]) -> String {
-    let all = drawn(plan, states);
-    let depths = depths(&all);
-    let mut rows = vec![0; depths.iter().max().map_or(0, |d| d + 1)];
-    let mut places: Vec<(usize, usize)> = Vec::new();
-    for depth in depths {
-        places.push((20 + depth * (BOX.0 + GAP.0), 20 + rows[depth] * (BOX.1 + GAP.1)));
-        rows[depth] += 1;
-    }
-    let (width, height) =
-        (rows.len() * (BOX.0 + GAP.0) + 20, rows.iter().max().unwrap_or(&0) * (BOX.1 + GAP.1) + 20);
-    let mut text = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" \
-        font-family=\"sans-serif\" font-size=\"12\">\n"
-    );
-    for (drawn, (x2, y2)) in all.iter().zip(&places) {
-        for (x1, y1) in drawn.parents.iter().map(|(parent, _)| places[*parent]) {
-            let (x1, y1, y2) = (x1 + BOX.0, y1 + BOX.1 / 2, y2 + BOX.1 / 2);
-            let middle = usize::midpoint(x1, *x2);
-            text += &format!(
-                "<path d=\"M{x1} {y1} C{middle} {y1} {middle} {y2} {x2} {y2}\" fill=\"none\" \
-                stroke=\"#888\"/>\n"
-            );
-        }
-    }
-    for (drawn, (x, y)) in all.iter().zip(&places) {
-        let (width, height, fill) = (BOX.0, BOX.1, drawn.state.colour());
-        let label = drawn.label.replace('&', "&amp;").replace('<', "&lt;");
-        let (middle, baseline) = (x + width / 2, y + height / 2 + 4);
-        text += &format!(
-            "<rect x=\"{x}\" y=\"{y}\" width=\"{width}\" height=\"{height}\" rx=\"6\" \
-            fill=\"{fill}\" stroke=\"#555\"/>"
-        );
-        text += &format!(
-            "<text x=\"{middle}\" y=\"{baseline}\" text-anchor=\"middle\">{label}</text>\n"
-        );
-    }
-    text + "</svg>\n"
 }
 
 /// Longest way from a source, for each.

@@ -120,11 +120,6 @@ struct Arguments {
 enum Command {
     /// Print name, code fingerprint, parameters, inputs and output as JSON
     Describe,
-    /// Print shell completions
-    Completions {
-        /// For which shell
-        shell: clap_complete::Shell,
-    },
 }
 
 /// Environment variable in which a runner tells its stages its process id, so that they see when it
@@ -319,13 +314,6 @@ fn parse_and_run<S: Stage>(
     match arguments.command {
         Some(Command::Describe) => {
             print_lines(&serde_json::to_string_pretty(&description)?);
-            Ok(())
-        }
-        Some(Command::Completions { shell }) => {
-            let mut script = Vec::new();
-            clap_complete::generate(shell, &mut command, S::NAME, &mut script);
-            // Whoever asked for it may have gone.
-            std::io::stdout().write_all(&script).ok();
             Ok(())
         }
         None => execute::<S>(arguments, &description),
