@@ -1,10 +1,12 @@
-use pixels::ExrImage;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use anyhow::Context as _;
+use artifact::FailureExt as _;
+use pixels::{ExrImage, read_exr};
+
+use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::scored_view::{ScoredScene, ScoredView};
 
 /// How far depth is off, in scene units.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DepthError {
     /// Mean absolute error; edges weigh in heavily.
     pub mean_absolute: f64,
@@ -35,6 +37,52 @@ pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> 
         median_absolute: errors[errors.len() / 2],
         missed: seen.iter().filter(|&&i| a[i] < 0.5).count() as f64 / count,
     })
+}
+
+/// [`depth_error`], where there is true depth.
+pub(crate) struct DepthMetric;
+
+impl Metric for DepthMetric {
+    fn name(&self) -> &'static str {
+        "depth"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("depth/mean_absolute", "depth error ↓ mean", 4, false),
+            Figure::new("depth/median_absolute", "depth error ↓ median", 4, false),
+            Figure::new("depth/missed", "depth ↓ missed", 4, false),
+        ]
+    }
+
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
+        "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one \
+        half there"
+            .to_owned()
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let (scene, place) = (view.scene, format!("view {}", view.view.camera.name));
+        let (Some(found), Some(expected)) = (&view.view.depth, &view.true_view.depth) else {
+            return Ok(Measured::default());
+        };
+        let found = read_exr(&scene.views_in.path(found)).bad_input(&place)?;
+        let expected = read_exr(&scene.truth_in.path(expected)).bad_input(&place)?;
+        let error = depth_error(&found, &expected);
+        let error = error.context("depth needs channels Z and A of one size").bad_input(&place)?;
+        let score = Score::several([
+            ("mean_absolute", error.mean_absolute),
+            ("median_absolute", error.median_absolute),
+            ("missed", error.missed),
+        ]);
+        Ok(Measured::one(self.name(), score))
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        let [mean, median] =
+            ["mean_absolute", "median_absolute"].map(|part| value(mean, &format!("depth/{part}")));
+        Some(format!("depth error {:.4} mean, {:.4} median", mean?, median?))
+    }
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use scene::{Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::metric::value;
 use crate::{Metrics, ViewScores};
 
 /// Views count as near a reference within this angle between the optical axes, in degrees.
@@ -36,7 +37,8 @@ pub(crate) fn least_gain(
             );
             return Err(Failure::BadInput(message).into());
         };
-        if let (Some(now), Some(before)) = (view.scores.psnr, before.scores.psnr) {
+        let both = [&view.scores, &before.scores].map(|scores| value(scores, "psnr"));
+        if let [Some(now), Some(before)] = both {
             least = Some(least.map_or(now - before, |least| least.min(now - before)));
         }
     }
@@ -55,7 +57,7 @@ pub(crate) fn near_references(
     };
     let near: Vec<f64> = (scored.iter().zip(&truth.views))
         .filter(|(_, view)| is_near(&view.camera))
-        .filter_map(|(scores, _)| scores.scores.psnr)
+        .filter_map(|(scores, _)| value(&scores.scores, "psnr"))
         .collect();
     (!near.is_empty()).then(|| NearReferences {
         views: near.len(),
@@ -70,17 +72,19 @@ fn cosine(one: &Camera, other: &Camera) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
-    use crate::perceptual::Perceptual;
-    use crate::{Params, Scores, conventions};
+    use crate::Scores;
+    use crate::metric::Score;
     use scene::{Background, Bounds, Distortion, Intrinsics, View};
 
     fn scores(name: &str, psnr: Option<f64>) -> ViewScores {
         ViewScores {
             name: name.to_owned(),
-            scores: Scores { psnr, ..Scores::default() },
+            scores: psnr.map(|psnr| ("psnr".to_owned(), Score::One(psnr))).into_iter().collect(),
             error_map: String::new(),
-            warp: None,
+            pictures: BTreeMap::new(),
         }
     }
 
@@ -125,15 +129,10 @@ mod tests {
         let write = |names: &[(&str, f64)]| {
             let views: Vec<ViewScores> =
                 names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
-            let conventions = conventions(
-                &Params::default(),
-                &self::views(&[0.0]),
-                &Perceptual::new(None).unwrap(),
-                None,
-            );
             let metrics = Metrics {
-                conventions,
-                mean: Scores::default(),
+                conventions: BTreeMap::new(),
+                figures: Vec::new(),
+                mean: Scores::new(),
                 least_gain: None,
                 near_references: None,
                 views,

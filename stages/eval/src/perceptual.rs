@@ -3,6 +3,8 @@ use pixels::Image;
 
 #[cfg(feature = "torch")]
 use crate::Lpips;
+use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::scored_view::{ScoredScene, ScoredView};
 
 /// Networks whose features LPIPS compares. Their distances differ: name the network beside the
 /// figure.
@@ -27,6 +29,33 @@ impl LpipsNetwork {
             Self::Squeeze => ["squeezenet1_1.safetensors", "lpips_linear_squeeze_v0.1.safetensors"],
             Self::Alex => ["alexnet.safetensors", "lpips_linear_alex_v0.1.safetensors"],
             Self::Vgg => ["vgg16.safetensors", "lpips_linear_vgg_v0.1.safetensors"],
+        }
+    }
+
+    /// Its score's name.
+    fn key(self) -> &'static str {
+        match self {
+            Self::Squeeze => "lpips",
+            Self::Alex => "lpips_alex",
+            Self::Vgg => "lpips_vgg",
+        }
+    }
+
+    /// Its score's label in a table.
+    fn label(self) -> &'static str {
+        match self {
+            Self::Squeeze => "LPIPS ↓",
+            Self::Alex => "LPIPS ↓ AlexNet",
+            Self::Vgg => "LPIPS ↓ VGG-16",
+        }
+    }
+
+    /// Its score in a sentence.
+    fn short(self) -> &'static str {
+        match self {
+            Self::Squeeze => "LPIPS",
+            Self::Alex => "LPIPS (AlexNet)",
+            Self::Vgg => "LPIPS (VGG-16)",
         }
     }
 
@@ -106,11 +135,7 @@ impl Perceptual {
     }
 
     /// Distances by each network, in the order of [`LpipsNetwork::ALL`].
-    pub(crate) fn distances(
-        &self,
-        found: &Image,
-        expected: &Image,
-    ) -> anyhow::Result<[Option<f64>; 3]> {
+    fn distances(&self, found: &Image, expected: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         let mut distances = [None; 3];
         for reader in &self.readers {
             let lpips = reader.take()?;
@@ -137,17 +162,28 @@ impl Perceptual {
         Ok(Self { given: Vec::new() })
     }
 
-    pub(crate) fn distances(&self, _: &Image, _: &Image) -> anyhow::Result<[Option<f64>; 3]> {
+    fn distances(&self, _: &Image, _: &Image) -> anyhow::Result<[Option<f64>; 3]> {
         Ok([None; 3])
     }
 }
 
 /// What stands where LPIPS would.
-pub(crate) const MISSING: &str = "weights not given";
+const MISSING: &str = "weights not given";
 
-impl Perceptual {
+impl Metric for Perceptual {
+    fn name(&self) -> &'static str {
+        "lpips"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        let of = |network: LpipsNetwork| Figure::new(network.key(), network.label(), 4, false);
+        let mut figures = LpipsNetwork::ALL.map(of).to_vec();
+        figures[0].missing = Some(MISSING.to_owned());
+        figures
+    }
+
     /// Which networks there are, and what is lacking for the others.
-    pub(crate) fn convention(&self) -> String {
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
         let lacking: Vec<LpipsNetwork> =
             LpipsNetwork::ALL.into_iter().filter(|network| !self.given.contains(network)).collect();
         if self.given.is_empty() {
@@ -160,6 +196,27 @@ impl Perceptual {
             format!("; {MISSING} for others: {}", wanted(&lacking))
         };
         format!("v0.1, inputs in [-1, 1], by {}{missing}", by.join(", "))
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
+        let distances = self.distances(&view.found, expected)?;
+        let known = LpipsNetwork::ALL.into_iter().zip(distances);
+        let known = known.filter_map(|(network, distance)| {
+            Some((network.key().to_owned(), Score::One(distance?)))
+        });
+        Ok(Measured { scores: known.collect(), picture: None })
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        value(mean, "psnr")?;
+        let known: Vec<String> = LpipsNetwork::ALL
+            .iter()
+            .filter_map(|network| {
+                Some(format!("{} {:.4}", network.short(), value(mean, network.key())?))
+            })
+            .collect();
+        Some(if known.is_empty() { format!("LPIPS {MISSING}") } else { known.join(" · ") })
     }
 }
 

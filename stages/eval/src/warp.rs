@@ -1,13 +1,13 @@
 use artifact::{FailureExt as _, GivenInput};
 use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+
+use crate::metric::{Figure, Measured, Metric, Score, Scores};
+use crate::scored_view::{ScoredScene, ScoredView, read_image};
 
 /// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
 /// where colours agree.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct WarpScore {
     /// Peak signal-to-noise ratio in dB over the pixels that the neighbour sees, too.
     pub psnr: f64,
@@ -60,6 +60,59 @@ pub(crate) fn warp(
 
 fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
     Some(Surface { camera, depth: image.channel("Z")?, opacity: image.channel("A")? })
+}
+
+/// [`warp`], where there is HR truth and rendered depth.
+pub(crate) struct WarpMetric;
+
+impl Metric for WarpMetric {
+    fn name(&self) -> &'static str {
+        "warp"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
+            Figure::new("warp/seen", "share that neighbours see ↑", 4, true),
+        ]
+    }
+
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
+        "the true picture of the view whose camera is nearest, brought over by both rendered depths, \
+        against the view's own, where both see the same surface (depths within 2 %, or within a \
+        pixel as the view sees them; opacity at least one half)"
+            .to_owned()
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some((score, picture)) = warped(view)? else { return Ok(Measured::default()) };
+        let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
+        Ok(Measured { picture: Some(picture), ..Measured::one(self.name(), score) })
+    }
+
+    fn in_words(&self, _: &Scores) -> Option<String> {
+        None
+    }
+}
+
+/// The true image of a view's nearest neighbour, seen from the view by the rendered depths.
+fn warped(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
+    let (scene, own_camera) = (view.scene, &view.view.camera);
+    let Some(expected) = &view.expected else { return Ok(None) };
+    let Some(other) = neighbour(own_camera, &scene.views.views) else { return Ok(None) };
+    let other_truth = scene.truth.views.iter().find(|v| v.camera.name == other.camera.name);
+    let Some((other_view, file)) = other_truth.and_then(|v| Some((v, v.image.as_ref()?))) else {
+        return Ok(None);
+    };
+    let own = read_surface(scene.views_in, view.view)?;
+    let (Some(own), Some(theirs)) = (own, read_surface(scene.views_in, other)?) else {
+        return Ok(None);
+    };
+    let image = read_image(scene.truth_in, other_view, file, scene.truth.background)?;
+    if (image.width, image.height) != (theirs.width, theirs.height) {
+        return Ok(None);
+    }
+    Ok(warp((own_camera, &own, expected), (&other.camera, &theirs, &image)))
 }
 
 #[cfg(test)]

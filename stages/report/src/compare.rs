@@ -92,19 +92,29 @@ fn row(
     let Crop { x, y, side } = crop;
     let figure = |image: &Rgba8, caption: &str| {
         let same_size = (image.width, image.height) == (truth.width, truth.height);
-        html! { @if same_size { figure { img class="px" src=(uri_of(&cut(image,
-        crop))) alt=(caption); figcaption { (caption) } } } }
+        html! {
+            @if same_size {
+                figure {
+                    img class="px" src=(uri_of(&cut(image, crop))) alt=(caption);
+                    figcaption { (caption) }
+                }
+            }
+        }
     };
     Ok(Some(html! {
-        p { "View " (name) ", the " (side) "×" (side) " pixels from " (x) ", " (y) " on; the \
-            figures are the whole view's." }
-        div class="row compare" { (figure(&truth, "ground \
-            truth")) @for (name, psnr, image, _) in &methods { (figure(image,
-                &format!("{name}{psnr}"))) } }
+        p {
+            "View " (name) ", the " (side) "×" (side) " pixels from " (x) ", " (y) " on; the figures \
+            are the whole view's."
+        }
+        div class="row compare" {
+            (figure(&truth, "ground truth"))
+            @for (name, psnr, image, _) in &methods { (figure(image, &format!("{name}{psnr}"))) }
+        }
         div class="row compare" {
             figure { figcaption { "error" } }
-            @for (name, _, _, error) in &methods { @if let Some(error) = error { (figure(error,
-                name)) } }
+            @for (name, _, _, error) in &methods {
+                @if let Some(error) = error { (figure(error, name)) }
+            }
         }
     }))
 }

@@ -12,6 +12,7 @@
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 
 mod compare;
+mod figures;
 mod images;
 mod page;
 mod results;

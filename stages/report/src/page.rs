@@ -8,6 +8,7 @@ use serde_json::Value;
 
 use crate::Params;
 use crate::compare::compare;
+use crate::figures::{Figure, figures};
 use crate::images::{colour, depth, depths_of, shown_in_gallery};
 use crate::results::{metrics, scored, warnings_by_node};
 
@@ -85,52 +86,21 @@ fn warnings(run: &RunRecord) -> Markup {
 
 /// A table of means, one row a point, the best figure of each column in bold.
 fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
-    let mean = |p: &Point<'_>, path: &str| {
-        p.metrics.pointer(&format!("/mean/{path}")).and_then(Value::as_f64)
-    };
-    let mut columns: Vec<(&str, &str, usize, bool)> = vec![
-        ("PSNR ↑ dB", "psnr", 2, true),
-        ("SSIM ↑", "ssim", 4, true),
-        ("SSIM ↑ whole windows", "ssim_valid", 4, true),
-        ("LPIPS ↓", "lpips", 4, false),
-        ("LPIPS ↓ AlexNet", "lpips_alex", 4, false),
-        ("LPIPS ↓ VGG-16", "lpips_vgg", 4, false),
-        ("PSNR at LR ↑ dB", "low_resolution/psnr", 2, true),
-        ("PSNR of neighbours by depth ↑ dB", "warp/psnr", 2, true),
-        ("depth error ↓ mean", "depth/mean_absolute", 4, false),
-        ("median", "depth/median_absolute", 4, false),
-        ("missed", "depth/missed", 4, false),
-    ];
-    // Variants that nothing was scored by only take room.
-    let is_variant = |path: &str| ["ssim_valid", "lpips_alex", "lpips_vgg"].contains(&path);
-    columns.retain(|(_, path, ..)| {
-        !is_variant(path) || points.iter().any(|point| mean(point, path).is_some())
-    });
-    let best = |path: &str, up: bool| {
-        let values = points.iter().filter_map(|p| mean(p, path));
-        if up {
-            values.fold(f64::NEG_INFINITY, f64::max)
-        } else {
-            values.fold(f64::INFINITY, f64::min)
-        }
-    };
+    let figures = figures(points);
     html! {
         table id="scores" {
-            thead { tr { th { "point" } @for (name,
-                ..) in &columns { th { (name) } } th { "views" } th { "training" } th { "rendering" } } }
+            thead {
+                tr {
+                    th { "point" }
+                    @for figure in &figures { th { (figure.label) } }
+                    th { "views" } th { "training" } th { "rendering" }
+                }
+            }
             tbody {
                 @for point in points {
                     tr {
                         td { (label(points, point)) }
-                        @for &(_, path, digits, up) in &columns {
-                            @match mean(point, path) {
-                                Some(value) => td class=(if points.len() > 1 && value == best(path,
-                                    up) { "n best" } else { "n" }) { (format!("{value:.digits$}")) },
-                                None if path == "lpips" && mean(point,
-                                    "psnr").is_some() => td { "weights not given" },
-                                None => td { "–" },
-                            }
-                        }
+                        @for figure in &figures { (mean(figure, point, points)) }
                         td class="n" { (point.metrics["views"].as_array().map_or(0, Vec::len)) }
                         @let [training, rendering] = times(run, point);
                         td class="n" { (duration(training)) }
@@ -140,11 +110,28 @@ fn scores(run: &RunRecord, points: &[Point<'_>]) -> Markup {
             }
         }
         @if let Some(point) = points.first() {
-            details { summary { "How these figures were made" }
-                ul { @for (name, text) in point.metrics["conventions"].as_object().into_iter().flatten() { li { b { (name) } ": " (text.as_str().unwrap_or_default()) } } }
+            details {
+                summary { "How these figures were made" }
+                ul {
+                    @for (name, text) in point.metrics["conventions"].as_object().into_iter().flatten() {
+                        li { b { (name) } ": " (text.as_str().unwrap_or_default()) }
+                    }
+                }
             }
         }
     }
+}
+
+/// A cell of that table.
+fn mean(figure: &Figure, point: &Point<'_>, points: &[Point<'_>]) -> Markup {
+    let Some(value) = figure.mean(point) else {
+        // Without HR truth no weights would help.
+        let has_truth = point.metrics["mean"]["psnr"].is_number();
+        let missing = figure.missing.as_deref().filter(|_| has_truth);
+        return html! { td { (missing.unwrap_or("–")) } };
+    };
+    let class = if figure.is_best(value, points) { "n best" } else { "n" };
+    html! { td class=(class) { (figure.text(value)) } }
 }
 
 /// What tells a point from the others: its values in the sweep and, where several blocks score,
@@ -205,7 +192,14 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
     for (scores, view, true_view) in chosen {
         let name = &view.camera.name;
         let figure = |class: &str, uri: Option<String>, caption: String| {
-            html! { @if let Some(uri) = uri { figure { img class=(class) src=(uri) alt=(format!("{caption}, view {name}")); figcaption { (caption) } } } }
+            html! {
+                @if let Some(uri) = uri {
+                    figure {
+                        img class=(class) src=(uri) alt=(format!("{caption}, view {name}"));
+                        figcaption { (caption) }
+                    }
+                }
+            }
         };
         let embedded = |folder: &Path,
                         file: &Option<String>,
@@ -217,12 +211,11 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
         let lr = embedded(&truth, &true_view.low_resolution, truths.background)?;
         let found = embedded(&rendered, &view.image, views.background)?;
         let expected = embedded(&truth, &true_view.image, truths.background)?;
-        let map = |key: &str| -> anyhow::Result<Option<String>> {
-            let file =
-                scores[key].as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
+        let map = |file: &Value| -> anyhow::Result<Option<String>> {
+            let file = file.as_str().map(|f| read_png(&point.node.folder.join(f))).transpose()?;
             Ok(file.map(|map| shown_in_gallery(&map)))
         };
-        let (error, warped) = (map("error_map")?, map("warp")?);
+        let (error, warped) = (map(&scores["error_map"])?, map(&scores["pictures"]["warp"])?);
         let depth = depth(&rendered, &view, range)?;
         let caption = |what: &str, found: &Option<(String, usize)>| {
             found.as_ref().map(|(_, w)| format!("{what}, {w} px")).unwrap_or_default()
@@ -234,20 +227,23 @@ fn gallery(run: &RunRecord, point: &Point<'_>, count: usize) -> anyhow::Result<M
                 .map(|v| format!("{v:.digits$}"))
                 .unwrap_or_else(|| "–".to_owned())
         };
+        let (psnr, ssim) = (number("/psnr", 2), number("/ssim", 4));
+        let at_lr = number("/low_resolution/psnr", 2);
+        let of_error = if expected.is_some() { "error" } else { "error at LR" };
+        let of_warp = format!("neighbour by depth, {} dB (red: not seen)", number("/warp/psnr", 2));
         rows.push(html! {
-            h3 { "View " (name) " " small { "PSNR " (number("/psnr",
-                2)) " dB · SSIM " (number("/ssim", 4)) " · at LR " (number("/low_resolution/psnr",
-                    2)) " dB" } }
+            h3 {
+                "View " (name) " "
+                small { "PSNR " (psnr) " dB · SSIM " (ssim) " · at LR " (at_lr) " dB" }
+            }
             div class="row" {
                 (figure("lr", lr.clone().map(|l| l.0), caption("LR", &lr)))
                 (figure("px", found.clone().map(|f| f.0), caption("render", &found)))
                 (figure("px", expected.clone().map(|e| e.0), caption("ground truth", &expected)))
-                (figure("px", error, if expected.is_some() { "error" } else { "error at \
-                    LR" }.to_owned()))
-                (figure("px", warped, format!("neighbour by depth, {} dB (red: not \
-                    seen)", number("/warp/psnr", 2))))
-                (figure("px", depth.map(|d| shown_in_gallery(&d)), "depth (warm is \
-                    near)".to_owned()))
+                (figure("px", error, of_error.to_owned()))
+                (figure("px", warped, of_warp))
+                (figure("px", depth.map(|d| shown_in_gallery(&d)),
+                    "depth (warm is near)".to_owned()))
             }
         });
     }

@@ -114,13 +114,13 @@ fn params(text: serde_json::Value) -> Params {
 fn methods() -> Vec<Row> {
     let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| {
         let places = json!({"commit": "abc1234", "machine": "vm"});
-        let mut row = json!({"method": method, "has \
-            seen": seen, "scene": scene, "protocol": protocol, "psnr": psnr});
+        let mut row = json!({"method": method, "has seen": seen, "scene": scene,
+            "protocol": protocol, "psnr": psnr});
         row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
         row
     };
-    let missing = json!({"method": "liif", "has \
-        seen": "HR", "scene": "lego", "protocol": "100x2", "missing": "no liif"});
+    let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2",
+        "missing": "no liif"});
     let rows = [
         row("nerf", "LR", "lego", "100x2", 30.0),
         row("nerf", "LR", "chair", "100x2", 32.0),
@@ -153,8 +153,8 @@ fn groups_further_rows_and_gains() {
             Gain { name: "unknown".to_owned(), of: "ss".to_owned(), over: "liif".to_owned() },
         ],
         ..params(json!({
-            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"], "grouped_by": "has \
-            seen", "each": "scene",
+            "rows": ["method"], "columns": ["protocol"], "values": ["psnr"],
+            "grouped_by": "has seen", "each": "scene",
             "notes": ["One."],
             "further": [
                 {"method": "paper: NeRF", "protocol": "100x2", "psnr": 27.5},

@@ -85,8 +85,8 @@ mod tests {
             parameters: json!({"properties": {
                 "supervision": {"description": long, "enum": ["average", "kernel"],
                 "default": null, "x-default": "by scene", "x-group": "loss"},
-                "exposure": {"description": "Finds \
-                exposures.", "type": "boolean", "default": false, "x-group": "data"},
+                "exposure": {"description": "Finds exposures.", "type": "boolean",
+                "default": false, "x-group": "data"},
                 "rays": {"description": "Rays.", "type": "integer", "minimum": 1, "default": 5},
                 "rate": {"description": "Rate.", "type": ["number", "null"], "minimum": 0.0,
                 "maximum": 0.5, "default": null}

@@ -275,20 +275,20 @@ mod tests {
         };
         for (parts, expected) in [
             (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input \
-                    a": "x"}),
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
+                    "input a": "x"}),
                 true,
             ),
             (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "input \
-                    a": "y", "code": "z"}),
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
+                    "input a": "y", "code": "z"}),
                 true,
             ),
             (json!({"stage": "prep", "parameter lr": 3, "parameter kernel": null}), false),
             (json!({"stage": "prep", "parameter lr": 2}), false),
             (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null, "parameter \
-                    more": 1}),
+                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
+                    "parameter more": 1}),
                 false,
             ),
             (json!({"stage": "eval", "parameter lr": 2, "parameter kernel": null}), false),

@@ -67,13 +67,12 @@ mod tests {
     fn every_difference_in_words() {
         let map = |value: Value| value.as_object().cloned().unwrap();
         let before = map(json!({
-            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null, "parameter \
-            scale": 2, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
+            "code": "a".repeat(64), "parameter kernel": "box", "parameter near": null,
+            "parameter scale": 2, "metric mean.psnr": 30.25, "device": "cpu", "input x": "y"
         }));
         let now = map(json!({
-            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter \
-            near": 0.5, "parameter scale": 4.0, "metric mean.psnr": 31, "device": "cpu", "input \
-                z": "y"
+            "code": "b".repeat(64), "parameter kernel": "lanczos", "parameter near": 0.5,
+            "parameter scale": 4.0, "metric mean.psnr": 31, "device": "cpu", "input z": "y"
         }));
         let found: Vec<String> = changes(&before, &now).iter().map(ToString::to_string).collect();
         let expected = [

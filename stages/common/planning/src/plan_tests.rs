@@ -53,8 +53,8 @@ fn descriptions() -> BTreeMap<String, Description> {
             "method": {"enum": ["plain", "net"], "default": "plain"},
             "open": {"type": "boolean", "default": false}, "seed": seed}},
          "rules": [
-            {"when": {"method": {"const": "net"}}, "needs": ["weights"], "message": "input \
-                weights is missing: method net needs it"},
+            {"when": {"method": {"const": "net"}}, "needs": ["weights"],
+                "message": "input weights is missing: method net needs it"},
             {"when": {"scene.background": {"const": "alpha"}}, "must": {"open": {"const": true}},
                 "message": "alpha needs open"}]},
         {"name": "score", "output": {"kind": "metrics"},
@@ -253,8 +253,7 @@ fn command_lines_that_cannot_be_meant() {
         ),
         (
             &["-p", "kernel=bxo"],
-            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you \
-            mean \"box\"?",
+            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you mean \"box\"?",
         ),
         (
             &["-p", "seed=1"],

@@ -147,8 +147,8 @@ mod tests {
                 let up = loss(&wide);
                 wide[i] -= 2.0 * h;
                 let numeric = (up - loss(&wide)) / (2.0 * h);
-                prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} \
-                    {numeric}", gradient[i]);
+                prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}",
+                    gradient[i]);
             }
         }
     }

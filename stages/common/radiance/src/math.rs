@@ -79,8 +79,8 @@ mod tests {
         #[test]
         fn close_to_f64(x in -86.0f32..86.0) {
             let exact = f64::from(x).exp();
-            prop_assert!(((f64::from(exp(x)) - exact) / exact).abs() < 2e-7, "{} \
-                {}", exp(x), exact);
+            prop_assert!(((f64::from(exp(x)) - exact) / exact).abs() < 2e-7, "{} {}", exp(x),
+                exact);
         }
 
         #[test]

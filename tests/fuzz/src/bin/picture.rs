@@ -11,8 +11,7 @@ static FOLDERS: LazyLock<[(Folder, &str); 3]> = LazyLock::new(|| {
         let folder = Folder::new();
         let pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]";
         let text = format!(
-            "{{\"camera_angle_x\": 0.7, \"frames\": [{{\"file_path\": \"images/c.{end}\", \
-            \"transform_matrix\": {pose}}}]}}"
+            "{{\"camera_angle_x\": 0.7, \"frames\": [{{\"file_path\": \"images/c.{end}\", \"transform_matrix\": {pose}}}]}}"
         );
         folder.write("transforms.json", text.as_bytes());
         (folder, end)

@@ -1,0 +1,185 @@
+use std::collections::BTreeMap;
+
+use pixels::Rgba8;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::depth::DepthMetric;
+use crate::low_resolution::LowResolutionMetric;
+use crate::perceptual::Perceptual;
+use crate::psnr::PsnrMetric;
+use crate::scored_view::{ScoredScene, ScoredView};
+use crate::ssim::SsimMetric;
+use crate::warp::WarpMetric;
+
+/// Something that views are scored by. A new one is a type in a file of its own, and a line in
+/// [`metrics`]: `metrics.json`, the page and the summary follow from what it says of itself.
+pub(crate) trait Metric: Sync {
+    /// Its key among the conventions, and its pictures' folder.
+    fn name(&self) -> &'static str;
+    /// Its figures, the most important first.
+    fn figures(&self) -> Vec<Figure>;
+    /// How its figures are made, in words.
+    fn convention(&self, scene: &ScoredScene<'_>) -> String;
+    /// Scores a view; nothing where the view lacks what that needs.
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
+    /// What a line for people says of means over all views.
+    fn in_words(&self, mean: &Scores) -> Option<String>;
+}
+
+/// All metrics, in the order in which they are shown.
+pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
+    vec![
+        Box::new(PsnrMetric),
+        Box::new(SsimMetric),
+        Box::new(perceptual),
+        Box::new(LowResolutionMetric),
+        Box::new(WarpMetric),
+        Box::new(DepthMetric),
+    ]
+}
+
+/// A figure of `metrics.json`, and how it is shown.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct Figure {
+    /// Its place among the scores: keys from the outermost on, `/` between them.
+    pub path: String,
+    /// What it is called, with its unit.
+    pub label: String,
+    /// Digits after the point.
+    pub digits: usize,
+    /// Whether more of it is better.
+    pub higher_is_better: bool,
+    /// What stands where it is missing from views that have others; without it, only results that
+    /// have the figure show it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub missing: Option<String>,
+}
+
+impl Figure {
+    pub(crate) fn new(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Self {
+        Self {
+            path: path.to_owned(),
+            label: label.to_owned(),
+            digits,
+            higher_is_better,
+            missing: None,
+        }
+    }
+}
+
+/// A score: a number, or several that belong together.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(untagged)]
+pub enum Score {
+    /// One number.
+    One(f64),
+    /// Numbers by name.
+    Several(BTreeMap<String, f64>),
+}
+
+impl Score {
+    pub(crate) fn several<const N: usize>(parts: [(&str, f64); N]) -> Self {
+        Self::Several(parts.map(|(name, value)| (name.to_owned(), value)).into())
+    }
+}
+
+/// Scores of a view, or their means, by name.
+pub type Scores = BTreeMap<String, Score>;
+
+/// What a metric found of a view.
+#[derive(Default)]
+pub(crate) struct Measured {
+    pub(crate) scores: Scores,
+    /// A picture of what was compared, where that is worth a look.
+    pub(crate) picture: Option<Rgba8>,
+}
+
+impl Measured {
+    pub(crate) fn one(name: &str, score: Score) -> Self {
+        Self { scores: [(name.to_owned(), score)].into(), picture: None }
+    }
+}
+
+/// The number at a figure's path, where there is one.
+pub(crate) fn value(scores: &Scores, path: &str) -> Option<f64> {
+    match path.split_once('/') {
+        None => match scores.get(path)? {
+            Score::One(value) => Some(*value),
+            Score::Several(_) => None,
+        },
+        Some((name, part)) => match scores.get(name)? {
+            Score::One(_) => None,
+            Score::Several(parts) => parts.get(part).copied(),
+        },
+    }
+}
+
+/// Means of the values of the views that have them.
+pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
+    let mut sums: BTreeMap<(String, Option<String>), (f64, usize)> = BTreeMap::new();
+    let mut add = |key: (String, Option<String>), value: f64| {
+        let (sum, count) = sums.entry(key).or_default();
+        *sum += value;
+        *count += 1;
+    };
+    for (name, score) in views.flatten() {
+        match score {
+            Score::One(value) => add((name.clone(), None), *value),
+            Score::Several(parts) => {
+                for (part, value) in parts {
+                    add((name.clone(), Some(part.clone())), *value);
+                }
+            }
+        }
+    }
+    let mut means = Scores::new();
+    for ((name, part), (sum, count)) in sums {
+        let mean = sum / count as f64;
+        match part {
+            None => {
+                means.insert(name, Score::One(mean));
+            }
+            Some(part) => {
+                let several = means.entry(name).or_insert_with(|| Score::several([]));
+                if let Score::Several(parts) = several {
+                    parts.insert(part, mean);
+                }
+            }
+        }
+    }
+    means
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_are_those_of_the_views_that_have_a_value() {
+        let one = |value| Scores::from([("psnr".to_owned(), Score::One(value))]);
+        let mut with_depth = one(32.0);
+        with_depth.insert("depth".to_owned(), Score::several([("missed", 0.5)]));
+        let mean = mean_of([one(30.0), with_depth, Scores::new()].iter());
+        assert_eq!((value(&mean, "psnr"), value(&mean, "depth/missed")), (Some(31.0), Some(0.5)));
+        for path in ["ssim", "depth", "psnr/missed", "depth/none"] {
+            assert_eq!(value(&mean, path), None, "{path}");
+        }
+        assert_eq!(
+            serde_json::to_value(&mean).unwrap(),
+            serde_json::json!({"psnr": 31.0, "depth": {"missed": 0.5}})
+        );
+    }
+
+    /// Every figure's number is among the scores, and has a name of its own.
+    #[test]
+    fn figures_are_told_apart() {
+        let all = metrics(Perceptual::new(None).unwrap());
+        let figures: Vec<Figure> = all.iter().flat_map(|metric| metric.figures()).collect();
+        for (i, figure) in figures.iter().enumerate() {
+            assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));
+        }
+        assert_eq!(figures[0].path, "psnr");
+    }
+}
