@@ -20,6 +20,8 @@ pub(crate) struct Target {
     pub(crate) behind: [f32; 3],
     /// Weight of the bundle's loss.
     pub(crate) weight: f32,
+    /// Whether samples were clipped to black and white after a kernel or an exposure made them.
+    pub(crate) is_clipped: bool,
 }
 
 impl Target {
@@ -76,7 +78,11 @@ impl Target {
         let mut loss = 0.0;
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() * share;
-            let residual = residual(mean, target[c]);
+            let residual = if self.is_clipped {
+                self.unclipped_residual(c, mean, sample[c])
+            } else {
+                residual(mean, target[c])
+            };
             loss += f64::from(self.weight) * f64::from(residual) * f64::from(residual) / 3.0;
             for gradient in gradients.iter_mut() {
                 gradient[c] = self.weight * residual * share * (2.0 / 3.0);
@@ -90,7 +96,8 @@ impl Target {
 mod tests {
     use super::*;
 
-    const PLAIN: Target = Target { back: [1.0; 3], behind: [0.0; 3], weight: 1.0 };
+    const PLAIN: Target =
+        Target { back: [1.0; 3], behind: [0.0; 3], weight: 1.0, is_clipped: false };
 
     /// A clipped sample says no more than that the true value lies beyond.
     #[test]
@@ -110,6 +117,13 @@ mod tests {
             );
         }
         assert!(is_clipped(1.0) && is_clipped(0.0) && !is_clipped(0.99));
+        // A photograph half as bright as the scene says of its white that the scene is no darker.
+        let bright = Target { back: [0.5; 3], is_clipped: true, ..PLAIN };
+        let mut gradients = [[9.0; 3]; 2];
+        assert_eq!(bright.of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients), 0.0);
+        assert_eq!(gradients, [[0.0; 3]; 2]);
+        let plain = Target { is_clipped: false, ..bright };
+        assert!(plain.of_mean(&[[0.9; 3]; 2], [1.0; 4], &mut gradients) > 0.1);
     }
 
     /// What isn't known asks for nothing.
@@ -128,7 +142,7 @@ mod tests {
     /// Exposure is taken back, and what is transparent shows what lies behind.
     #[test]
     fn samples_ask_for_colours() {
-        let target = Target { back: [2.0, 1.0, 0.5], behind: [0.4, 0.8, 1.0], weight: 1.0 };
+        let target = Target { back: [2.0, 1.0, 0.5], behind: [0.4, 0.8, 1.0], ..PLAIN };
         let colour = target.colour([0.1, 0.2, 0.3, 0.75]);
         assert!(
             colour.iter().zip([0.4, 0.4, 0.275]).all(|(a, b): (&f32, f32)| (a - b).abs() < 1e-6),

@@ -54,6 +54,7 @@ pub struct Supersampling {
     full: [usize; 2],
     side: [usize; 2],
     supersample_warmup: f64,
+    supervision: Supervision,
     seed: u64,
     cache: Option<HrCache>,
     exposures: Option<Exposures>,
@@ -207,6 +208,7 @@ impl Supersampling {
             full,
             side: full,
             supersample_warmup: options.supersample_warmup,
+            supervision: options.supervision,
             seed: options.seed,
             cache,
             memory,
@@ -421,6 +423,7 @@ impl radiance::Supervisor for Supersampling {
             back,
             behind: self.behind(bundle),
             weight: self.sampler.weight(bundle, (index, pixel)),
+            is_clipped: self.supervision == Supervision::Kernel && index < self.lr_views,
         };
         let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
         if let Some(cache) = self.kernel(index) {
