@@ -105,7 +105,7 @@ fn datasets_that_cannot_be_used() {
                 d.join("transforms_train.json"),
                 r#"{"camera_angle_x": 0.7, "frames": []}"#,
             )
-            .unwrap()
+            .unwrap();
         },
         &[],
         3,

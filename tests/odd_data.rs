@@ -183,7 +183,7 @@ fn poses_that_look_wrong_are_warned_of() {
         (
             |list| {
                 (list["w"], list["h"], list["cx"], list["cy"]) =
-                    (json!(32), json!(32), json!(8), json!(8))
+                    (json!(32), json!(32), json!(8), json!(8));
             },
             "4 of 6 views have a principal point far from the middle, first training view r_0: \
             (4.0, 4.0) in 16×16 pixels",

@@ -265,7 +265,7 @@ fn exposures_are_found() {
         let mut image = pixels::read_png(&path).unwrap();
         for pixel in image.data.chunks_exact_mut(4) {
             (0..3).for_each(|c| {
-                pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8
+                pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8;
             });
         }
         pixels::write_png(&path, &image).unwrap();
@@ -512,7 +512,7 @@ fn contradictions_are_refused() {
     let folder = as_transforms(&project);
     let out = project.path("out");
     let refused = |params: &str, words: &[&str]| {
-        stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words)
+        stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
     };
     refused(
         r#"{"lr_source": "photographs", "lr_width": 16}"#,

@@ -139,7 +139,7 @@ impl World {
                 self.write_program(program);
             }
             4 => {
-                self.overrides = vec!["-p".to_owned(), format!("s{index}.value={}", self.values())]
+                self.overrides = vec!["-p".to_owned(), format!("s{index}.value={}", self.values())];
             }
             5 => {
                 self.overrides = vec![
@@ -189,9 +189,9 @@ impl World {
         paths.sort();
         let chosen = &paths[self.draws.below(paths.len() as u64) as usize];
         if self.draws.below(2) == 0 {
-            std::fs::remove_file(chosen).unwrap()
+            std::fs::remove_file(chosen).unwrap();
         } else {
-            std::fs::write(chosen, "").unwrap()
+            std::fs::write(chosen, "").unwrap();
         }
     }
 

@@ -416,7 +416,7 @@ impl RefineJob<'_> {
                     drawn.data.chunks_exact_mut(3).zip(rendered.view.data.chunks_exact(4))
                 {
                     (0..3).for_each(|c| {
-                        to[c] = (from[c] + self.strength * (to[c] - from[c])).clamp(0.0, 1.0)
+                        to[c] = (from[c] + self.strength * (to[c] - from[c])).clamp(0.0, 1.0);
                     });
                 }
                 Ok(drawn)

@@ -119,10 +119,10 @@ mod tests {
             let selection = Selection { keys: words(keys), artifacts: words(artifacts), history };
             match (selection.of(&records(), "there"), expected) {
                 (Ok(found), Ok(expected)) => {
-                    assert_eq!(found.into_iter().collect::<Vec<_>>(), expected)
+                    assert_eq!(found.into_iter().collect::<Vec<_>>(), expected);
                 }
                 (Err(error), Err(expected)) => {
-                    assert!(error.to_string().contains(expected), "{error}")
+                    assert!(error.to_string().contains(expected), "{error}");
                 }
                 (found, expected) => panic!("{found:?} where {expected:?}"),
             }

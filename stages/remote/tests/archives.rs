@@ -169,7 +169,7 @@ impl Sample {
         let identity = self.manifest.identity();
         let record = Record { output: identity.clone(), ..self.record.clone() };
         self.index(|index| {
-            (index["objects"], index["artifact"]) = (json!([identity]), json!(identity))
+            (index["objects"], index["artifact"]) = (json!([identity]), json!(identity));
         });
         let path = |file: &str| format!("objects/{identity}/{file}");
         self.entries[MANIFEST] =

@@ -115,22 +115,22 @@ fn lead_outside(setup: &Setup, path: &str) {
 fn harm_is_refused_by_name() {
     let cases: &[(&str, &str, Harm)] = &[
         ("metrics.json", "blake3 differs", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1)
+            edit(&on_remote(s, 3, "metrics.json"), |b| b[3] ^= 1);
         }),
         ("metrics.json", "more than the 15 bytes", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '))
+            edit(&on_remote(s, 3, "metrics.json"), |b| b.push(b' '));
         }),
         ("metrics.json", "14 bytes where the manifest says 15", |s| {
-            edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14))
+            edit(&on_remote(s, 3, "metrics.json"), |b| b.truncate(14));
         }),
         ("metrics.json", "it is not there", |s| {
-            fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap()
+            fs::remove_file(on_remote(s, 3, "metrics.json")).unwrap();
         }),
         (MANIFEST_FILE, "it is not there", |s| {
-            fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap()
+            fs::remove_file(on_remote(s, 3, MANIFEST_FILE)).unwrap();
         }),
         (MANIFEST_FILE, "not a manifest", |s| {
-            edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20))
+            edit(&on_remote(s, 3, MANIFEST_FILE), |b| b.truncate(20));
         }),
         (MANIFEST_FILE, "its blake3 is not the artifact's name", |s| {
             fs::copy(on_remote(s, 0, MANIFEST_FILE), on_remote(s, 3, MANIFEST_FILE))
@@ -141,11 +141,11 @@ fn harm_is_refused_by_name() {
         (MANIFEST_FILE, "not a path inside", |s| lead_outside(s, "/tmp/evil")),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| lead_outside(s, MANIFEST_FILE)),
         (MANIFEST_FILE, "not the path of an artifact's file", |s| {
-            lead_outside(s, "./metrics.json")
+            lead_outside(s, "./metrics.json");
         }),
         (".json", "not a record", |s| edit(&record_file(s, 3), |b| b.truncate(40))),
         (".json", "its key is not its name", |s| {
-            fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap()
+            fs::copy(record_file(s, 0), record_file(s, 3)).map(|_| ()).unwrap();
         }),
         (".json", "\"../../evil\" is not a hash", |s| {
             write_json(

@@ -185,7 +185,7 @@ fn numbers(name: &str, value: &Value, tell: &mut dyn FnMut(&str, &Value)) {
     match value {
         Value::Number(_) => tell(name, value),
         Value::Object(entries) => {
-            entries.iter().for_each(|(key, value)| numbers(&format!("{name}.{key}"), value, tell))
+            entries.iter().for_each(|(key, value)| numbers(&format!("{name}.{key}"), value, tell));
         }
         _ => {}
     }

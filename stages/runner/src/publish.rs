@@ -205,13 +205,13 @@ mod tests {
         type Damage = fn(&Path);
         let cases: [(&str, Damage); 8] = [
             ("report/notes.txt is not nerf-sr's", |t| {
-                fs::write(t.join("notes.txt"), "precious").unwrap()
+                fs::write(t.join("notes.txt"), "precious").unwrap();
             }),
             ("report/views/mine.png is not nerf-sr's", |t| {
-                fs::write(t.join("views/mine.png"), "precious").unwrap()
+                fs::write(t.join("views/mine.png"), "precious").unwrap();
             }),
             ("report/index.html was changed", |t| {
-                fs::write(t.join("index.html"), "my own words").unwrap()
+                fs::write(t.join("index.html"), "my own words").unwrap();
             }),
             ("index.html is not nerf-sr's", |t| fs::remove_file(t.join(MANIFEST_FILE)).unwrap()),
             ("index.html is not nerf-sr's", |t| fs::write(t.join(MANIFEST_FILE), "{}").unwrap()),

@@ -49,7 +49,7 @@ impl Shape<'_> {
             false => {
                 head.extend(columns.iter().map(|column| {
                     format!("{} ({})", column.join(", "), titles(values).join(" / "))
-                }))
+                }));
             }
             true => head.extend(titles(values)),
         }
@@ -78,11 +78,11 @@ impl Shape<'_> {
             match (self.params.columns.is_empty(), reason(&here)) {
                 (false, Some(reason)) => line.push(reason),
                 (false, None) if cells.iter().all(|cell| cell == NOTHING) => {
-                    line.push(NOTHING.to_owned())
+                    line.push(NOTHING.to_owned());
                 }
                 (false, None) => line.push(cells.join(" / ")),
                 (true, Some(reason)) => {
-                    line.extend(std::iter::once(reason).chain(cells.into_iter().skip(1)))
+                    line.extend(std::iter::once(reason).chain(cells.into_iter().skip(1)));
                 }
                 (true, None) => line.extend(cells),
             }

@@ -205,7 +205,7 @@ fn bandwidth() -> f64 {
     let seconds = best(5, || {
         let parts = a.par_chunks_mut(1 << 16).zip(b.par_chunks(1 << 16)).zip(c.par_chunks(1 << 16));
         parts.for_each(|((a, b), c)| {
-            a.iter_mut().zip(b).zip(c).for_each(|((a, b), c)| *a = b + 3.0 * c)
+            a.iter_mut().zip(b).zip(c).for_each(|((a, b), c)| *a = b + 3.0 * c);
         });
     });
     black_box(&a);

@@ -124,7 +124,7 @@ impl Bytes {
         match self {
             Self::Memory(kept) => kept[at..at + bytes.len()].copy_from_slice(bytes),
             Self::File { file, start, .. } => {
-                file.note(file.file.write_all_at(bytes, *start + at as u64))
+                file.note(file.file.write_all_at(bytes, *start + at as u64));
             }
         }
     }

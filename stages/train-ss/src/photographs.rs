@@ -74,7 +74,7 @@ fn read(
         );
         return Err(Failure::BadInput(message).into());
     }
-    Ok(PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?)
+    PackedPhotograph::new(&photograph, memory).context(NO_PLACE)
 }
 
 /// What to say where pixels can't be written to their file.

@@ -83,7 +83,7 @@ pub fn supervision(
     };
     let (photographs, references) =
         (photographs.over_background(), references.map(Photographs::over_background));
-    Ok(Supersampling::new(photographs, references, &options, memory).context(NO_PLACE)?)
+    Supersampling::new(photographs, references, &options, memory).context(NO_PLACE)
 }
 
 /// The kernel that made LR images, where parameters and background allow what they ask for.

@@ -88,7 +88,7 @@ impl Run {
         for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
             match line {
                 RunLine::Run { holder, command } => {
-                    (run.holder, run.command) = (Some(holder), command)
+                    (run.holder, run.command) = (Some(holder), command);
                 }
                 RunLine::Action { key, .. } => {
                     run.keys.insert(key);

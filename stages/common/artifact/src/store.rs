@@ -713,7 +713,7 @@ mod tests {
                         assert_eq!(
                             make(store, &format!("{round} {action}"), "1234").output.len(),
                             64
-                        )
+                        );
                     });
                 }
             });

@@ -165,7 +165,7 @@ mod tests {
             background: Background::White,
         };
         let seen = |opacity| {
-            let members = Members { file: file.clone(), fields: vec![Box::new(Broken(opacity))] };
+            let members = Members { file, fields: vec![Box::new(Broken(opacity))] };
             members.render(&[Ray::default()])
         };
         assert_eq!(seen(0.5).unwrap()[0].opacity, 0.5);

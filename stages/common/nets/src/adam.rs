@@ -99,7 +99,7 @@ impl Adam {
             .map(|(name, tensor)| weights.tensor(name, &tensor.size()))
             .collect::<Result<Vec<_>, _>>()?;
         no_grad(|| {
-            network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from))
+            network.iter().zip(&saved).for_each(|((_, to), from)| to.shallow_clone().copy_(from));
         });
         Ok((adam, counts))
     }

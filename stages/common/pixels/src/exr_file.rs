@@ -179,7 +179,7 @@ fn block_bytes(samples: &[f32], width: usize, channels: &[Channel], order: &[usi
                 SampleType::Half => {
                     // Largest finite half; beyond it a conversion would make infinity.
                     line.for_each(|&v| {
-                        data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes())
+                        data.extend(half::f16::from_f32(v.clamp(-65504.0, 65504.0)).to_ne_bytes());
                     });
                 }
                 SampleType::Float => line.for_each(|v| data.extend(v.to_ne_bytes())),

@@ -60,7 +60,7 @@ impl Mask {
             narrow.chunks_exact_mut(width.max(1)).zip(self.counts.chunks_exact(self.width.max(1)))
         {
             row.iter_mut().enumerate().for_each(|(x, counts)| {
-                *counts = line[under(x, width, self.width)].iter().all(|c| *c)
+                *counts = line[under(x, width, self.width)].iter().all(|c| *c);
             });
         }
         let pixel =

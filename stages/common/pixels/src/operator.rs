@@ -296,7 +296,7 @@ mod tests {
                         assert!(
                             (f32::from(p[c]) / 255.0 - q[c]).abs() < 1.3 / 255.0,
                             "{filter:?} {p:?} {q:?}"
-                        )
+                        );
                     });
                 }
             }

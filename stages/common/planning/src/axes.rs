@@ -218,7 +218,7 @@ impl Scope<'_> {
                 .collect(),
         };
         let values = each_once(values, |again, first| {
-            notes.push(format!("{given}: {again} is {first} again; it is made once"))
+            notes.push(format!("{given}: {again} is {first} again; it is made once"));
         });
         if program.description.sink && kind == Kind::Input {
             return Err(usage(format!(

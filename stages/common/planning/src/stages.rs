@@ -115,7 +115,7 @@ impl Programs {
                 Ok(identity) => match cache.answer(path, &identity) {
                     Some(description) => _ = answers.insert(path.clone(), Ok(description)),
                     None if identity.may_be_asked(asking, is_needed) => {
-                        _ = unasked.insert(path.clone(), identity)
+                        _ = unasked.insert(path.clone(), identity);
                     }
                     None => {
                         let problem =

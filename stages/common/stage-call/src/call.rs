@@ -122,7 +122,7 @@ impl Call<'_> {
                 summary.lines().for_each(|line| log.line(format_args!("result: {line}")));
             }
             Err(StageFailure { code, message }) => {
-                log.line(format_args!("failed after {time} with {code}: {message}"))
+                log.line(format_args!("failed after {time} with {code}: {message}"));
             }
         }
         result

@@ -210,7 +210,7 @@ impl GridTrainer {
             match &mut self.average {
                 None => {
                     self.average =
-                        Some(now.iter().map(Tensor::f_detach_copy).collect::<Result<_, _>>()?)
+                        Some(now.iter().map(Tensor::f_detach_copy).collect::<Result<_, _>>()?);
                 }
                 Some(average) => {
                     let new = 1.0 - f64::from(options.ema_decay);

@@ -208,7 +208,7 @@ impl<'a> Schedule<'a> {
                         .line(&format!("{}: waits: {why}", self.work.plan.nodes[index].label()));
                 }
                 Place::Never(message) if !self.gives_up() => {
-                    self.fail(index, StageFailure { code: 1, message })
+                    self.fail(index, StageFailure { code: 1, message });
                 }
                 Place::Free if !self.gives_up() => {
                     let progress =
@@ -288,7 +288,7 @@ fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Re
     match &shown {
         Shown::Written(folder) => print_line!("{}: {}", sink.stage, page(folder).display()),
         Shown::UpToDate(folder) => {
-            print_line!("{}: {} (up to date)", sink.stage, page(folder).display())
+            print_line!("{}: {} (up to date)", sink.stage, page(folder).display());
         }
         Shown::Missing => print_line!("{}: nothing to show", sink.stage),
     }

@@ -120,7 +120,7 @@ impl NodeJob<'_> {
 
     fn enter(&self) -> Result<Entered, StageFailure> {
         enter(self.store, self.stop, &|text| {
-            self.display.line(&format!("{}: {text}", self.node.label()))
+            self.display.line(&format!("{}: {text}", self.node.label()));
         })
     }
 
