@@ -3,10 +3,9 @@ use std::path::PathBuf;
 use artifact::{Failure, MEMORY_REMEDY, sized};
 use scene::{Background, View, Views};
 
-use crate::hr_cache::HrCache;
 use crate::packed::PixelMemory;
 use crate::resolve::{Resolved, ResolvedField};
-use crate::supervision::{SupersamplingOptions, Supervision};
+use crate::supervision::SupersamplingOptions;
 
 /// The memory that a training needs at its peak, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -46,15 +45,17 @@ impl MemoryNeed {
     ) -> Self {
         let mut need = Self { field: field(params), ..Self::default() };
         let packed = if views.background == Background::Opaque { 3 } else { 4 };
+        let size_of = |view: &View| {
+            let k = view.camera.intrinsics;
+            (k.width as usize, k.height as usize)
+        };
+        let needs_cache = options.needs_cache(views.views.iter().map(size_of));
         for (view, is_reference) in
             views.views.iter().map(|v| (v, false)).chain(references.iter().map(|v| (v, true)))
         {
-            let k = view.camera.intrinsics;
-            let size = (k.width as usize, k.height as usize);
+            let size = size_of(view);
             let (pixels, hr) = ((size.0 * size.1) as u64, options.hr_size(size));
-            let is_cached = !is_reference
-                && options.supervision == Supervision::Kernel
-                && HrCache::is_needed(options.filter, hr, size);
+            let is_cached = needs_cache && !is_reference;
             let cached = if is_cached { (hr.0 * hr.1) as u64 } else { 0 };
             // A bit a pixel for its mask and one for its detail.
             need.pixels += packed * pixels + pixels / 4 + 3 * cached;
@@ -126,6 +127,7 @@ mod tests {
 
     use super::*;
     use crate::pixel_sampler::Order;
+    use crate::supervision::Supervision;
     use crate::{Params, SceneFacts};
 
     fn need(images: usize, filter: Filter, pose_refinement: bool) -> MemoryNeed {

@@ -103,6 +103,13 @@ impl SupersamplingOptions {
         (length(width, 0), length(height, 1))
     }
 
+    /// Whether HR pixels of LR photographs of such sizes are cached: of all, where the kernel of one
+    /// asks for it.
+    pub(crate) fn needs_cache(&self, mut lr_sizes: impl Iterator<Item = (usize, usize)>) -> bool {
+        let is_needed = |lr| HrCache::is_needed(self.filter, self.hr_size(lr), lr);
+        self.supervision == Supervision::Kernel && lr_sizes.any(is_needed)
+    }
+
     /// Sub-pixel rays along x and y: no more than the smallest view has HR pixels.
     fn full_side(&self, photographs: &Photographs, references: Option<&Photographs>) -> [usize; 2] {
         let lr =
@@ -134,7 +141,8 @@ impl Supersampling {
         let (background, lr_views) = (photographs.views.background, photographs.images.len());
         let lr_pixels: u64 = photographs.images.iter().map(|image| image.pixels() as u64).sum();
         let full = options.full_side(&photographs, references.as_ref());
-        let mut cache = None;
+        let lr_sizes = photographs.images.iter().map(|image| (image.width(), image.height()));
+        let mut cache = options.needs_cache(lr_sizes).then(|| HrCache::new(full));
         let mut kernels = BTreeMap::new();
         let (mut views, mut cameras) = (Vec::with_capacity(lr_views), Vec::with_capacity(lr_views));
         let (mut numbered, mut numbers, mut with_detail) =
@@ -148,20 +156,14 @@ impl Supersampling {
             }
             let mut whole = photograph.whole();
             // References are what they are: nothing has shrunk them.
-            if options.supervision == Supervision::Kernel && !is_reference {
+            if let Some(cache) = cache.as_mut().filter(|_| !is_reference) {
                 let lr = (whole.width, whole.height);
                 let hr = options.hr_size(lr);
-                if HrCache::is_needed(options.filter, hr, lr) {
-                    let (enlarge, kernel) = kernels.entry(lr).or_insert_with(|| {
-                        let enlarge = Resampling::new(Filter::Lanczos, lr, hr);
-                        (enlarge, Arc::new(KernelOperator::new(options.filter, hr, lr)))
-                    });
-                    cache.get_or_insert_with(|| HrCache::new(full)).add(
-                        &enlarge.apply(&whole),
-                        kernel.clone(),
-                        &mut memory,
-                    )?;
-                }
+                let (enlarge, kernel) = kernels.entry(lr).or_insert_with(|| {
+                    let enlarge = Resampling::new(Filter::Lanczos, lr, hr);
+                    (enlarge, Arc::new(KernelOperator::new(options.filter, hr, lr)))
+                });
+                cache.add(&enlarge.apply(&whole), kernel.clone(), &mut memory)?;
             }
             let (image, hr) = if is_reference {
                 whole = block_means(&whole, full);
@@ -821,6 +823,29 @@ mod tests {
         assert!(means.data.iter().all(|v| v.is_finite()) && (means.width, means.height) == (5, 4));
         masked.data.fill(f32::NAN);
         assert!(block_means(&masked, [2, 2]).data.iter().all(|v| v.is_nan()));
+    }
+
+    /// At a broken scale a box may be whole for a photograph of one size and not for another's: then
+    /// the pixels of both are cached, and each is compared with its own.
+    #[test]
+    fn sizes_share_a_cache() {
+        let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
+        let mut both = Photographs::taken_by(camera.resized(1, 1), hr_image(1, 1));
+        let second = Photographs::taken_by(camera.resized(3, 2), hr_image(3, 2));
+        both.views.views.extend(second.views.views);
+        both.images.extend(second.images);
+        let mut options = options(Supervision::Kernel, [1.5, 1.5]);
+        options.filter = Filter::Box;
+        let needs = |lr: (usize, usize)| options.needs_cache([lr].into_iter());
+        assert!(!needs((1, 1)) && needs((3, 2)));
+        let mut joined = supersampling(both, None, &options);
+        let mut gradients = vec![[0.0; 3]; joined.rays_per_bundle()];
+        for bundle in 0..50 {
+            let colours = vec![[0.5, 0.4, 0.3]; joined.rays_per_bundle()];
+            assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
+            joined.remember(bundle, &colours);
+        }
+        assert_eq!(joined.written_len(), 3 * (2 * 2 + 5 * 3));
     }
 
     #[test]
