@@ -281,7 +281,7 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
     let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
         let params = params.resolve(&SceneFacts::of(&views, true));
         let mut supervision =
-            train_ss::supervision(&input, &params, None, &std::env::temp_dir(), &|_| ())?;
+            train_ss::supervision(&input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
         let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field
         else {
             anyhow::bail!("a grid is measured here");
@@ -361,7 +361,7 @@ fn mlp(rows: &mut Rows, input: &GivenInput, views: &Views) -> anyhow::Result<()>
     };
     nets::deterministic();
     let mut supervision =
-        train_ss::supervision(input, &params, None, &std::env::temp_dir(), &|_| ())?;
+        train_ss::supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
     let field =
         torch_field::Mlp::new(*architecture, views.bounds, params.seed, nets::device("cpu")?)?;
     let weights = field.parameter_count() / 2;

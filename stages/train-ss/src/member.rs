@@ -152,8 +152,9 @@ impl<'a> Member<'a> {
             std::fs::create_dir_all(work)
                 .with_context(|| format!("cannot make {}", work.display()))?;
         }
+        let say = |text: String| context.say(text);
         let mut supervision =
-            supervision(input, params, data.references, folder, &|text| context.say(text))?;
+            supervision(input, params, data.references, folder, work.is_some(), &say)?;
         let (total, bundle) = (params.rays, supervision.full_side().iter().product::<usize>());
         if total < bundle as u64 {
             let message = format!(

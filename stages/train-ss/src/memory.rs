@@ -10,7 +10,7 @@ use crate::supervision::SupersamplingOptions;
 /// The memory that a training needs at its peak, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct MemoryNeed {
-    /// The field and all that its optimiser keeps.
+    /// The field, all that its optimiser keeps, and the copy that a checkpoint is written from.
     pub(crate) field: u64,
     /// Photographs as they are kept, and the field's HR pixels: in memory, or in a file where they
     /// are too many.
@@ -26,9 +26,10 @@ pub(crate) struct MemoryNeed {
 const MOST_PIXELS: u64 = 4_000_000_000;
 /// The program, without libtorch and with it.
 const PROGRAM: u64 = if cfg!(feature = "torch") { 150_000_000 } else { 30_000_000 };
-/// Numbers a parameter of the grid: it, its gradient, two moments, an average; and what a
-/// checkpoint copies.
+/// Numbers a parameter of the grid: it, its gradient, two moments, an average.
 const NUMBERS: u64 = 5;
+/// Numbers a parameter that a checkpoint copies: all but the gradient.
+const COPIED: u64 = 4;
 /// Bytes a pixel of a photograph in floats, RGBA.
 const IN_FLOATS: u64 = 16;
 /// Bytes a pixel of its pyramid in floats, RGB: 1 + 1/4 + 1/16 + …, and of the photograph that is
@@ -36,14 +37,16 @@ const IN_FLOATS: u64 = 16;
 const OF_POSES: u64 = 16 + 12;
 
 impl MemoryNeed {
-    /// Of a training with such a field on such views. `references` are HR.
+    /// Of a training with such a field on such views. `references` are HR; `has_checkpoints` says
+    /// whether it writes any.
     pub(crate) fn of(
         params: &Resolved,
         options: &SupersamplingOptions,
         views: &Views,
         references: &[View],
+        has_checkpoints: bool,
     ) -> Self {
-        let mut need = Self { field: field(params), ..Self::default() };
+        let mut need = Self { field: field(params, has_checkpoints), ..Self::default() };
         let packed = if views.background == Background::Opaque { 3 } else { 4 };
         let size_of = |view: &View| {
             let k = view.camera.intrinsics;
@@ -110,13 +113,15 @@ impl MemoryNeed {
     }
 }
 
-/// Memory of the field and its optimiser.
-fn field(params: &Resolved) -> u64 {
+/// Memory of the field, its optimiser and its checkpoints.
+fn field(params: &Resolved, has_checkpoints: bool) -> u64 {
     match &params.field {
-        ResolvedField::Grid { architecture, .. } => 4 * NUMBERS * architecture.grid_len() as u64,
-        // Two networks of some half a million weights; what libtorch takes for a step doesn't show
-        // in their number.
-        ResolvedField::Mlp { .. } => 2_000_000_000,
+        ResolvedField::Grid { architecture, .. } => {
+            let numbers = if has_checkpoints { NUMBERS + COPIED } else { NUMBERS };
+            4 * numbers * architecture.grid_len() as u64
+        }
+        // At least: what libtorch takes for a step doesn't show in the networks' size.
+        ResolvedField::Mlp { .. } => 500_000_000,
     }
 }
 
@@ -156,7 +161,7 @@ mod tests {
             pose_refinement,
             seed: 1,
         };
-        MemoryNeed::of(&params, &options, &views, &[])
+        MemoryNeed::of(&params, &options, &views, &[], false)
     }
 
     /// Images of three megapixels: three bytes a pixel, twelve more where HR pixels are cached, two

@@ -31,13 +31,14 @@ pub(crate) fn open_background(parameter: &str) -> String {
 }
 
 /// What the field is compared with, by the parameters and by what the input says of its own making.
-/// The memory for it is said; where pixels need more, they go into a file in `folder`. What is
-/// wrong with a reference is said.
+/// The memory for it is said; where pixels need more, they go into a file in `folder`.
+/// `has_checkpoints` says whether the training writes any. What is wrong with a reference is said.
 pub fn supervision(
     input: &GivenInput,
     params: &Resolved,
     references: Option<&GivenInput>,
     folder: &Path,
+    has_checkpoints: bool,
     say: &dyn Fn(String),
 ) -> anyhow::Result<Supersampling> {
     let views = Views::read(input)?;
@@ -62,7 +63,7 @@ pub fn supervision(
     };
     let hr_views = hr_views
         .map_or(Vec::new(), |views| views.views.into_iter().take(params.max_references).collect());
-    let need = MemoryNeed::of(params, &options, &views, &hr_views);
+    let need = MemoryNeed::of(params, &options, &views, &hr_views, has_checkpoints);
     let mut memory = need.plan(available_memory()?, folder.to_path_buf())?;
     say(need.in_words(memory.left()));
     let photographs = Photographs::read(input, usize::MAX, &mut memory)?;
