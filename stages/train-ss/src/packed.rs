@@ -315,7 +315,7 @@ fn premultiplied([r, g, b, a]: [u8; 4]) -> [f32; 4] {
 }
 
 /// The 8-bit levels, alpha straight, nearest to a premultiplied pixel.
-fn straight([r, g, b, a]: [f32; 4]) -> [u8; 4] {
+pub(crate) fn straight([r, g, b, a]: [f32; 4]) -> [u8; 4] {
     let of = |colour: f32| if a > 0.0 { to_u8(colour / a) } else { 0 };
     [of(r), of(g), of(b), to_u8(a)]
 }

@@ -1,8 +1,8 @@
 use anyhow::Context as _;
-use pixels::{Exposure, Image, Kernel, Resampling, Rgba8, psnr_of, resize_pillow, to_u8};
+use pixels::{Exposure, Image, Kernel, Resampling, Rgba8, psnr_of, resize_pillow};
 use scene::Camera;
 
-use crate::packed::{PackedPhotograph, PixelMemory};
+use crate::packed::{PackedPhotograph, PixelMemory, straight};
 use crate::photographs::{NO_PLACE, Photographs};
 
 /// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else
@@ -94,11 +94,8 @@ fn compared(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
 
 /// An image with premultiplied alpha as its PNG has it: 8 bits, alpha straight.
 fn as_stored(image: &Image) -> Rgba8 {
-    let pixel = |p: &[f32]| {
-        let straight = |colour: f32| if p[3] > 0.0 { to_u8(colour / p[3]) } else { 0 };
-        [straight(p[0]), straight(p[1]), straight(p[2]), to_u8(p[3])]
-    };
-    Rgba8::new(image.width, image.height, image.data.chunks_exact(4).flat_map(pixel).collect())
+    let pixels = image.data.as_chunks::<4>().0.iter().copied();
+    Rgba8::new(image.width, image.height, pixels.flat_map(straight).collect())
 }
 
 fn is_transparent(image: &Image) -> bool {
