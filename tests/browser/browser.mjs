@@ -1,0 +1,62 @@
+// Opens a page from disk in headless Chromium, as tests/common/browser.rs calls it.
+//
+// Packages lie in target/browser, where scripts/setup-browser.sh puts them. No console error and no request but for
+// files is allowed: `finish` says what was found.
+import { createRequire } from "node:module";
+import { readFileSync } from "node:fs";
+import { pathToFileURL } from "node:url";
+
+const packages = createRequire(`${process.env.NERF_SR_BROWSER}/`);
+const { chromium } = packages("playwright-core");
+
+const QUIET = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
+  "--disable-component-update", "--disable-sync"];
+const SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"];
+
+/** Starts Chromium; `webgl` brings WebGL2 in software. */
+export async function start({ webgl = false } = {}) {
+  return chromium.launch({
+    executablePath: process.env.NERF_SR_CHROMIUM,
+    args: [...QUIET, ...(webgl ? SOFTWARE_GL : ["--disable-gpu"])],
+  });
+}
+
+/** Opens the file at `path`; returns its `page` and `problems`, a list that errors and requests are added to. */
+export async function open(browser, path, { width = 1440, height = 900, dark = false } = {}) {
+  const context = await browser.newContext({
+    viewport: { width, height },
+    colorScheme: dark ? "dark" : "light",
+    reducedMotion: "reduce",
+    hasTouch: width < 600,
+  });
+  const page = await context.newPage();
+  const problems = [];
+  page.on("console", (message) => {
+    if (["error", "warning"].includes(message.type())) problems.push(`console: ${message.text()}`);
+  });
+  page.on("pageerror", (error) => problems.push(`error: ${error.message}`));
+  page.on("request", (request) => {
+    if (!/^(file|data|blob):/.test(request.url())) problems.push(`request: ${request.url()}`);
+  });
+  await page.goto(pathToFileURL(path).href);
+  return { page, problems };
+}
+
+/** Serious and critical findings of axe-core, one line each. */
+export async function accessibilityFindings(page) {
+  await page.evaluate(readFileSync(packages.resolve("axe-core/axe.min.js"), "utf8"));
+  const { violations } = await page.evaluate(() => window.axe.run());
+  return violations
+    .filter(({ impact }) => ["serious", "critical"].includes(impact))
+    .map(({ id, help, nodes }) => `${id}: ${help}: ${nodes.slice(0, 3).map(({ target }) => target.join(" ")).join(", ")}`);
+}
+
+/** Runs `check`, prints the object that it returns as JSON, and ends the browser whatever happens. */
+export async function report(options, check) {
+  const browser = await start(options);
+  try {
+    console.log(JSON.stringify(await check(browser)));
+  } finally {
+    await browser.close();
+  }
+}

@@ -1,0 +1,40 @@
+//! A real browser for pages that stages write: scripts of `tests/browser`, run by node in Debian's
+//! Chromium.
+
+use std::ffi::OsStr;
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+/// Runs `tests/browser/SCRIPT` and returns the JSON that it prints. None, with a word, where the
+/// browser isn't installed.
+#[track_caller]
+pub fn run_in_browser<A: AsRef<OsStr>>(
+    script: &str,
+    arguments: impl IntoIterator<Item = A>,
+) -> Option<serde_json::Value> {
+    let root = super::root();
+    let packages = root.join("target/browser");
+    let chromium = chromium();
+    if chromium.is_none() || !packages.join("complete").exists() {
+        eprintln!("skipped: no browser (apt-get install chromium; scripts/setup-browser.sh)");
+        return None;
+    }
+    let output = Command::new("node")
+        .arg(root.join("tests/browser").join(script))
+        .args(arguments)
+        .env("NERF_SR_BROWSER", packages)
+        .env("NERF_SR_CHROMIUM", chromium.unwrap())
+        .stdin(Stdio::null())
+        .output()
+        .expect("node starts");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{script}: {errors}");
+    Some(serde_json::from_slice(&output.stdout).unwrap_or_else(|error| {
+        panic!("{script} printed no JSON ({error}): {}", String::from_utf8_lossy(&output.stdout))
+    }))
+}
+
+fn chromium() -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    std::env::split_paths(&path).map(|folder| folder.join("chromium")).find(|file| file.exists())
+}
