@@ -29,6 +29,8 @@ export async function open(browser, path, { width = 1440, height = 900, dark = f
     reducedMotion: "reduce",
     hasTouch: width < 600,
   });
+  // Pages of megabytes take long to open on a busy machine.
+  context.setDefaultTimeout(180_000);
   const page = await context.newPage();
   const problems = [];
   page.on("console", (message) => {

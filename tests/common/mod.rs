@@ -5,6 +5,8 @@
 #![allow(unreachable_pub, reason = "shared by several test binaries")]
 
 pub mod browser;
+pub mod splats;
+pub mod surfaces;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};

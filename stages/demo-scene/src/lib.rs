@@ -225,6 +225,33 @@ mod tests {
         assert!(agree.count() > 64 * 64 * 95 / 100);
     }
 
+    /// A ray's first surface is at distance 0, its normal is where the distance grows, and all the
+    /// way there is no nearer one.
+    #[test]
+    fn distances_are_those_of_the_surfaces() {
+        let world = World::new(2);
+        let mut met = 0;
+        for i in 0..200 {
+            let pose = pose(Layout::Around, "train", i, 200);
+            let origin = DVec3::new(pose[0][3], pose[1][3], pose[2][3]);
+            let at = 0.2 * DVec3::new(f64::from(i % 7) - 3.0, f64::from(i % 11) - 5.0, -1.0);
+            let direction = (at - origin).normalize();
+            let Some((point, normal)) = world.surface(origin, direction) else { continue };
+            met += 1;
+            assert!(world.distance(point).abs() < 1e-9, "ray {i}");
+            let step = 1e-4;
+            let [out, inside] = [step, -step].map(|by| world.distance(point + by * normal));
+            assert!(out > 0.5 * step && inside < 0.0, "ray {i}: {out} and {inside}");
+            for k in 1..10 {
+                let share = f64::from(k) / 10.0;
+                let left = (1.0 - share) * (point - origin).length();
+                let distance = world.distance(origin.lerp(point, share));
+                assert!(distance > 0.0 && distance <= left + 1e-9, "ray {i}");
+            }
+        }
+        assert!(met > 100, "{met} rays meet something");
+    }
+
     #[test]
     fn the_scene_stays_in_every_view() {
         // What a test view sees must be inside the training views' frusta, or near/far and hull

@@ -25,6 +25,13 @@ struct Thing {
     material: Material,
 }
 
+impl Thing {
+    /// One whose axes are the world's.
+    fn new(shape: Shape, centre: DVec3, material: Material) -> Self {
+        Self { shape, centre, to_local: DMat3::IDENTITY, material }
+    }
+}
+
 /// Things behind one bounding ball, so that most rays pass them at the cost of one test.
 #[derive(Clone, Debug)]
 struct Cluster {
@@ -66,102 +73,28 @@ impl World {
         let place = |slot: u32, distance: f64| {
             let angle =
                 turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * std::f64::consts::TAU / 5.0;
-            DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), FLOOR)
+            distance * towards(angle) + DVec3::Z * FLOOR
         };
-        let thing =
-            |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
-        let mut groups = vec![group(vec![thing(
-            Shape::Drum(1.1, 0.06),
-            DVec3::new(0.0, 0.0, FLOOR - 0.06),
-            Material::Tiles,
-        )])];
-
-        let crate_half = 0.26;
-        let spin = 0.5 + turn;
-        let to_local = DMat3::from_cols(
-            DVec3::new(libm::cos(spin), -libm::sin(spin), 0.0),
-            DVec3::new(libm::sin(spin), libm::cos(spin), 0.0),
-            DVec3::Z,
-        );
-        let centre = place(0, 0.62) + DVec3::Z * crate_half;
-        groups.push(group(vec![Thing {
-            shape: Shape::Block(DVec3::splat(crate_half)),
-            centre,
-            to_local,
-            material: Material::Crate,
-        }]));
-
-        groups.push(group(vec![thing(
-            Shape::Ball(0.3),
-            place(1, 0.62) + DVec3::Z * 0.3,
-            Material::Ball,
-        )]));
-
-        // A cage of rods around a striped ball.
-        let foot = place(2, 0.64);
-        let mut cage = vec![thing(Shape::Ball(0.17), foot + DVec3::Z * 0.36, Material::Stripes)];
-        let on_circle = |k: usize, n: usize, radius: f64| {
-            let angle = k as f64 / n as f64 * std::f64::consts::TAU;
-            DVec3::new(radius * libm::cos(angle), radius * libm::sin(angle), 0.0)
-        };
-        for k in 0..12 {
-            let p = on_circle(k, 12, 0.27);
-            cage.push(thing(Shape::Rod(p, p + DVec3::Z * 0.7, 0.011), foot, Material::Rod));
-        }
-        for height in [0.02, 0.36, 0.7] {
-            for k in 0..20 {
-                let (a, b) = (on_circle(k, 20, 0.27), on_circle(k + 1, 20, 0.27));
-                cage.push(thing(
-                    Shape::Rod(a + DVec3::Z * height, b + DVec3::Z * height, 0.013),
-                    foot,
-                    Material::Rod,
-                ));
-            }
-        }
-        groups.push(group(cage));
-
-        // A copper spring, in pieces short enough for tight bounding balls.
-        let foot = place(3, 0.60);
-        let turns = 5.0;
-        let pieces = 80;
-        let point = |k: usize| {
-            let share = k as f64 / f64::from(pieces);
-            let angle = share * turns * std::f64::consts::TAU;
-            let radius = 0.20 - 0.08 * share;
-            DVec3::new(radius * libm::cos(angle), radius * libm::sin(angle), 0.02 + 0.95 * share)
-        };
-        let rods: Vec<Thing> = (0..pieces as usize)
-            .map(|k| thing(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper))
-            .collect();
-        groups.extend(rods.chunks(16).map(|piece| group(piece.to_vec())));
-
-        // A sign on a thin post.
-        let foot = place(4, 0.66);
-        let facing = libm::atan2(foot.y, foot.x) + std::f64::consts::FRAC_PI_2;
-        let to_local = DMat3::from_cols(
-            DVec3::new(libm::cos(facing), -libm::sin(facing), 0.0),
-            DVec3::new(libm::sin(facing), libm::cos(facing), 0.0),
-            DVec3::Z,
-        );
-        groups.push(group(vec![
-            thing(Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014), foot, Material::Rod),
-            Thing {
-                shape: Shape::Block(DVec3::new(0.27, 0.010, 0.19)),
-                centre: foot + DVec3::Z * 0.62,
-                to_local,
-                material: Material::Sign,
-            },
-        ]));
+        let mut groups = vec![
+            base(),
+            crate_at(place(0, 0.62), 0.5 + turn),
+            group(vec![Thing::new(
+                Shape::Ball(0.3),
+                place(1, 0.62) + DVec3::Z * 0.3,
+                Material::Ball,
+            )]),
+            cage(place(2, 0.64)),
+        ];
+        groups.extend(spring(place(3, 0.60)));
+        groups.push(sign(place(4, 0.66)));
         Self { groups, seed, sky: false }
     }
 
     /// The same things with a world around them that doesn't end: ground, towers far away, sky.
     #[must_use]
     pub fn with_backdrop(mut self) -> Self {
-        let thing =
-            |shape, centre, material| Thing { shape, centre, to_local: DMat3::IDENTITY, material };
         let ground = FLOOR - 0.2;
-        self.groups.push(group(vec![thing(
+        self.groups.push(group(vec![Thing::new(
             Shape::Drum(60.0, 0.05),
             DVec3::Z * (ground - 0.05),
             Material::Tiles,
@@ -170,8 +103,8 @@ impl World {
             // Scattered by the golden angle, between 7 and 20 units away.
             let (angle, distance) = (f64::from(k + self.seed % 9) * 2.4, 7.0 + 1.6 * f64::from(k));
             let half = DVec3::new(0.7, 0.9, 1.2 + 0.35 * f64::from(k % 4));
-            let foot = DVec3::new(distance * libm::cos(angle), distance * libm::sin(angle), ground);
-            self.groups.push(group(vec![thing(
+            let foot = distance * towards(angle) + DVec3::Z * ground;
+            self.groups.push(group(vec![Thing::new(
                 Shape::Block(half),
                 foot + DVec3::Z * half.z,
                 Material::Crate,
@@ -179,6 +112,20 @@ impl World {
         }
         self.sky = true;
         self
+    }
+
+    /// Distance from a point to the nearest surface, below 0 inside of things: what geometry made of
+    /// the scene's images is measured by.
+    pub fn distance(&self, point: DVec3) -> f64 {
+        let things = self.groups.iter().flat_map(|group| &group.things);
+        let to = |thing: &Thing| thing.shape.distance(thing.to_local * (point - thing.centre));
+        things.map(to).fold(f64::INFINITY, f64::min)
+    }
+
+    /// The first surface that a ray meets: where, and its unit normal, outwards. The direction has
+    /// unit length.
+    pub fn surface(&self, origin: DVec3, direction: DVec3) -> Option<(DVec3, DVec3)> {
+        self.first_hit(origin, direction).map(|hit| (origin + hit.t * direction, hit.normal))
     }
 
     /// The first surface along a ray, beyond a tiny distance.
@@ -209,6 +156,76 @@ impl World {
             }
         })
     }
+}
+
+/// The horizontal direction at an angle, of unit length.
+fn towards(angle: f64) -> DVec3 {
+    DVec3::new(libm::cos(angle), libm::sin(angle), 0.0)
+}
+
+/// World to the axes of a thing that is turned around the vertical.
+fn turned(angle: f64) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::new(libm::cos(angle), -libm::sin(angle), 0.0),
+        DVec3::new(libm::sin(angle), libm::cos(angle), 0.0),
+        DVec3::Z,
+    )
+}
+
+/// The round base that all stands on.
+fn base() -> Cluster {
+    let centre = DVec3::new(0.0, 0.0, FLOOR - 0.06);
+    group(vec![Thing::new(Shape::Drum(1.1, 0.06), centre, Material::Tiles)])
+}
+
+/// A printed crate.
+fn crate_at(foot: DVec3, angle: f64) -> Cluster {
+    let half = 0.26;
+    let block =
+        Thing::new(Shape::Block(DVec3::splat(half)), foot + DVec3::Z * half, Material::Crate);
+    group(vec![Thing { to_local: turned(angle), ..block }])
+}
+
+/// A cage of rods around a striped ball.
+fn cage(foot: DVec3) -> Cluster {
+    let mut things = vec![Thing::new(Shape::Ball(0.17), foot + DVec3::Z * 0.36, Material::Stripes)];
+    let on_circle =
+        |k: usize, n: usize| 0.27 * towards(k as f64 / n as f64 * std::f64::consts::TAU);
+    for k in 0..12 {
+        let p = on_circle(k, 12);
+        things.push(Thing::new(Shape::Rod(p, p + DVec3::Z * 0.7, 0.011), foot, Material::Rod));
+    }
+    for height in [0.02, 0.36, 0.7] {
+        for k in 0..20 {
+            let [a, b] = [k, k + 1].map(|k| on_circle(k, 20) + DVec3::Z * height);
+            things.push(Thing::new(Shape::Rod(a, b, 0.013), foot, Material::Rod));
+        }
+    }
+    group(things)
+}
+
+/// A copper spring, in pieces short enough for tight bounding balls.
+fn spring(foot: DVec3) -> Vec<Cluster> {
+    const TURNS: f64 = 5.0;
+    const PIECES: usize = 80;
+    let point = |k: usize| {
+        let share = k as f64 / PIECES as f64;
+        let radius = 0.20 - 0.08 * share;
+        radius * towards(share * TURNS * std::f64::consts::TAU) + DVec3::Z * (0.02 + 0.95 * share)
+    };
+    let rods: Vec<Thing> = (0..PIECES)
+        .map(|k| Thing::new(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper))
+        .collect();
+    rods.chunks(16).map(|piece| group(piece.to_vec())).collect()
+}
+
+/// A sign on a thin post.
+fn sign(foot: DVec3) -> Cluster {
+    let facing = libm::atan2(foot.y, foot.x) + std::f64::consts::FRAC_PI_2;
+    let post = Shape::Rod(DVec3::ZERO, DVec3::Z * 0.5, 0.014);
+    let board = Shape::Block(DVec3::new(0.27, 0.010, 0.19));
+    let board = Thing::new(board, foot + DVec3::Z * 0.62, Material::Sign);
+    group(vec![Thing::new(post, foot, Material::Rod), Thing { to_local: turned(facing), ..board }])
 }
 
 fn group(things: Vec<Thing>) -> Cluster {
@@ -262,89 +279,115 @@ impl Shape {
         }
     }
 
+    /// Distance from the surface, below 0 inside, in the shape's own space.
+    fn distance(self, p: DVec3) -> f64 {
+        let outside =
+            |beyond: DVec3| beyond.max(DVec3::ZERO).length() + beyond.max_element().min(0.0);
+        match self {
+            Self::Ball(r) => p.length() - r,
+            Self::Block(half) => outside(p.abs() - half),
+            Self::Drum(r, h) => {
+                let beside = libm::sqrt(p.x * p.x + p.y * p.y) - r;
+                // The same along the two directions that a drum has.
+                outside(DVec3::new(beside, p.z.abs() - h, f64::NEG_INFINITY))
+            }
+            Self::Rod(a, b, r) => {
+                let (axis, from) = (b - a, p - a);
+                let share = (from.dot(axis) / axis.length_squared()).clamp(0.0, 1.0);
+                (from - share * axis).length() - r
+            }
+        }
+    }
+
     /// Distance and normal of the first surface, in the shape's own space.
     fn intersect(self, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
         match self {
-            Self::Ball(r) => {
-                let (near, far) =
-                    quadratic(d.length_squared(), o.dot(d), o.length_squared() - r * r)?;
-                let t = if near > EPSILON { near } else { far };
-                (t > EPSILON).then(|| (t, (o + t * d) / r))
-            }
-            Self::Block(half) => {
-                let inverse = d.recip();
-                let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
-                let (low, high) = (a.min(b), a.max(b));
-                let (near, far) = (low.max_element(), high.min_element());
-                let t = if near > EPSILON { near } else { far };
-                if near > far || t <= EPSILON {
-                    return None;
-                }
-                let p = (o + t * d) / half;
-                let axis = if p.x.abs() >= p.y.abs().max(p.z.abs()) {
-                    DVec3::X
-                } else if p.y.abs() >= p.z.abs() {
-                    DVec3::Y
-                } else {
-                    DVec3::Z
-                };
-                Some((t, axis * p.dot(axis).signum()))
-            }
-            Self::Drum(r, h) => {
-                let mut best: Option<(f64, DVec3)> = None;
-                let mut offer = |t: f64, normal: DVec3| {
-                    if t > EPSILON && best.is_none_or(|(nearest, _)| t < nearest) {
-                        best = Some((t, normal));
-                    }
-                };
-                let roots = quadratic(
-                    d.x * d.x + d.y * d.y,
-                    o.x * d.x + o.y * d.y,
-                    o.x * o.x + o.y * o.y - r * r,
-                );
-                for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
-                    let p = o + t * d;
-                    if p.z.abs() <= h {
-                        offer(t, DVec3::new(p.x / r, p.y / r, 0.0));
-                    }
-                }
-                for side in [-1.0, 1.0] {
-                    let t = (side * h - o.z) / d.z;
-                    let p = o + t * d;
-                    if t.is_finite() && p.x * p.x + p.y * p.y <= r * r {
-                        offer(t, DVec3::Z * side);
-                    }
-                }
-                best
-            }
-            Self::Rod(a, b, r) => {
-                let axis = b - a;
-                let (length2, od) = (axis.length_squared(), o - a);
-                let (along_d, along_o) = (axis.dot(d), axis.dot(od));
-                let mut best: Option<(f64, DVec3)> = None;
-                let mut offer = |t: f64, normal: DVec3| {
-                    if t > EPSILON && best.is_none_or(|(nearest, _)| t < nearest) {
-                        best = Some((t, normal));
-                    }
-                };
-                let roots = quadratic(
-                    length2 * d.length_squared() - along_d * along_d,
-                    length2 * od.dot(d) - along_o * along_d,
-                    length2 * (od.length_squared() - r * r) - along_o * along_o,
-                );
-                for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
-                    let share = (along_o + t * along_d) / length2;
-                    if (0.0..=1.0).contains(&share) {
-                        offer(t, (od + t * d - share * axis) / r);
-                    }
-                }
-                for end in [a, b] {
-                    if let Some((t, normal)) = Self::Ball(r).intersect(o - end, d) {
-                        offer(t, normal);
-                    }
-                }
-                best
-            }
+            Self::Ball(r) => intersect_ball(r, o, d),
+            Self::Block(half) => intersect_block(half, o, d),
+            Self::Drum(r, h) => intersect_drum(r, h, o, d),
+            Self::Rod(a, b, r) => intersect_rod([a, b], r, o, d),
+        }
+    }
+}
+
+fn intersect_ball(r: f64, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+    let (near, far) = quadratic(d.length_squared(), o.dot(d), o.length_squared() - r * r)?;
+    let t = if near > EPSILON { near } else { far };
+    (t > EPSILON).then(|| (t, (o + t * d) / r))
+}
+
+fn intersect_block(half: DVec3, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+    let inverse = d.recip();
+    let (a, b) = ((-half - o) * inverse, (half - o) * inverse);
+    let (low, high) = (a.min(b), a.max(b));
+    let (near, far) = (low.max_element(), high.min_element());
+    let t = if near > EPSILON { near } else { far };
+    if near > far || t <= EPSILON {
+        return None;
+    }
+    let p = (o + t * d) / half;
+    let axis = if p.x.abs() >= p.y.abs().max(p.z.abs()) {
+        DVec3::X
+    } else if p.y.abs() >= p.z.abs() {
+        DVec3::Y
+    } else {
+        DVec3::Z
+    };
+    Some((t, axis * p.dot(axis).signum()))
+}
+
+fn intersect_drum(r: f64, h: f64, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+    let mut nearest = Nearest::default();
+    let roots =
+        quadratic(d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y, o.x * o.x + o.y * o.y - r * r);
+    for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
+        let p = o + t * d;
+        if p.z.abs() <= h {
+            nearest.offer(t, DVec3::new(p.x / r, p.y / r, 0.0));
+        }
+    }
+    for side in [-1.0, 1.0] {
+        let t = (side * h - o.z) / d.z;
+        let p = o + t * d;
+        if t.is_finite() && p.x * p.x + p.y * p.y <= r * r {
+            nearest.offer(t, DVec3::Z * side);
+        }
+    }
+    nearest.0
+}
+
+fn intersect_rod([a, b]: [DVec3; 2], r: f64, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {
+    let axis = b - a;
+    let (length2, od) = (axis.length_squared(), o - a);
+    let (along_d, along_o) = (axis.dot(d), axis.dot(od));
+    let mut nearest = Nearest::default();
+    let roots = quadratic(
+        length2 * d.length_squared() - along_d * along_d,
+        length2 * od.dot(d) - along_o * along_d,
+        length2 * (od.length_squared() - r * r) - along_o * along_o,
+    );
+    for t in roots.into_iter().flat_map(|(near, far)| [near, far]) {
+        let share = (along_o + t * along_d) / length2;
+        if (0.0..=1.0).contains(&share) {
+            nearest.offer(t, (od + t * d - share * axis) / r);
+        }
+    }
+    for end in [a, b] {
+        if let Some((t, normal)) = intersect_ball(r, o - end, d) {
+            nearest.offer(t, normal);
+        }
+    }
+    nearest.0
+}
+
+/// The nearest surface of those offered: distance and normal.
+#[derive(Default)]
+struct Nearest(Option<(f64, DVec3)>);
+
+impl Nearest {
+    fn offer(&mut self, t: f64, normal: DVec3) {
+        if t > EPSILON && self.0.is_none_or(|(nearest, _)| t < nearest) {
+            self.0 = Some((t, normal));
         }
     }
 }

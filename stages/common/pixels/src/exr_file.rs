@@ -91,29 +91,7 @@ pub fn write_exr<E: From<PixelError>>(
 ) -> Result<(), E> {
     let mut order: Vec<usize> = (0..channels.len()).collect();
     order.sort_by_key(|&i| channels[i].name);
-    let described = order.iter().map(|&i| {
-        let sample_type = match channels[i].sample_type {
-            SampleType::Half => exr::meta::attribute::SampleType::F16,
-            SampleType::Float => exr::meta::attribute::SampleType::F32,
-        };
-        ChannelDescription {
-            name: Text::from(channels[i].name),
-            sample_type,
-            quantize_linearly: false,
-            sampling: (1, 1).into(),
-        }
-    });
-    let list = ChannelList::new(described.collect());
-    // Measured in facts/pipelines.md: the crate's default line order wrote 40 different files of 40.
-    let mut header = Header::new(Text::from("views"), (width, height), list.list).with_encoding(
-        Compression::ZIP16,
-        BlockDescription::ScanLines,
-        LineOrder::Increasing,
-    );
-    // A second custom attribute would land in a hash map, in no fixed order.
-    header.own_attributes.layer_name = None;
-    header.own_attributes.other.insert(Text::from("note"), AttributeValue::Text(Text::from(note)));
-
+    let header = header((width, height), order.iter().map(|&i| &channels[i]), note);
     let file =
         File::create(path).map_err(|source| PixelError::Io { path: path.to_path_buf(), source })?;
     let mut failure: Option<E> = None;
@@ -149,6 +127,37 @@ pub fn write_exr<E: From<PixelError>>(
         (None, Ok(())) => Ok(()),
         (None, Err(error)) => Err(exr_error(path, error).into()),
     }
+}
+
+/// The header of a file with channels in their order of names.
+fn header<'a>(
+    size: (usize, usize),
+    channels: impl Iterator<Item = &'a Channel>,
+    note: &str,
+) -> Header {
+    let described = channels.map(|channel| {
+        let sample_type = match channel.sample_type {
+            SampleType::Half => exr::meta::attribute::SampleType::F16,
+            SampleType::Float => exr::meta::attribute::SampleType::F32,
+        };
+        ChannelDescription {
+            name: Text::from(channel.name),
+            sample_type,
+            quantize_linearly: false,
+            sampling: (1, 1).into(),
+        }
+    });
+    let list = ChannelList::new(described.collect());
+    // Measured in facts/pipelines.md: the crate's default line order wrote 40 different files of 40.
+    let mut header = Header::new(Text::from("views"), size, list.list).with_encoding(
+        Compression::ZIP16,
+        BlockDescription::ScanLines,
+        LineOrder::Increasing,
+    );
+    // A second custom attribute would land in a hash map, in no fixed order.
+    header.own_attributes.layer_name = None;
+    header.own_attributes.other.insert(Text::from("note"), AttributeValue::Text(Text::from(note)));
+    header
 }
 
 fn check_finite(

@@ -52,7 +52,7 @@ pub use operator::{AxisTaps, Resampling};
 pub use pillow_resample::{Filter, resize_pillow};
 pub use png_file::{PngRows, encode_png, read_png, write_png};
 pub use pool::average_pool;
-pub use srgb::srgb_from_linear;
+pub use srgb::{linear_from_srgb, srgb_from_linear};
 
 use std::path::PathBuf;
 

@@ -1,0 +1,81 @@
+#!/usr/bin/env python3
+"""Reads an artifact of `export` with trimesh, plyfile and pycolmap, and compares it with a true surface.
+
+    check-export.py EXPORT TRUTH.ply SEEN.ply
+
+TRUTH.ply has points of the true surface with their normals, SEEN.ply those that cameras see. Prints JSON: mean distances to
+the former and from the latter over the scene's size, its longest side, and shares of normals that point the same way as the
+nearest true one. Cameras are left out without pycolmap.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import trimesh
+from scipy.spatial import cKDTree
+
+
+def columns(element, names):
+    return np.stack([np.asarray(element[name], dtype=np.float64) for name in names], axis=1)
+
+
+def read_points(path):
+    vertex = plyfile.PlyData.read(path)["vertex"]
+    return columns(vertex, ["x", "y", "z"]), columns(vertex, ["nx", "ny", "nz"]), vertex
+
+
+def outward(points, normals, tree, truth_normals):
+    _, nearest = tree.query(points)
+    return float(np.mean(np.sum(normals * truth_normals[nearest], axis=1) > 0))
+
+
+def main():
+    export = Path(sys.argv[1])
+    truth, truth_normals, _ = read_points(sys.argv[2])
+    seen, _, _ = read_points(sys.argv[3])
+    size = float((truth.max(axis=0) - truth.min(axis=0)).max())
+    tree = cKDTree(truth)
+
+    def figures(points, normals, to_surface):
+        return {
+            "count": len(points),
+            "to_truth": float(np.mean(tree.query(points)[0])) / size,
+            "from_truth": float(np.mean(to_surface)) / size,
+            "outward": outward(points, normals, tree, truth_normals),
+        }
+
+    found = {}
+    (mesh,) = trimesh.load(export / "mesh.glb", process=False).geometry.values()
+    samples, faces = trimesh.sample.sample_surface(mesh, 200_000, seed=1)
+    # The sampled surface is dense enough to stand for all of it.
+    found["mesh"] = figures(samples, mesh.face_normals[faces], cKDTree(samples).query(seen)[0])
+    found["mesh"]["triangles"] = len(mesh.faces)
+    found["mesh"]["vertices_outward"] = outward(mesh.vertices, mesh.vertex_normals, tree, truth_normals)
+    found["mesh"]["has_colours"] = len(mesh.visual.vertex_attributes["color"]) == len(mesh.vertices)
+    points, normals, vertex = read_points(export / "points.ply")
+    found["points"] = figures(points, normals, cKDTree(points).query(seen)[0])
+    found["points"]["properties"] = [p.name for p in vertex.properties]
+    splats, normals, vertex = read_points(export / "splats.ply")
+    found["splats"] = figures(splats, normals, cKDTree(splats).query(seen)[0])
+    found["splats"]["properties"] = [p.name for p in vertex.properties]
+    cameras = json.loads((export / "transforms.json").read_text())
+    found["frames"] = len(cameras["frames"])
+    try:
+        import pycolmap
+    except ImportError:
+        pass
+    else:
+        model = pycolmap.Reconstruction(str(export / "colmap/sparse/0"))
+        poses = {}
+        for image in model.images.values():
+            pose = image.cam_from_world() if callable(image.cam_from_world) else image.cam_from_world
+            poses[image.name] = pose.inverse().matrix().tolist()
+        found["colmap"] = {"points": len(model.points3D), "cameras": len(model.cameras), "camera_to_world": poses}
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+use std::fmt::Write as _;
+
+use glam::{DMat3, DQuat, DVec3};
+use scene::{Camera, Intrinsics};
+use serde_json::{Map, Value, json};
+
+use crate::surfel::Surfel;
+
+/// Points of a COLMAP model, at most: what a structure from motion finds, about.
+const POINTS: usize = 100_000;
+
+/// `transforms.json` as instant-ngp and nerfstudio read it. Images aren't exported: each is named
+/// `images/NAME.png`.
+pub(crate) fn transforms(cameras: &[Camera], points: Option<&str>) -> Value {
+    let shared = shared_intrinsics(cameras);
+    let frame = |camera: &Camera| {
+        let mut entry = if shared.is_some() { Map::new() } else { lens(&camera.intrinsics) };
+        let mut matrix = camera.camera_to_world.to_vec();
+        matrix.push([0.0, 0.0, 0.0, 1.0]);
+        entry.insert("file_path".to_owned(), json!(image(camera, "images/")));
+        entry.insert("transform_matrix".to_owned(), json!(matrix));
+        Value::Object(entry)
+    };
+    let mut file = shared.map(lens).unwrap_or_default();
+    file.insert("frames".to_owned(), cameras.iter().map(frame).collect());
+    if let Some(points) = points {
+        file.insert("ply_file_path".to_owned(), json!(points));
+    }
+    Value::Object(file)
+}
+
+/// The intrinsics of all cameras, where they have the same.
+fn shared_intrinsics(cameras: &[Camera]) -> Option<&Intrinsics> {
+    let first = &cameras.first()?.intrinsics;
+    cameras.iter().all(|camera| camera.intrinsics == *first).then_some(first)
+}
+
+fn image(camera: &Camera, folder: &str) -> String {
+    format!("{folder}{}.png", camera.name)
+}
+
+fn lens(k: &Intrinsics) -> Map<String, Value> {
+    let ([k1, k2, k3], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
+    let half_angle = |size: u32, focal: f64| (0.5 * f64::from(size) / focal).atan();
+    let entry = json!({
+        "camera_model": if k.distortion.is_none() { "PINHOLE" } else { "OPENCV" },
+        "camera_angle_x": 2.0 * half_angle(k.width, k.fx),
+        "camera_angle_y": 2.0 * half_angle(k.height, k.fy),
+        "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height,
+        "k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2,
+    });
+    if let Value::Object(entry) = entry { entry } else { Map::new() }
+}
+
+/// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to camera
+/// with axes right, down, forward. Points have no track.
+pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, String); 3] {
+    let mut lenses: Vec<&Intrinsics> = Vec::new();
+    let mut images =
+        "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; a line of points\n".to_owned();
+    for (id, camera) in (1..).zip(cameras) {
+        let known = lenses.iter().position(|k| **k == camera.intrinsics);
+        let lens = known.unwrap_or_else(|| {
+            lenses.push(&camera.intrinsics);
+            lenses.len() - 1
+        });
+        let (q, t) = world_to_camera(camera);
+        let pose = [q.w, q.x, q.y, q.z, t.x, t.y, t.z].map(|v| v.to_string()).join(" ");
+        let _ = writeln!(images, "{id} {pose} {} {}\n", lens + 1, image(camera, ""));
+    }
+    let mut cameras = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".to_owned();
+    for (id, k) in (1..).zip(lenses) {
+        let (model, numbers) = colmap_model(k);
+        let numbers = numbers.iter().map(f64::to_string).collect::<Vec<_>>().join(" ");
+        let _ = writeln!(cameras, "{id} {model} {} {} {numbers}", k.width, k.height);
+    }
+    let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
+    let step = surfels.len().div_ceil(POINTS).max(1);
+    for (id, surfel) in (1..).zip(surfels.iter().step_by(step)) {
+        let [x, y, z] = surfel.position.as_vec3().to_array();
+        let [r, g, b] = crate::points::level(surfel.colour);
+        let _ = writeln!(points, "{id} {x} {y} {z} {r} {g} {b} 0");
+    }
+    [("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", points)]
+}
+
+/// COLMAP's model of a lens, and its parameters.
+fn colmap_model(k: &Intrinsics) -> (&'static str, Vec<f64>) {
+    let ([k1, k2, k3], [p1, p2]) = (k.distortion.radial, k.distortion.tangential);
+    let pinhole = [k.fx, k.fy, k.cx, k.cy];
+    if k.distortion.is_none() {
+        ("PINHOLE", pinhole.to_vec())
+    } else if k3 == 0.0 {
+        ("OPENCV", [&pinhole[..], &[k1, k2, p1, p2]].concat())
+    } else {
+        ("FULL_OPENCV", [&pinhole[..], &[k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]].concat())
+    }
+}
+
+/// Rotation and translation from the world to a camera with axes right, down, forward.
+fn world_to_camera(camera: &Camera) -> (DQuat, DVec3) {
+    let axes = camera.rotation();
+    let turned = DMat3::from_cols(axes.x_axis, -axes.y_axis, -axes.z_axis).transpose();
+    let rotation = DQuat::from_mat3(&turned).normalize();
+    (rotation, -(rotation * camera.centre()))
+}

@@ -1,0 +1,48 @@
+use rayon::prelude::*;
+
+use crate::seen::{SeenView, Sight};
+
+/// Views see one surface where they agree to so many pixel widths,
+const REACH: f64 = 2.0;
+/// and their normals to 45°: thin things have another side.
+const SAME_SIDE: f64 = 0.7;
+
+/// Moves what each view sees to the mean of what all views see of the same surface, and drops what
+/// more than a third of them look through: floaters, and fringes of edges.
+pub(crate) fn agree(views: &mut [SeenView]) {
+    let agreed: Vec<Vec<(usize, Option<f32>)>> = views
+        .par_iter()
+        .map(|view| view.surface().map(|(at, _)| (at, shift(views, view, at))).collect())
+        .collect();
+    for (view, agreed) in views.iter_mut().zip(agreed) {
+        for (at, shift) in agreed {
+            match shift {
+                Some(shift) => view.move_along_normal(at, shift),
+                None => view.forget(at),
+            }
+        }
+    }
+}
+
+/// How far a pixel's point is moved along its normal; `None` where it is dropped.
+fn shift(views: &[SeenView], view: &SeenView, at: usize) -> Option<f32> {
+    let (point, normal) = (view.world_point(at), view.world_normal(at));
+    let reach = (REACH * view.footprint(at)) as f32;
+    let (mut sum, mut weights, mut seen, mut looked_through) = (0.0, 0.0, 0, 0);
+    for other in views {
+        match other.look(point, reach) {
+            Sight::Surface { distance, cosine, index }
+                if other.world_normal(index).dot(normal) > SAME_SIDE =>
+            {
+                let weight = cosine.max(0.05);
+                sum += weight * distance;
+                weights += weight;
+                seen += 1;
+            }
+            Sight::Empty => looked_through += 1,
+            _ => {}
+        }
+    }
+    // It sees the point itself.
+    (2 * looked_through <= seen).then(|| -sum / weights)
+}

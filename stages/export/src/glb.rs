@@ -1,0 +1,86 @@
+use std::io::{self, Write};
+
+use glam::Vec3;
+use pixels::linear_from_srgb;
+use serde_json::{Value, json};
+
+use crate::mesh::Mesh;
+
+/// glTF's numbers for kinds of components and of buffers.
+const FLOAT: u32 = 5126;
+const UNSIGNED: u32 = 5125;
+const VERTICES: u32 = 34962;
+const INDICES: u32 = 34963;
+
+/// Writes a mesh as binary glTF 2.0, unlit: the colours hold the scene's light. glTF has linear
+/// colours, so `colours`, display-encoded sRGB of each vertex, are converted.
+pub(crate) fn write(file: &mut impl Write, mesh: &Mesh, colours: &[[f32; 3]]) -> io::Result<()> {
+    let linear = |v: f32| linear_from_srgb(f64::from(v)) as f32;
+    let colours: Vec<Vec3> = colours.iter().map(|c| Vec3::from(c.map(linear))).collect();
+    let mut text = serde_json::to_string(&description(mesh))?;
+    // Chunks have whole words.
+    while !text.len().is_multiple_of(4) {
+        text.push(' ');
+    }
+    let length = buffer_length(mesh);
+    file.write_all(b"glTF")?;
+    write_words(file, &[2, (28 + text.len() + length) as u32, text.len() as u32])?;
+    file.write_all(b"JSON")?;
+    file.write_all(text.as_bytes())?;
+    write_words(file, &[length as u32])?;
+    file.write_all(b"BIN\0")?;
+    for vector in mesh.positions.iter().chain(&mesh.normals).chain(&colours) {
+        crate::ply::write_floats(file, &vector.to_array())?;
+    }
+    mesh.triangles.iter().try_for_each(|triangle| write_words(file, triangle))
+}
+
+fn write_words(file: &mut impl Write, words: &[u32]) -> io::Result<()> {
+    words.iter().try_for_each(|word| file.write_all(&word.to_le_bytes()))
+}
+
+/// Bytes of all vertices and triangles.
+pub(crate) fn buffer_length(mesh: &Mesh) -> usize {
+    3 * 12 * mesh.positions.len() + 12 * mesh.triangles.len()
+}
+
+fn description(mesh: &Mesh) -> Value {
+    let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
+    let bound = |of: fn(Vec3, Vec3) -> Vec3| {
+        mesh.positions.iter().copied().reduce(of).unwrap_or_default().to_array()
+    };
+    let list = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": vertices, "type": "VEC3"});
+    let mut positions = list(0);
+    positions["min"] = json!(bound(Vec3::min));
+    positions["max"] = json!(bound(Vec3::max));
+    let indices = json!({"bufferView": 3, "componentType": UNSIGNED, "count": 3 * triangles,
+        "type": "SCALAR"});
+    let view = |first: usize, length: usize, target: u32| json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target});
+    let length = 12 * vertices;
+    json!({
+        "asset": {"version": "2.0", "generator": "nerf-sr export",
+            "extras": {"coordinates": crate::COORDINATES}},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "field"}],
+        "meshes": [{"primitives": [{
+            "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
+            "indices": 3,
+            "material": 0,
+        }]}],
+        "materials": [{
+            "doubleSided": true,
+            "extensions": {"KHR_materials_unlit": {}},
+            "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
+        }],
+        "accessors": [positions, list(1), list(2), indices],
+        "bufferViews": [
+            view(0, length, VERTICES),
+            view(length, length, VERTICES),
+            view(2 * length, length, VERTICES),
+            view(3 * length, 12 * triangles, INDICES),
+        ],
+        "buffers": [{"byteLength": buffer_length(mesh)}],
+    })
+}

@@ -1,0 +1,276 @@
+//! `export`: a trained field in files that other programs open.
+//!
+//! The field is rendered from the training cameras; all files are made of what these views see.
+//!
+//! * `points.ply`: coloured points with normals.
+//! * `splats.ply`: 3D Gaussians in the layout of 3DGS viewers.
+//! * `mesh.glb`: triangles with vertex colours, by fusing the views' depth.
+//! * `transforms.json`, `colmap/sparse/0/`: the cameras for instant-ngp, nerfstudio and COLMAP.
+//! * [`EXPORT_FILE`]: counts, and the coordinates in words.
+//!
+//! Coordinates, scale and orientation are those of the cameras given, which `prep` leaves as the
+//! data set has them. Camera axes are OpenGL's (x right, y up, looking along -z) in
+//! `transforms.json`, and COLMAP's (x right, y down, looking along z) in its model.
+
+mod cameras;
+mod colour;
+mod consensus;
+mod fusion;
+mod glb;
+mod lattice;
+mod mesh;
+mod ply;
+mod points;
+mod seen;
+mod splats;
+mod surface_nets;
+mod surfel;
+#[cfg(test)]
+mod tests;
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write as _};
+
+use anyhow::Context as _;
+use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
+use fields::Members;
+use scene::{Camera, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use lattice::Lattice;
+use mesh::Mesh;
+use seen::SeenView;
+
+/// What coordinates in all files are.
+pub(crate) const COORDINATES: &str =
+    "coordinates, scale and orientation are those of the input's cameras";
+
+/// Name of the summary in the artifact.
+pub const EXPORT_FILE: &str = "export.json";
+
+/// Pixels of all rendered views together, unless `size` is given.
+const PIXELS: f64 = 16e6;
+
+/// Parameters of `export`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Writes points with normals and colours, `points.ply`.
+    pub points: bool,
+    /// Writes 3D Gaussians, `splats.ply`.
+    pub splats: bool,
+    /// Writes a mesh with vertex colours, `mesh.glb`.
+    pub mesh: bool,
+    /// Writes the cameras as `transforms.json` and as COLMAP's text files.
+    pub cameras: bool,
+    /// Width at which the field is rendered from each camera. Default: the cameras' own, or less
+    /// where all views together would have more than 16 million pixels.
+    #[schemars(range(min = 1, max = 65536), extend("x-default" = "by cameras"))]
+    pub size: Option<u32>,
+    /// Maximum number of points and of splats.
+    #[schemars(range(min = 1, max = 20_000_000))]
+    pub max_points: u32,
+    /// Cells of the mesh's grid along the longest side of the field's box, or in NDC of its frustum.
+    #[schemars(range(min = 8, max = 1024))]
+    pub resolution: u32,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self {
+            points: true,
+            splats: true,
+            mesh: true,
+            cameras: true,
+            size: None,
+            max_points: 500_000,
+            resolution: 256,
+        }
+    }
+}
+
+/// `export.json`: what was written.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ExportSummary {
+    /// What coordinates in all files are.
+    pub coordinates: String,
+    /// Number of cameras.
+    pub cameras: usize,
+    /// Number of points in `points.ply`; 0 without this file.
+    pub points: usize,
+    /// Number of Gaussians in `splats.ply`; 0 without this file.
+    pub splats: usize,
+    /// Number of vertices in `mesh.glb`; 0 without this file.
+    pub vertices: usize,
+    /// Number of triangles in `mesh.glb`; 0 without this file.
+    pub triangles: usize,
+}
+
+/// The stage.
+pub struct Export;
+
+impl Stage for Export {
+    type Params = Params;
+    const NAME: &'static str = "export";
+    const SUMMARY: &'static str =
+        "Writes a field as points, Gaussian splats, mesh and cameras that other programs open.";
+    const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        let cameras = [
+            "scene/train-cameras",
+            "scene/cameras",
+            "scene/truth",
+            "scene/train",
+            "cameras",
+            "views",
+        ];
+        vec![
+            ("field", Input::required(&["field"], "a trained field")),
+            ("cameras", Input::required(&cameras, "folder with views.json: the training cameras")),
+        ]
+    }
+
+    fn output() -> Output {
+        Output::kind("export")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        if !(params.points || params.splats || params.mesh || params.cameras) {
+            let message = "nothing is to be written; set points, splats, mesh or cameras to true";
+            return Err(Failure::Usage(message.to_owned()).into());
+        }
+        let field = Members::read(context.input("field")?, &context.device)?;
+        let given = Views::read(context.input("cameras")?)?;
+        let cameras: Vec<Camera> = given.views.into_iter().map(|view| view.camera).collect();
+        let mut views = render(context, &field, &cameras, params.size)?;
+        consensus::agree(&mut views);
+        let job = ExportJob { context, params, field, cameras, views };
+        let mut summary = ExportSummary {
+            coordinates: COORDINATES.to_owned(),
+            cameras: job.cameras.len(),
+            points: 0,
+            splats: 0,
+            vertices: 0,
+            triangles: 0,
+        };
+        job.write_surfels(&mut summary)?;
+        if params.mesh {
+            context.check_interrupt()?;
+            job.write_mesh(&mut summary)?;
+        }
+        context.write_json(EXPORT_FILE, &summary)?;
+        context.write_summary(&in_words(&summary))
+    }
+}
+
+fn in_words(summary: &ExportSummary) -> String {
+    let counts =
+        [(summary.points, "points"), (summary.splats, "splats"), (summary.triangles, "triangles")];
+    let counts = counts.into_iter().filter(|(count, _)| *count > 0);
+    let mut words: Vec<String> =
+        counts.map(|(count, what)| format!("{} {what}", amount(count as u64))).collect();
+    words.push(counted(summary.cameras, "camera"));
+    words.join(", ")
+}
+
+/// Renders the field from every camera.
+fn render(
+    context: &Context,
+    field: &Members,
+    cameras: &[Camera],
+    width: Option<u32>,
+) -> anyhow::Result<Vec<SeenView>> {
+    let progress = context.progress("rendering", cameras.len() as u64);
+    let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
+    let most = (PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(1.0);
+    cameras
+        .iter()
+        .map(|camera| {
+            context.check_interrupt()?;
+            let own = f64::from(camera.intrinsics.width);
+            let scale = width.map_or(most, |width| f64::from(width) / own);
+            let side = |pixels: u32| (scale * f64::from(pixels)).round().max(1.0) as u32;
+            let resized =
+                camera.resized(side(camera.intrinsics.width), side(camera.intrinsics.height));
+            let view = SeenView::render(field, &resized, field.file.background)?;
+            progress.add(1);
+            Ok(view)
+        })
+        .collect()
+}
+
+struct ExportJob<'a> {
+    context: &'a Context,
+    params: &'a Params,
+    field: Members,
+    cameras: Vec<Camera>,
+    views: Vec<SeenView>,
+}
+
+impl ExportJob<'_> {
+    /// Points, splats and cameras.
+    fn write_surfels(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
+        let bounds = &self.field.file.bounds;
+        let surfels = surfel::merge(&self.views, bounds, self.params.max_points as usize);
+        if surfels.is_empty() {
+            return Err(no_surface());
+        }
+        if self.params.points {
+            self.write("points.ply", |file| points::write(file, &surfels))?;
+            summary.points = surfels.len();
+        }
+        if self.params.splats {
+            self.write("splats.ply", |file| splats::write(file, &surfels))?;
+            summary.splats = surfels.len();
+        }
+        if self.params.cameras {
+            let points = self.params.points.then_some("points.ply");
+            let file = cameras::transforms(&self.cameras, points);
+            self.context.write_json("transforms.json", &file)?;
+            for (name, text) in cameras::colmap(&self.cameras, &surfels) {
+                self.write(&format!("colmap/sparse/0/{name}"), |file| {
+                    file.write_all(text.as_bytes())
+                })?;
+            }
+        }
+        Ok(())
+    }
+
+    fn write_mesh(&self, summary: &mut ExportSummary) -> anyhow::Result<()> {
+        let lattice = Lattice::new(&self.field.file.bounds, self.params.resolution);
+        let values = fusion::fuse(&self.views, &lattice);
+        let mut mesh: Mesh = surface_nets::extract(&lattice, &values);
+        mesh.drop_small_pieces();
+        mesh.find_normals();
+        if mesh.triangles.is_empty() {
+            return Err(no_surface());
+        }
+        let colours = colour::colours(&self.field, &self.views, &mesh, &lattice)?;
+        self.write("mesh.glb", |file| glb::write(file, &mesh, &colours))?;
+        (summary.vertices, summary.triangles) = (mesh.positions.len(), mesh.triangles.len());
+        Ok(())
+    }
+
+    /// Writes a file of the output.
+    fn write(
+        &self,
+        file: &str,
+        write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+    ) -> anyhow::Result<()> {
+        let path = self.context.output_path(file)?;
+        let written = || {
+            let mut out = BufWriter::new(File::create(&path)?);
+            write(&mut out)?;
+            out.flush()
+        };
+        written().with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+fn no_surface() -> anyhow::Error {
+    let message = "input field: no camera sees a surface inside its bounds; train it longer";
+    Failure::BadInput(message.to_owned()).into()
+}

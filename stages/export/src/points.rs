@@ -1,0 +1,27 @@
+use std::io::{self, Write};
+
+use crate::ply::{Kind, write_floats, write_header};
+use crate::surfel::Surfel;
+
+/// Writes points with normals and 8-bit colours, display-encoded sRGB.
+pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()> {
+    let named = |names: [&str; 3], kind| names.map(|name| (name.to_owned(), kind));
+    let properties = [
+        named(["x", "y", "z"], Kind::Float),
+        named(["nx", "ny", "nz"], Kind::Float),
+        named(["red", "green", "blue"], Kind::Byte),
+    ]
+    .concat();
+    write_header(file, &[crate::COORDINATES.to_owned()], surfels.len(), &properties)?;
+    for surfel in surfels {
+        write_floats(file, &surfel.position.as_vec3().to_array())?;
+        write_floats(file, &surfel.normal.as_vec3().to_array())?;
+        file.write_all(&level(surfel.colour))?;
+    }
+    Ok(())
+}
+
+/// A colour in 8 bits.
+pub(crate) fn level(colour: [f32; 3]) -> [u8; 3] {
+    colour.map(|v| (255.0 * v.clamp(0.0, 1.0) + 0.5) as u8)
+}

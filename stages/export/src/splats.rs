@@ -1,0 +1,54 @@
+use std::io::{self, Write};
+
+use glam::{DQuat, DVec3};
+
+use crate::ply::{Kind, write_floats, write_header};
+use crate::surfel::Surfel;
+
+/// The constant spherical harmonic.
+const HARMONIC: f32 = 0.282_094_79;
+
+/// Standard deviation of a disc along its surface, over the distance of neighbours.
+const RADIUS: f64 = 0.35;
+/// Standard deviation along the normal, over that.
+const FLATNESS: f64 = 0.1;
+/// Optical depth of a surface at the size at which the views see it, for one disc in each square of
+/// that distance; there are more. More of it widens edges, since viewers blur splats.
+const DEPTH: f64 = 0.75;
+/// Variance of that blur, in square pixels.
+const BLUR: f64 = 0.3;
+/// Opacities written: a logit of 1 is infinite.
+const OPACITIES: [f64; 2] = [0.02, 0.99];
+
+/// Writes surfels as 3D Gaussians, in the PLY layout of Kerbl et al. 2023: position, normal, colour
+/// as coefficient of the constant spherical harmonic, opacity as logit, standard deviations as
+/// logarithms, rotation as quaternion with the real part first.
+pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()> {
+    let names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 \
+        rot_2 rot_3";
+    let properties: Vec<_> =
+        names.split_whitespace().map(|name| (name.to_owned(), Kind::Float)).collect();
+    write_header(file, &[crate::COORDINATES.to_owned()], surfels.len(), &properties)?;
+    surfels.iter().try_for_each(|surfel| write_floats(file, &splat(surfel)))
+}
+
+/// The numbers of a splat: a disc whose third axis is the normal.
+fn splat(surfel: &Surfel) -> [f32; 17] {
+    let [x, y, z] = surfel.position.as_vec3().to_array();
+    let [nx, ny, nz] = surfel.normal.as_vec3().to_array();
+    let [r, g, b] = surfel.colour.map(|v| (v - 0.5) / HARMONIC);
+    let opacity = opacity(surfel);
+    let along = RADIUS * surfel.spacing;
+    let [along, across] = [along, FLATNESS * along].map(|deviation| deviation.ln() as f32);
+    let turn = DQuat::from_rotation_arc(DVec3::Z, surfel.normal).as_quat();
+    let logit = (opacity / (1.0 - opacity)).ln() as f32;
+    [x, y, z, nx, ny, nz, r, g, b, logit, along, along, across, turn.w, turn.x, turn.y, turn.z]
+}
+
+/// Opacity of one of several discs that lie over each other in a pixel.
+fn opacity(surfel: &Surfel) -> f64 {
+    let share = surfel.spacing / surfel.footprint;
+    let spread = std::f64::consts::TAU * (BLUR + (RADIUS * share).powi(2));
+    let each = DEPTH * share * share / spread;
+    (f64::from(surfel.opacity) * each).clamp(OPACITIES[0], OPACITIES[1])
+}

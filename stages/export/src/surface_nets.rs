@@ -1,0 +1,106 @@
+use glam::{DVec3, Vec3};
+
+use crate::lattice::Lattice;
+use crate::mesh::Mesh;
+
+/// Extracts the surface between places with values below 0, inside, and above (naive surface nets,
+/// Gibson 1998): a vertex in each cell that the surface passes, at the mean of its crossings with the
+/// cell's edges, and a quad around each crossed edge of the lattice. NaN is unknown: no surface
+/// ends there.
+pub(crate) fn extract(lattice: &Lattice, values: &[f32]) -> Mesh {
+    let cells = Cells { lattice, values, strides: lattice.strides() };
+    let mut mesh = Mesh::default();
+    let [nx, ny, nz] = lattice.counts;
+    let mut vertices = vec![u32::MAX; values.len()];
+    for k in 0..nz - 1 {
+        for j in 0..ny - 1 {
+            for i in 0..nx - 1 {
+                if let Some(place) = cells.vertex([i, j, k]) {
+                    vertices[cells.index([i, j, k])] = mesh.positions.len() as u32;
+                    mesh.positions.push(place);
+                }
+            }
+        }
+    }
+    for k in 0..nz {
+        for j in 0..ny {
+            for i in 0..nx {
+                for axis in 0..3 {
+                    cells.add_quad([i, j, k], axis, &vertices, &mut mesh.triangles);
+                }
+            }
+        }
+    }
+    mesh
+}
+
+struct Cells<'a> {
+    lattice: &'a Lattice,
+    values: &'a [f32],
+    strides: [usize; 3],
+}
+
+impl Cells<'_> {
+    fn index(&self, cell: [usize; 3]) -> usize {
+        (0..3).map(|axis| cell[axis] * self.strides[axis]).sum()
+    }
+
+    /// Where between two places the surface is, as a share of the way.
+    fn crossing(&self, from: usize, to: usize) -> Option<f64> {
+        let (a, b) = (self.values[from], self.values[to]);
+        let is_crossed = (a < 0.0 && b >= 0.0) || (a >= 0.0 && b < 0.0);
+        is_crossed.then(|| f64::from(a) / (f64::from(a) - f64::from(b)))
+    }
+
+    /// The vertex of a cell, by its lowest corner.
+    fn vertex(&self, cell: [usize; 3]) -> Option<Vec3> {
+        let base = self.index(cell);
+        let (mut sum, mut count) = (DVec3::ZERO, 0);
+        for axis in 0..3 {
+            let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+            for corner in 0..4 {
+                let (along_u, along_v) = (corner & 1, corner >> 1);
+                let from = base + along_u * self.strides[u] + along_v * self.strides[v];
+                if let Some(share) = self.crossing(from, from + self.strides[axis]) {
+                    sum[axis] += share;
+                    sum[u] += along_u as f64;
+                    sum[v] += along_v as f64;
+                    count += 1;
+                }
+            }
+        }
+        let place = || sum / f64::from(count) + DVec3::from(cell.map(|i| i as f64));
+        (count > 0).then(|| self.lattice.point(place().to_array()).as_vec3())
+    }
+
+    /// Two triangles among the four cells around the edge from a place along an axis, where the
+    /// surface crosses it.
+    fn add_quad(
+        &self,
+        from: [usize; 3],
+        axis: usize,
+        vertices: &[u32],
+        triangles: &mut Vec<[u32; 3]>,
+    ) {
+        let [u, v] = [(axis + 1) % 3, (axis + 2) % 3];
+        let counts = self.lattice.counts;
+        let is_inner = |axis: usize| from[axis] > 0 && from[axis] + 1 < counts[axis];
+        if from[axis] + 1 >= counts[axis] || !is_inner(u) || !is_inner(v) {
+            return;
+        }
+        let at = self.index(from);
+        if self.crossing(at, at + self.strides[axis]).is_none() {
+            return;
+        }
+        // Counter-clockwise, seen from the axis' positive end.
+        let around = [
+            at - self.strides[u] - self.strides[v],
+            at - self.strides[v],
+            at,
+            at - self.strides[u],
+        ];
+        let [a, b, c, d] = around.map(|cell| vertices[cell]);
+        let is_outwards = (self.values[at] < 0.0) != self.lattice.is_mirrored();
+        triangles.extend(if is_outwards { [[a, b, c], [a, c, d]] } else { [[a, c, b], [a, d, c]] });
+    }
+}

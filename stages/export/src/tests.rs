@@ -1,0 +1,326 @@
+//! Everything on a ball that is known exactly.
+
+use dataset::Dataset;
+use glam::{DMat3, DVec3};
+use radiance::{Pixel, Ray, RayField, RenderError};
+use scene::{Background, Bounds, Camera, Distortion, Frustum, Intrinsics, Space};
+
+use crate::lattice::Lattice;
+use crate::mesh::Mesh;
+use crate::seen::SeenView;
+use crate::surfel::Surfel;
+use crate::{cameras, fusion, glb, points, splats, surface_nets, surfel};
+
+/// A ball around the origin: red on the side of +x, blue on the other.
+struct Ball;
+
+const RADIUS: f64 = 0.7;
+
+impl RayField for Ball {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        Ok(rays.iter().map(ball_pixel).collect())
+    }
+}
+
+fn ball_pixel(ray: &Ray) -> Pixel {
+    let [origin, direction] = [ray.origin, ray.direction].map(|v| DVec3::from(v.map(f64::from)));
+    let along = -origin.dot(direction);
+    let under = RADIUS * RADIUS - (origin + along * direction).length_squared();
+    if under < 0.0 {
+        return Pixel { colour: ray.background, depth: 9.0, median_depth: 9.0, ..Pixel::default() };
+    }
+    let distance = along - under.sqrt();
+    let is_red = origin.x + distance * direction.x > 0.0;
+    let colour = if is_red { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] };
+    let depth = distance as f32;
+    Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
+}
+
+const BOX: Bounds =
+    Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, space: Space::Box };
+
+/// Cameras around the origin at distance 3; `up` is the lowest height that they have.
+fn around(count: u32, lowest: f64) -> Vec<Camera> {
+    let camera = |i: u32| {
+        let share = (f64::from(i) + 0.5) / f64::from(count);
+        let (height, angle) = (lowest + (0.98 - lowest) * share, 2.4 * f64::from(i));
+        let level = (1.0 - height * height).sqrt();
+        let back = DVec3::new(level * angle.cos(), level * angle.sin(), height);
+        let right = DVec3::Z.cross(back).normalize();
+        let up = back.cross(right);
+        Camera {
+            name: format!("v {i}"),
+            intrinsics: Intrinsics::from_angle_x(96, 80, 0.6),
+            camera_to_world: [0, 1, 2].map(|k| [right[k], up[k], back[k], 3.0 * back[k]]),
+        }
+    };
+    (0..count).map(camera).collect()
+}
+
+fn views(cameras: &[Camera]) -> Vec<SeenView> {
+    cameras.iter().map(|c| SeenView::render(&Ball, c, Background::White).unwrap()).collect()
+}
+
+fn fused(views: &[SeenView], cells: u32) -> Mesh {
+    let lattice = Lattice::new(&BOX, cells);
+    let mut mesh = surface_nets::extract(&lattice, &fusion::fuse(views, &lattice));
+    mesh.drop_small_pieces();
+    mesh.find_normals();
+    mesh
+}
+
+/// Edges with one triangle alone.
+fn open_edges(mesh: &Mesh) -> usize {
+    let mut edges: Vec<[u32; 2]> = mesh
+        .triangles
+        .iter()
+        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+        .map(|[a, b]| [a.min(b), a.max(b)])
+        .collect();
+    edges.sort_unstable();
+    edges.chunk_by(|a, b| a == b).filter(|same| same.len() == 1).count()
+}
+
+/// The volume inside, above 0 where triangles are counter-clockwise seen from outside.
+fn volume(mesh: &Mesh) -> f64 {
+    let volume = |t: &[u32; 3]| {
+        let [a, b, c] = t.map(|v| mesh.positions[v as usize].as_dvec3());
+        a.dot(b.cross(c)) / 6.0
+    };
+    mesh.triangles.iter().map(volume).sum()
+}
+
+const BALL_VOLUME: f64 = 4.0 / 3.0 * std::f64::consts::PI * RADIUS * RADIUS * RADIUS;
+
+#[test]
+fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
+    let pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]];
+    let (near, far) = (2.5, 9.0);
+    let frustum = Frustum { camera_to_world: pose, min: [-0.4; 2], max: [0.4; 2], near, far };
+    for space in [Space::Box, Space::Ndc(frustum)] {
+        let lattice = Lattice::new(&Bounds { space, ..BOX }, 48);
+        let [nx, ny, _] = lattice.counts;
+        let value = |i: usize| {
+            let place = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
+            (lattice.point(place).length() - RADIUS) as f32
+        };
+        let values: Vec<f32> = (0..lattice.len()).map(value).collect();
+        let mut mesh = surface_nets::extract(&lattice, &values);
+        mesh.find_normals();
+        assert_eq!(open_edges(&mesh), 0, "{space:?}");
+        assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{space:?}: {}", volume(&mesh));
+        for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
+            assert!((f64::from(p.length()) - RADIUS).abs() < 4e-3, "{space:?}: {p}");
+            assert!(p.normalize().dot(*n) > 0.9, "{space:?}: {p} {n}");
+        }
+    }
+}
+
+#[test]
+fn places_of_a_lattice_come_back() {
+    let pose = [[0.0, 0.0, 1.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 4.0]];
+    let (near, far) = (0.5, 90.0);
+    let frustum = Frustum { camera_to_world: pose, min: [-0.9, -0.6], max: [0.8, 0.7], near, far };
+    for space in [Space::Box, Space::Ndc(frustum), Space::Contraction] {
+        let lattice = Lattice::new(&Bounds { space, ..BOX }, 20);
+        let place = [3.0, 1.5, 2.25];
+        let back = lattice.place(lattice.point(place));
+        assert!((DVec3::from(back) - DVec3::from(place)).length() < 1e-9, "{space:?}: {back:?}");
+    }
+}
+
+#[test]
+fn fused_depth_is_the_ball() {
+    let mesh = fused(&views(&around(24, -0.95)), 64);
+    assert_eq!(open_edges(&mesh), 0);
+    assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{}", volume(&mesh));
+    let off = mesh.positions.iter().map(|p| (f64::from(p.length()) - RADIUS).abs());
+    let mean = off.sum::<f64>() / mesh.positions.len() as f64;
+    // Pixels are 0.015 wide there.
+    assert!(mean < 6e-3, "{mean}");
+}
+
+/// Cameras above alone: there is no surface where none looks.
+#[test]
+fn the_unseen_side_stays_open() {
+    let mesh = fused(&views(&around(24, 0.05)), 64);
+    assert!(open_edges(&mesh) > 50, "{}", open_edges(&mesh));
+    for p in &mesh.positions {
+        assert!((f64::from(p.length()) - RADIUS).abs() < 0.08, "{p}");
+    }
+}
+
+#[test]
+fn surfels_lie_on_the_ball_and_face_outwards() {
+    let views = views(&around(24, -0.95));
+    let all = surfel::merge(&views, &BOX, 1_000_000);
+    let few = surfel::merge(&views, &BOX, 2_000);
+    assert!(all.len() > 10_000 && (1_500..=2_000).contains(&few.len()), "{}", few.len());
+    for surfel in all.iter().chain(&few) {
+        let Surfel { position, normal, colour, opacity, spacing, .. } = *surfel;
+        assert!((position.length() - RADIUS).abs() < 0.02, "{position}");
+        assert!(normal.dot(position.normalize()) > 0.9 && opacity == 1.0 && spacing > 0.0);
+        if position.x.abs() > 0.1 {
+            assert_eq!(colour, if position.x > 0.0 { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] });
+        }
+    }
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same() {
+    let with = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let views = views(&around(9, -0.5));
+            (fused(&views, 40), surfel::merge(&views, &BOX, 5_000))
+        })
+    };
+    assert!(with(1) == with(3));
+}
+
+#[test]
+fn pieces_of_a_few_triangles_go() {
+    let mut mesh = fused(&views(&around(24, -0.95)), 64);
+    let whole = mesh.clone();
+    let first = mesh.positions.len() as u32;
+    mesh.positions.extend([glam::Vec3::X, glam::Vec3::Y, glam::Vec3::Z]);
+    mesh.triangles.insert(0, [first, first + 1, first + 2]);
+    mesh.drop_small_pieces();
+    assert!(mesh.positions == whole.positions && mesh.triangles == whole.triangles);
+}
+
+fn one_surfel() -> Surfel {
+    Surfel {
+        position: DVec3::new(1.0, 2.0, 3.0),
+        normal: DVec3::new(0.0, -1.0, 0.0),
+        colour: [1.0, 0.5, 0.0],
+        opacity: 0.75,
+        spacing: 0.1,
+        footprint: 0.05,
+    }
+}
+
+/// Header and numbers of a PLY file.
+fn ply(bytes: &[u8]) -> (String, Vec<u8>) {
+    let end = b"end_header\n";
+    let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
+    (String::from_utf8(bytes[..at].to_vec()).unwrap(), bytes[at..].to_vec())
+}
+
+#[test]
+fn points_have_normals_and_colours() {
+    let mut bytes = Vec::new();
+    points::write(&mut bytes, &[one_surfel()]).unwrap();
+    let (header, data) = ply(&bytes);
+    assert!(header.contains("\nelement vertex 1\nproperty float x\n"), "{header}");
+    assert!(
+        header.ends_with(
+            "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+        )
+    );
+    let floats: Vec<u8> =
+        [1.0f32, 2.0, 3.0, 0.0, -1.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
+    assert_eq!(data, [&floats[..], &[255, 128, 0]].concat());
+}
+
+#[test]
+fn splats_are_discs_across_their_normal() {
+    let mut bytes = Vec::new();
+    splats::write(&mut bytes, &[one_surfel()]).unwrap();
+    let (header, data) = ply(&bytes);
+    let names: Vec<&str> =
+        header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
+    let numbers: Vec<f64> =
+        data.as_chunks::<4>().0.iter().map(|b| f64::from(f32::from_le_bytes(*b))).collect();
+    assert_eq!(names.len(), numbers.len());
+    let of = |name: &str| numbers[names.iter().position(|n| *n == name).unwrap()];
+    // Twice as far apart as pixels are wide; 0.75 of what 0.75 optical depths need.
+    assert!((1.0 / (1.0 + (-of("opacity")).exp()) - 0.453).abs() < 1e-3);
+    let colour = |c: i32| 0.5 + 0.282_094_79 * of(&format!("f_dc_{c}"));
+    assert!((colour(0) - 1.0).abs() < 1e-6 && (colour(2)).abs() < 1e-6);
+    let turn = glam::DQuat::from_xyzw(of("rot_1"), of("rot_2"), of("rot_3"), of("rot_0"));
+    assert!((turn * DVec3::Z).dot(DVec3::NEG_Y) > 1.0 - 1e-6);
+    assert!(of("scale_0") == of("scale_1") && of("scale_2") < of("scale_0") - 1.0);
+}
+
+#[test]
+fn glb_chunks_hold_what_the_json_says() {
+    let mesh = fused(&views(&around(9, -0.5)), 24);
+    let colours = vec![[1.0, 0.5, 0.0]; mesh.positions.len()];
+    let mut bytes = Vec::new();
+    glb::write(&mut bytes, &mesh, &colours).unwrap();
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+    assert_eq!((&bytes[..4], word(4), word(8)), (&b"glTF"[..], 2, bytes.len()));
+    let text = word(12);
+    let json: serde_json::Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
+    assert_eq!(word(20 + text), bytes.len() - 28 - text);
+    assert_eq!(json["buffers"][0]["byteLength"], glb::buffer_length(&mesh));
+    let views = json["bufferViews"].as_array().unwrap();
+    let end =
+        views.iter().map(|v| v["byteOffset"].as_u64().unwrap() + v["byteLength"].as_u64().unwrap());
+    assert_eq!(end.max().unwrap() as usize, glb::buffer_length(&mesh));
+    // 50 % display-encoded are 21.4 % of the light.
+    let first = 28 + text + views[2]["byteOffset"].as_u64().unwrap() as usize;
+    assert!((f32::from_bits(word(first + 4) as u32) - 0.2140).abs() < 1e-3);
+}
+
+/// A folder with images of the cameras' size, where `transforms.json` and COLMAP look for them.
+fn folder(cameras: &[Camera]) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::create_dir(folder.path().join("images")).unwrap();
+    for camera in cameras {
+        let k = camera.intrinsics;
+        let (width, height) = (k.width as usize, k.height as usize);
+        let image = pixels::Rgba8::new(width, height, vec![255; width * height * 4]);
+        let file = folder.path().join(format!("images/{}.png", camera.name));
+        pixels::write_png(&file, &image).unwrap();
+    }
+    folder
+}
+
+fn assert_same(set: &Dataset, cameras: &[Camera]) {
+    assert_eq!(set.frames.len(), cameras.len());
+    for camera in cameras {
+        let frame = set.frames.iter().find(|f| f.name == camera.name).unwrap();
+        assert_eq!(frame.taken_with, camera.intrinsics);
+        let off =
+            |r: usize, c: usize| (frame.camera_to_world[r][c] - camera.camera_to_world[r][c]).abs();
+        assert!((0..12).all(|i| off(i / 4, i % 4) < 1e-12), "{}", camera.name);
+    }
+}
+
+#[test]
+fn cameras_come_back_from_both_files() {
+    let plain = around(7, -0.9);
+    let mut mixed = plain.clone();
+    let distortion = Distortion { radial: [0.1, -0.01, 0.0], tangential: [0.001, 0.002] };
+    mixed[2].intrinsics.distortion = distortion;
+    mixed[4].intrinsics.cx += 3.5;
+    // As published poses are: rounded.
+    mixed[5].camera_to_world = plain[5].camera_to_world.map(|row| row.map(|v| f64::from(v as f32)));
+    for cameras in [plain, mixed] {
+        let folder = folder(&cameras);
+        let text = cameras::transforms(&cameras, Some("points.ply")).to_string();
+        std::fs::write(folder.path().join("transforms.json"), text).unwrap();
+        assert_same(&Dataset::read(folder.path()).unwrap(), &cameras);
+        std::fs::remove_file(folder.path().join("transforms.json")).unwrap();
+        let sparse = folder.path().join("sparse/0");
+        std::fs::create_dir_all(&sparse).unwrap();
+        for (name, text) in cameras::colmap(&cameras, &[one_surfel()]) {
+            std::fs::write(sparse.join(name), text).unwrap();
+        }
+        let set = Dataset::read(folder.path()).unwrap();
+        assert!(set.notes[0].starts_with("COLMAP"), "{:?}", set.notes);
+        let rounded: Vec<Camera> = cameras.iter().map(orthonormal).collect();
+        assert_same(&set, &rounded);
+    }
+}
+
+/// A camera's nearest rotation that a quaternion can say: what COLMAP's files hold.
+fn orthonormal(camera: &Camera) -> Camera {
+    let turn = glam::DQuat::from_mat3(&camera.rotation()).normalize();
+    let r = DMat3::from_quat(turn);
+    let at = camera.centre();
+    let camera_to_world = [0, 1, 2].map(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], at[k]]);
+    Camera { camera_to_world, ..camera.clone() }
+}

@@ -1,0 +1,148 @@
+// Uses a report page as a reader would, on a phone and a desktop, light and dark: page.mjs PAGE
+//
+// Prints for each of the four what was wrong (`problems`) and what the page said (`numbers`: by view, result and
+// figure; `summary`).
+import { accessibilityFindings, open, report } from "./browser.mjs";
+
+const PAGE = process.argv[2];
+const SIZES = [390, 1440].flatMap((width) =>
+  [false, true].map((dark) => ({ width, dark, height: width === 390 ? 844 : 900 })),
+)
+  .filter(({ width, dark }) => process.argv[3] !== "some" || (width === 390) === dark);
+
+async function look(browser, size) {
+  const { page, problems } = await open(browser, PAGE, size);
+  const expect = (isRight, words) => isRight || problems.push(words);
+  const found = { size, problems, summary: await page.locator(".summary dd").allTextContents() };
+  found.title = await page.locator("h1").textContent();
+  if (await page.locator("#viewer").isVisible()) {
+    found.numbers = await compare(page, expect);
+    await zoom(page, expect);
+    await arrange(page, expect);
+    await pick(page, expect);
+  }
+  await followGraph(page, expect);
+  const isWide = await page.evaluate(() => document.documentElement.scrollWidth > innerWidth);
+  expect(!isWide, "the page scrolls sideways");
+  for (const details of await page.locator("details").all()) await details.evaluate((element) => (element.open = true));
+  problems.push(...(await accessibilityFindings(page)));
+  expect(
+    !(await page.evaluate(() => document.documentElement.scrollWidth > innerWidth)),
+    "the open page scrolls sideways",
+  );
+  await page.context().close();
+  return found;
+}
+
+/** The numbers under the pictures, as a table's rows. */
+const readNumbers = (page) =>
+  page.locator("#numbers").evaluate((table) => {
+    const figures = [...table.querySelectorAll("thead th")].slice(1).map((cell) => cell.textContent);
+    const row = (line) => [
+      line.cells[0].textContent,
+      Object.fromEntries(figures.map((name, i) => [name, line.cells[i + 1].textContent])),
+    ];
+    return Object.fromEntries([...table.querySelectorAll("tbody tr")].map(row));
+  });
+
+const options = (page, id) => page.locator(`#${id} option`).evaluateAll((all) => all.map((option) => option.value));
+/** Of a hundred methods the first and the last. */
+const ends = (all) => [...all.slice(0, 6), ...all.slice(-6)].filter((value, i, some) => some.indexOf(value) === i);
+const sources = (page) => page.locator("#stage img").evaluateAll((all) => all.map((image) => image.src));
+const division = (page) =>
+  page
+    .locator("#stage .half")
+    .nth(1)
+    .evaluate((half) => half.style.clipPath);
+
+/** Moves the division, and goes through all views and methods. */
+async function compare(page, expect) {
+  const before = await division(page);
+  await page.locator("#split").press("Home");
+  const home = await division(page);
+  const pane = page.locator("#stage .pane");
+  await pane.hover({ position: { x: 60, y: 60 } });
+  await page.mouse.down();
+  await page.mouse.move((await pane.boundingBox()).x + 100, 300, { steps: 4 });
+  await page.mouse.up();
+  expect(new Set([before, home, await division(page)]).size === 3, `the division stays at ${before}`);
+  const numbers = {};
+  for (const view of await options(page, "view")) {
+    await page.locator("#view").selectOption(view);
+    const name = await page.locator("#view option:checked").textContent();
+    numbers[name] = {};
+    const seen = new Set();
+    for (const layer of ends(await options(page, "right"))) {
+      await page.locator("#right").selectOption(layer);
+      seen.add((await sources(page))[0]);
+      Object.assign(numbers[name], await readNumbers(page));
+    }
+    expect(seen.size > 2, `${name} has ${seen.size} pictures`);
+    const isBroken = await page.locator("#stage img").evaluateAll(async (all) => {
+      await Promise.all(all.map((image) => image.decode().catch(() => {})));
+      return all.some((image) => !image.naturalWidth);
+    });
+    expect(!isBroken, `a picture of ${name} can't be decoded`);
+  }
+  return numbers;
+}
+
+/** Zoom and pan stay when the view changes. */
+async function zoom(page, expect) {
+  const transform = () =>
+    page
+      .locator("#stage img")
+      .first()
+      .evaluate((image) => image.style.transform);
+  const fit = await transform();
+  await page.locator("#stage").press("+");
+  await page.locator("#stage").press("ArrowRight");
+  const near = await transform();
+  await page.locator("#next").click();
+  expect(near !== fit && (await transform()) === near, `zoom: ${fit}, ${near}, ${await transform()}`);
+  await page.locator("#fit").click();
+  expect((await transform()) === fit, "fit doesn't fit");
+}
+
+async function arrange(page, expect) {
+  await page.locator("#grid-mode").click();
+  expect((await page.locator("#stage .pane").count()) > 1, "nothing stands side by side");
+  await page.locator("#slider-mode").click();
+  expect((await page.locator("#stage .pane").count()) === 1, "the slider doesn't come back");
+}
+
+/** A click on a plot of all views shows the view. */
+async function pick(page, expect) {
+  const plot = page.locator(".plot").first();
+  if (!(await page.locator(".chart figcaption", { hasText: "of every view" }).count())) return;
+  await page.locator("#view").selectOption({ index: 0 });
+  const before = await page.locator("#view").inputValue();
+  await plot.focus();
+  for (const key of ["ArrowRight", "ArrowRight"]) await plot.press(key);
+  const text = await plot.locator(".tip").textContent();
+  await plot.press("Enter");
+  const name = await page.locator("#view option:checked").textContent();
+  expect(
+    text.startsWith(`${name}`) && (await page.locator("#view").inputValue()) !== before,
+    `the plot picks ${name} for ${text}`,
+  );
+}
+
+/** A box of the graph opens what is known of its stage. */
+async function followGraph(page, expect) {
+  const boxes = page.locator(".graph a");
+  if (!(await boxes.count())) return expect(false, "there is no graph");
+  await boxes.last().focus();
+  await page.keyboard.press("Enter");
+  const isOpen = await page
+    .locator("details.stage")
+    .last()
+    .evaluate((details) => details.open);
+  expect(isOpen, "a box of the graph opens nothing");
+}
+
+await report({}, async (browser) => {
+  const looks = [];
+  for (const size of SIZES) looks.push(await look(browser, size));
+  return looks;
+});

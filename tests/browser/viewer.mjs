@@ -1,0 +1,56 @@
+// Compares a viewer's page with rendered views: viewer.mjs PAGE VIEWS [PNG FOLDER]
+//
+// VIEWS is an artifact of render-depth. For each of its views, prints the PSNR of the page's view from the same camera in
+// dB, that of its mirror image, texture reads a pixel and milliseconds. With a folder, writes the page's views there.
+import { mkdirSync, readFileSync, writeFileSync } from "node:fs";
+import { accessibilityFindings, open, report } from "./browser.mjs";
+
+const [file, folder, written] = process.argv.slice(2);
+
+/** In the page: draws a camera's view and compares it with a PNG. */
+async function compared({ camera, expected }) {
+  const viewer = await window.viewer;
+  const pixelsOf = async (url, isMirrored = false) => {
+    const image = new Image();
+    image.src = url;
+    await image.decode();
+    const { width, height } = image;
+    const context = new OffscreenCanvas(width, height).getContext("2d");
+    if (isMirrored) context.setTransform(-1, 0, 0, 1, width, 0);
+    context.drawImage(image, 0, 0);
+    return context.getImageData(0, 0, width, height).data;
+  };
+  const psnr = (a, b) => {
+    let sum = 0;
+    for (let i = 0; i < a.length; i++) sum += i % 4 < 3 ? (a[i] - b[i]) ** 2 : 0;
+    return 10 * Math.log10((255 ** 2 * 0.75 * a.length) / sum);
+  };
+  await viewer.show(camera);
+  const milliseconds = await viewer.show(camera);
+  const image = viewer.image(camera);
+  const own = await pixelsOf(expected);
+  return {
+    name: camera.name,
+    psnr: psnr(own, await pixelsOf(image)),
+    mirrored: psnr(own, await pixelsOf(image, true)),
+    reads: viewer.reads(camera),
+    milliseconds,
+    image,
+  };
+}
+
+await report({ webgl: true }, async (browser) => {
+  const { page, problems } = await open(browser, file, { width: 512, height: 512 });
+  const { views } = JSON.parse(readFileSync(`${folder}/views.json`, "utf8"));
+  const results = [];
+  for (const { camera } of views) {
+    const png = readFileSync(`${folder}/previews/${camera.name}.png`).toString("base64");
+    const { image, ...result } = await page.evaluate(compared, { camera, expected: `data:image/png;base64,${png}` });
+    results.push(result);
+    if (written) {
+      mkdirSync(written, { recursive: true });
+      writeFileSync(`${written}/${camera.name}.png`, Buffer.from(image.split(",")[1], "base64"));
+    }
+  }
+  return { views: results, problems: [...problems, ...(await accessibilityFindings(page))] };
+});

@@ -1,0 +1,162 @@
+//! How near an exported surface is to the demo scene's own, which is known exactly.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use demo_scene::World;
+use glam::DVec3;
+use scene::Camera;
+use serde_json::Value;
+
+/// A binary glTF file with one mesh.
+pub struct Glb {
+    /// The JSON chunk.
+    pub description: Value,
+    /// Vertices.
+    pub positions: Vec<DVec3>,
+    /// Their normals.
+    pub normals: Vec<DVec3>,
+    /// Their linear colours.
+    pub colours: Vec<DVec3>,
+    /// Vertices of each triangle.
+    pub triangles: Vec<[usize; 3]>,
+}
+
+impl Glb {
+    /// Reads a file.
+    pub fn read(path: &Path) -> Self {
+        let bytes = std::fs::read(path).unwrap();
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+        assert!(&bytes[..4] == b"glTF" && word(4) == 2 && word(8) == bytes.len());
+        let text = word(12);
+        assert!(&bytes[16..20] == b"JSON" && text % 4 == 0);
+        let description: Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
+        let first = 28 + text;
+        assert!(&bytes[first - 4..first] == b"BIN\0" && word(first - 8) == bytes.len() - first);
+        let words = |accessor: &Value| -> Vec<[u8; 4]> {
+            let accessor = &description["accessors"][accessor.as_u64().unwrap() as usize];
+            let view =
+                &description["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+            let [offset, length] =
+                ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
+            let part = &bytes[first + offset..first + offset + length];
+            part.as_chunks::<4>().0.to_vec()
+        };
+        let primitive = &description["meshes"][0]["primitives"][0];
+        let vectors = |name: &str| -> Vec<DVec3> {
+            let words = words(&primitive["attributes"][name]);
+            let number = |word: [u8; 4]| f64::from(f32::from_le_bytes(word));
+            words.as_chunks::<3>().0.iter().map(|v| DVec3::from(v.map(number))).collect()
+        };
+        let indices = words(&primitive["indices"]);
+        let index = |word: [u8; 4]| u32::from_le_bytes(word) as usize;
+        Self {
+            positions: vectors("POSITION"),
+            normals: vectors("NORMAL"),
+            colours: vectors("COLOR_0"),
+            triangles: indices.as_chunks::<3>().0.iter().map(|t| t.map(index)).collect(),
+            description,
+        }
+    }
+}
+
+/// Points of the true surface that cameras see, and its normals, one for each cell of a grid.
+pub fn true_surface(world: &World, cameras: &[Camera], cell: f64) -> Vec<(DVec3, DVec3)> {
+    let mut points = BTreeMap::new();
+    for camera in cameras {
+        let k = camera.intrinsics;
+        for i in 0..k.width * k.height {
+            let ray = camera.ray(f64::from(i % k.width) + 0.5, f64::from(i / k.width) + 0.5);
+            if let Some((point, normal)) = world.surface(ray.origin, ray.direction) {
+                points.entry(key(point, cell)).or_insert((point, normal));
+            }
+        }
+    }
+    points.into_values().collect()
+}
+
+fn key(point: DVec3, cell: f64) -> [i32; 3] {
+    (point / cell).to_array().map(|x| x.floor() as i32)
+}
+
+/// Longest side of the box around points.
+pub fn size(points: &[(DVec3, DVec3)]) -> f64 {
+    let all = || points.iter().map(|(point, _)| *point);
+    let (min, max) = (all().reduce(DVec3::min).unwrap(), all().reduce(DVec3::max).unwrap());
+    (max - min).max_element()
+}
+
+/// How an exported surface compares with the true one.
+#[derive(Clone, Copy, Debug)]
+pub struct Compared {
+    /// Mean distance from exported vertices or points to the true surface, over the scene's size.
+    pub to_truth: f64,
+    /// Mean distance from the true surface to the nearest exported vertex, over the scene's size.
+    pub from_truth: f64,
+    /// Share of the normals along which the distance from the true surface grows.
+    pub outward: f64,
+}
+
+/// Compares vertices and normals with the true surface and points of it.
+pub fn compare(
+    world: &World,
+    truth: &[(DVec3, DVec3)],
+    positions: &[DVec3],
+    normals: &[DVec3],
+) -> Compared {
+    let size = size(truth);
+    let mean = |sum: f64, count: usize| sum / count as f64 / size;
+    let off: f64 = positions.iter().map(|p| world.distance(*p).abs()).sum();
+    let step = 1e-4;
+    let is_outward =
+        |p: DVec3, n: DVec3| world.distance(p + step * n) > world.distance(p - step * n);
+    let outward = positions.iter().zip(normals).filter(|(p, n)| is_outward(**p, **n)).count();
+    let near = Nearest::new(positions, 0.02 * size);
+    let missing: f64 = truth.iter().map(|(point, _)| near.distance(*point)).sum();
+    Compared {
+        to_truth: mean(off, positions.len()),
+        from_truth: mean(missing, truth.len()),
+        outward: outward as f64 / positions.len() as f64,
+    }
+}
+
+/// Finds the nearest of many points.
+struct Nearest {
+    cell: f64,
+    points: BTreeMap<[i32; 3], Vec<DVec3>>,
+}
+
+impl Nearest {
+    fn new(points: &[DVec3], cell: f64) -> Self {
+        let mut cells: BTreeMap<[i32; 3], Vec<DVec3>> = BTreeMap::new();
+        points.iter().for_each(|p| cells.entry(key(*p, cell)).or_default().push(*p));
+        Self { cell, points: cells }
+    }
+
+    fn distance(&self, from: DVec3) -> f64 {
+        let middle = key(from, self.cell);
+        let mut best = f64::INFINITY;
+        for ring in 0..64 {
+            // What lies in farther rings is at least so far away.
+            if best <= f64::from(ring - 1) * self.cell {
+                break;
+            }
+            for cell in cells_of_ring(middle, ring) {
+                for point in self.points.get(&cell).into_iter().flatten() {
+                    best = best.min((*point - from).length());
+                }
+            }
+        }
+        best
+    }
+}
+
+/// The cells at a distance, in cells, from one, by their largest coordinate difference.
+fn cells_of_ring(middle: [i32; 3], ring: i32) -> impl Iterator<Item = [i32; 3]> {
+    let side = 2 * ring + 1;
+    (0..side.pow(3)).filter_map(move |i| {
+        let off = [i % side - ring, i / side % side - ring, i / (side * side) - ring];
+        let is_there = off.iter().any(|o| o.abs() == ring);
+        is_there.then(|| [0, 1, 2].map(|axis| middle[axis] + off[axis]))
+    })
+}
