@@ -385,11 +385,7 @@ fn camera_rays(camera: &Camera) -> Vec<Ray> {
     let (width, height) = (camera.intrinsics.width as usize, camera.intrinsics.height as usize);
     let ray = |i: usize| {
         let ray = camera.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
-        Ray {
-            origin: ray.origin.as_vec3().to_array(),
-            direction: ray.direction.as_vec3().to_array(),
-            background: [1.0; 3],
-        }
+        Ray::new(&ray, [1.0; 3])
     };
     (0..width * height).map(ray).collect()
 }

@@ -82,7 +82,7 @@ pub(crate) fn start(
         #[cfg(not(feature = "torch"))]
         ResolvedField::Mlp { .. } => {
             let message = "parameter field: mlp needs libtorch, and train-ss was built without \
-                it; build with --features torch";
+                it; run `make build`";
             Err(Failure::Usage(message.to_owned()).into())
         }
     }
@@ -163,8 +163,7 @@ fn start_grid_on(
     _: TrainingOptions,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     let message = format!(
-        "--device {device}: it needs libtorch, and train-ss was built without it; build with \
-        --features torch"
+        "--device {device}: it needs libtorch, and train-ss was built without it; run `make build`"
     );
     Err(Failure::Usage(message).into())
 }

@@ -9,7 +9,7 @@
 //!   needs.
 //! * `photographs`: LR images and references, packed (`packed`) into memory and, beyond a budget, a
 //!   file.
-//! * `pixel_sampler`: which pixel a bundle trains on; `pixel_rays`: its rays; `residual`: how their
+//! * `pixel_sampler`: which pixel a bundle trains on; `residual`: how their
 //!   colours are judged.
 //! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without
 //!   casting its whole footprint.
@@ -19,6 +19,7 @@
 //!   whether it was better to ask.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
+mod assembly;
 mod checkpoint;
 mod exposure;
 mod field_trainer;
@@ -30,14 +31,15 @@ mod moving_cameras;
 mod packed;
 mod params;
 mod photographs;
-mod pixel_rays;
 mod pixel_sampler;
 mod pixel_set;
 mod pose_choice;
+mod reference_blocks;
 mod references;
 mod residual;
 mod resolve;
 mod setup;
+mod supersampling_options;
 mod supervision;
 mod training_log;
 
@@ -65,8 +67,7 @@ impl Stage for TrainSs {
     type Params = Params;
     const NAME: &'static str = "train-ss";
     const SUMMARY: &'static str = "Trains a radiance field from LR images by supersampling.";
-    #[cfg(feature = "torch")]
-    const ENVIRONMENT: &'static [&'static str] = &[nets::TF32_VARIABLE];
+    const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![

@@ -5,7 +5,7 @@ use scene::{Background, View, Views};
 
 use crate::packed::PixelMemory;
 use crate::resolve::{Resolved, ResolvedField};
-use crate::supervision::SupersamplingOptions;
+use crate::supersampling_options::SupersamplingOptions;
 
 /// The memory that a training needs at its peak, in bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

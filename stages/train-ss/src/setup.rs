@@ -10,7 +10,8 @@ use crate::packed::PackedPhotograph;
 use crate::photographs::{NO_PLACE, Photographs};
 use crate::references;
 use crate::resolve::Resolved;
-use crate::supervision::{Supersampling, SupersamplingOptions, Supervision};
+use crate::supersampling_options::SupersamplingOptions;
+use crate::supervision::{Supersampling, Supervision};
 
 /// What to say to a parameter that an open background leaves no meaning.
 pub(crate) fn open_background(parameter: &str) -> String {

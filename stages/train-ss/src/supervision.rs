@@ -1,23 +1,18 @@
-use std::collections::BTreeMap;
 use std::io;
-use std::sync::Arc;
 
 use counter_rng::CounterRng;
-use pixels::{Filter, Image, Resampling};
 use poses::Moved;
 use radiance::{Ray, RayField};
-use scene::{Background, Camera};
+use scene::{Background, Camera, CameraRays};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::exposure::Exposures;
-use crate::hr_cache::{HrCache, KernelOperator};
+use crate::hr_cache::HrCache;
 use crate::moving_cameras::MovingCameras;
 use crate::packed::{PackedPhotograph, PixelMemory};
-use crate::photographs::Photographs;
-use crate::pixel_rays::PixelRays;
-use crate::pixel_sampler::{Focus, Numbered, Order, PixelSampler, detailed};
-use crate::pixel_set::PixelSet;
+use crate::pixel_sampler::PixelSampler;
+use crate::reference_blocks::block_start;
 use crate::residual::{Target, is_clipped};
 
 /// How rays are compared with the LR pixel.
@@ -45,178 +40,36 @@ pub enum Supervision {
 /// altogether four times as many blocks as an LR image has pixels.
 pub struct Supersampling {
     /// LR photographs, then references.
-    views: Vec<TrainingView>,
+    pub(crate) views: Vec<TrainingView>,
     /// How many of them are LR photographs.
-    lr_views: usize,
-    sampler: PixelSampler,
-    background: Background,
+    pub(crate) lr_views: usize,
+    pub(crate) sampler: PixelSampler,
+    pub(crate) background: Background,
     /// Sub-pixel rays along x and y, when all are cast and now.
-    full: [usize; 2],
-    side: [usize; 2],
-    supersample_warmup: f64,
-    supervision: Supervision,
-    seed: u64,
-    cache: Option<HrCache>,
-    exposures: Option<Exposures>,
-    moving: Option<MovingCameras>,
-    memory: PixelMemory,
+    pub(crate) full: [usize; 2],
+    pub(crate) side: [usize; 2],
+    pub(crate) supersample_warmup: f64,
+    pub(crate) supervision: Supervision,
+    pub(crate) seed: u64,
+    pub(crate) cache: Option<HrCache>,
+    pub(crate) exposures: Option<Exposures>,
+    pub(crate) moving: Option<MovingCameras>,
+    pub(crate) memory: PixelMemory,
 }
 
-struct TrainingView {
+/// What a bundle is drawn from and compared with.
+pub(crate) struct TrainingView {
     /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels.
-    image: PackedPhotograph,
+    pub(crate) image: PackedPhotograph,
     /// A reference's own pixels.
-    hr: Option<PackedPhotograph>,
-    rays: PixelRays,
-}
-
-/// How to supersample.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct SupersamplingOptions {
-    /// What is compared.
-    pub supervision: Supervision,
-    /// Size of the HR images that the field is to render, over that of the LR ones, per axis.
-    pub scale: [f64; 2],
-    /// The filter that made the LR images.
-    pub filter: Filter,
-    /// Share of the training during which fewer sub-pixel rays are cast.
-    pub supersample_warmup: f64,
-    /// In which order pixels are drawn.
-    pub order: Order,
-    /// Pixels at the start that come from the middle half of each image's width and height alone.
-    pub precrop_bundles: u64,
-    /// How many times as often a pixel with detail is drawn as a flat one, in random order.
-    pub pixel_importance: f64,
-    /// Whether to find each photograph's exposure.
-    pub exposure: bool,
-    /// Whether to move cameras to where photographs are met best.
-    pub pose_refinement: bool,
-    /// Seed of what is drawn.
-    pub seed: u64,
-}
-
-impl SupersamplingOptions {
-    /// Size of the HR images for an LR size, (width, height).
-    pub(crate) fn hr_size(&self, (width, height): (usize, usize)) -> (usize, usize) {
-        let length =
-            |length: usize, i: usize| ((length as f64 * self.scale[i]).round() as usize).max(1);
-        (length(width, 0), length(height, 1))
-    }
-
-    /// Whether HR pixels of LR photographs of such sizes are cached: of all, where the kernel of one
-    /// asks for it.
-    pub(crate) fn needs_cache(&self, mut lr_sizes: impl Iterator<Item = (usize, usize)>) -> bool {
-        let is_needed = |lr| HrCache::is_needed(self.filter, self.hr_size(lr), lr);
-        self.supervision == Supervision::Kernel && lr_sizes.any(is_needed)
-    }
-
-    /// Sub-pixel rays along x and y: no more than the smallest view has HR pixels.
-    fn full_side(&self, photographs: &Photographs, references: Option<&Photographs>) -> [usize; 2] {
-        let lr =
-            photographs.images.iter().map(|image| self.hr_size((image.width(), image.height())));
-        let hr =
-            references.iter().flat_map(|r| &r.images).map(|image| (image.width(), image.height()));
-        let smallest = lr.chain(hr).reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or((1, 1));
-        let side = |scale: f64, most: usize| ((scale - 1e-6).ceil() as usize).clamp(1, most);
-        [side(self.scale[0], smallest.0), side(self.scale[1], smallest.1)]
-    }
+    pub(crate) hr: Option<PackedPhotograph>,
+    pub(crate) rays: CameraRays,
 }
 
 /// Purpose of a draw.
 const BACKGROUND: u64 = 101;
 
-/// How many times as often something of a reference is drawn as of an LR image. On a small demo
-/// scene, six of twelve views at HR, there are 21.66 dB without them, 21.63 and 22.12 with 1 and 4.
-const REFERENCE_DRAWS: u64 = 4;
-
 impl Supersampling {
-    /// Supervision by LR photographs, and by HR ones that join them. Pixels that don't count are
-    /// neither drawn nor compared with.
-    pub(crate) fn new(
-        photographs: Photographs,
-        references: Option<Photographs>,
-        options: &SupersamplingOptions,
-        mut memory: PixelMemory,
-    ) -> io::Result<Self> {
-        let (background, lr_views) = (photographs.views.background, photographs.images.len());
-        let lr_pixels: u64 = photographs.images.iter().map(|image| image.pixels() as u64).sum();
-        let full = options.full_side(&photographs, references.as_ref());
-        let lr_sizes = photographs.images.iter().map(|image| (image.width(), image.height()));
-        let mut cache = options.needs_cache(lr_sizes).then(|| HrCache::new(full));
-        let mut kernels = BTreeMap::new();
-        let (mut views, mut cameras) = (Vec::with_capacity(lr_views), Vec::with_capacity(lr_views));
-        let (mut numbered, mut numbers, mut with_detail) =
-            (Vec::with_capacity(lr_views), 0, PixelSet::default());
-        let mut pyramids = Vec::new();
-        let all = [Some(photographs), references].into_iter().flatten();
-        for (view, photograph) in all.flat_map(|p| p.views.views.into_iter().zip(p.images)) {
-            let is_reference = views.len() >= lr_views;
-            if options.pose_refinement {
-                pyramids.push(MovingCameras::pyramid(&photograph.known()));
-            }
-            let mut whole = photograph.whole();
-            // References are what they are: nothing has shrunk them.
-            if let Some(cache) = cache.as_mut().filter(|_| !is_reference) {
-                let lr = (whole.width, whole.height);
-                let hr = options.hr_size(lr);
-                let (enlarge, kernel) = kernels.entry(lr).or_insert_with(|| {
-                    let enlarge = Resampling::new(Filter::Lanczos, lr, hr);
-                    (enlarge, Arc::new(KernelOperator::new(options.filter, hr, lr)))
-                });
-                cache.add(&enlarge.apply(&whole), kernel.clone(), &mut memory)?;
-            }
-            let (image, hr) = if is_reference {
-                whole = block_means(&whole, full);
-                let known = block_means(&photograph.known(), full);
-                (PackedPhotograph::new(&known.into(), &mut memory)?, Some(photograph))
-            } else {
-                (photograph, None)
-            };
-            let count = image.pixels() as u64;
-            // Each block of a reference has so many numbers.
-            let draws = if is_reference {
-                (REFERENCE_DRAWS * lr_pixels / (lr_views as u64 * count)).max(1)
-            } else {
-                1
-            };
-            if options.pixel_importance > 1.0 {
-                let mut detailed = detailed(&whole);
-                // What the kernel needs to know of pixels around those that don't count stays; they
-                // themselves aren't drawn.
-                detailed
-                    .iter_mut()
-                    .enumerate()
-                    .for_each(|(pixel, is_detailed)| *is_detailed &= image.counts(pixel));
-                (0..draws).for_each(|_| with_detail.extend(detailed.iter().copied()));
-            }
-            numbered.push(Numbered {
-                width: image.width(),
-                height: image.height(),
-                before: numbers,
-            });
-            numbers += draws * count;
-            views.push(TrainingView { image, hr, rays: PixelRays::of(&view.camera) });
-            cameras.push(view.camera);
-        }
-        let focus = Focus::new(options.pixel_importance, numbers, with_detail);
-        let order = (options.order, options.precrop_bundles);
-        Ok(Self {
-            sampler: PixelSampler::new(numbered, numbers, focus, order, options.seed),
-            exposures: options.exposure.then(|| Exposures::new(views.len())),
-            moving: options.pose_refinement.then(|| MovingCameras::new(cameras, pyramids)),
-            views,
-            lr_views,
-            background,
-            full,
-            side: full,
-            supersample_warmup: options.supersample_warmup,
-            supervision: options.supervision,
-            seed: options.seed,
-            cache,
-            memory,
-        })
-    }
-
     /// Sub-pixel rays of an LR pixel along x and y, once all are cast.
     pub fn full_side(&self) -> [usize; 2] {
         self.full
@@ -288,10 +141,7 @@ impl Supersampling {
     /// Has rays cast from where cameras have moved to.
     fn place_views(&mut self) {
         let cameras = self.moving.iter().flat_map(MovingCameras::cameras);
-        self.views
-            .iter_mut()
-            .zip(cameras)
-            .for_each(|(view, camera)| view.rays = PixelRays::of(camera));
+        self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.rays = camera.rays());
     }
 
     /// How far cameras of photographs have gone, where that was asked for. `field` is only made
@@ -333,34 +183,6 @@ impl Supersampling {
             [self.background.shown(); 3]
         }
     }
-}
-
-/// Where a block of a reference's pixels begins: the last of a row or column ends with the image.
-fn block_start(block: usize, block_length: usize, length: usize) -> usize {
-    (block * block_length).min(length.saturating_sub(block_length))
-}
-
-/// Means over blocks of an image's pixels, of those that are known.
-fn block_means(image: &Image, block: [usize; 2]) -> Image {
-    let (width, height) = (image.width.div_ceil(block[0]), image.height.div_ceil(block[1]));
-    let mut data = Vec::with_capacity(width * height * image.channels);
-    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
-        let (left, top) =
-            (block_start(x, block[0], image.width), block_start(y, block[1], image.height));
-        let rows = top..(top + block[1]).min(image.height);
-        let pixels = rows.flat_map(|j| {
-            (left..(left + block[0]).min(image.width)).map(move |i| j * image.width + i)
-        });
-        data.extend((0..image.channels).map(|c| {
-            let known = pixels
-                .clone()
-                .map(|pixel| image.data[pixel * image.channels + c])
-                .filter(|v| !v.is_nan());
-            let (sum, count) = known.fold((0.0, 0.0), |(sum, count), v| (sum + v, count + 1.0f32));
-            sum / count
-        }));
-    }
-    Image::new(width, height, image.channels, data)
 }
 
 /// How often the sub-pixel rays along a side double before all are cast: as many stages has the
@@ -405,7 +227,7 @@ impl radiance::Supervisor for Supersampling {
             let (a, b) = (k % self.side[0], k / self.side[0]);
             let place =
                 [start[0] + (a as f64 + 0.5) * apart[0], start[1] + (b as f64 + 0.5) * apart[1]];
-            *ray = view.rays.ray(place, background);
+            *ray = Ray::new(&view.rays.ray(place[0], place[1]), background);
         }
     }
 
@@ -468,10 +290,16 @@ impl radiance::Supervisor for Supersampling {
 
 #[cfg(test)]
 mod tests {
+    use pixels::{Filter, Image, Resampling};
     use radiance::Supervisor as _;
     use scene::{Distortion, Intrinsics, Photograph};
 
     use super::*;
+    use crate::assembly::REFERENCE_DRAWS;
+    use crate::photographs::Photographs;
+    use crate::pixel_sampler::Order;
+    use crate::reference_blocks::block_means;
+    use crate::supersampling_options::SupersamplingOptions;
 
     fn options(supervision: Supervision, scale: [f64; 2]) -> SupersamplingOptions {
         SupersamplingOptions {

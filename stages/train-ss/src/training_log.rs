@@ -28,7 +28,7 @@ pub struct TrainingLog {
     /// `views.json`, where that was asked for; of the first member. The given poses where no better
     /// ones were found.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub poses: Vec<[[f64; 4]; 3]>,
+    pub poses: Vec<scene::Pose>,
     /// What looks wrong about it, a line each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,

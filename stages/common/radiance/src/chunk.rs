@@ -10,6 +10,9 @@ use crate::shading::{NetworkGradients, RayGradients, Shading, dot};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
 
+/// Rays in one chunk: enough samples to fill the vectors, few enough to stay in the cache.
+pub(crate) const CHUNK_RAYS: usize = 64;
+
 /// Gradients by grid features, in sample order: what is scattered once all shards are done.
 #[derive(Debug, Default)]
 pub(crate) struct FeatureGradients {

@@ -1,85 +1,15 @@
-use std::borrow::Cow;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use counter_rng::CounterRng;
-use rayon::prelude::*;
-use safetensors::tensor::{Dtype, SafeTensors, View};
+use safetensors::SafeTensors;
 use scene::Bounds;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
-use crate::chunk::Chunk;
-use crate::field_file::in_ranges;
+use crate::architecture::Architecture;
 use crate::grid::{Level, levels};
-use crate::mlp::Layer;
-use crate::occupancy::{CELLS, Cell, Occupancy, Strides};
-use crate::ray::{Ray, clip};
-use crate::spec::{DENSITY_OUTPUTS, FEATURES, VIEW_INPUTS};
-
-/// What a field is made of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(default, deny_unknown_fields)]
-pub struct Architecture {
-    /// Levels of the grid.
-    pub levels: u32,
-    /// Cells along an axis of the coarsest level.
-    pub coarsest: u32,
-    /// Cells along an axis of the finest level.
-    pub finest: u32,
-    /// Cells along z at most, of any level: in NDC rays run along z, and cells that lie closer than
-    /// their samples learn little each.
-    pub finest_z: u32,
-    /// Base-2 logarithm of the most entries a level may have; finer levels are hashed.
-    pub log2_entries: u32,
-    /// Width of the hidden layers.
-    pub hidden: u32,
-    /// Samples along the diagonal of the unit cube.
-    pub steps: u32,
-}
-
-/// Cells along an axis, at most.
-const MOST_CELLS: u32 = 4096;
-
-impl Default for Architecture {
-    fn default() -> Self {
-        Self {
-            levels: 8,
-            coarsest: 16,
-            finest: 256,
-            finest_z: MOST_CELLS,
-            log2_entries: 17,
-            hidden: 64,
-            steps: 512,
-        }
-    }
-}
-
-impl Architecture {
-    /// Says which number can't be.
-    pub fn check(&self) -> Result<(), String> {
-        let ranges = [
-            ("levels", self.levels, 1, 16),
-            ("coarsest", self.coarsest, 2, 512),
-            ("finest", self.finest, self.coarsest, MOST_CELLS),
-            ("finest_z", self.finest_z, 2, MOST_CELLS),
-            ("log2_entries", self.log2_entries, 8, 22),
-            ("hidden", self.hidden, 16, 128),
-            ("steps", self.steps, 16, 8192),
-        ];
-        in_ranges(&ranges)
-    }
-
-    /// Numbers in the grid of a field with this architecture.
-    pub fn grid_len(&self) -> usize {
-        levels(self).last().map_or(0, |level| level.range().end)
-    }
-
-    /// Samples of a ray through all of the cube, more or less: what a training expects before it
-    /// has seen any.
-    pub fn full_ray(&self) -> f64 {
-        f64::from(self.steps) * 0.6
-    }
-}
+use crate::mlp::Layers;
+use crate::occupancy::{CELLS, Cell, Occupancy};
+use crate::spec::FEATURES;
+use crate::tensors::{FieldError, Tensor, read_f32, read_u8, write_tensors};
 
 /// A radiance field: density and view-dependent colour of every point of a box.
 #[derive(Clone, Debug)]
@@ -94,115 +24,6 @@ pub struct Field {
     pub(crate) network: Vec<f32>,
     pub(crate) occupancy: Occupancy,
 }
-
-/// The five layers of the two networks: a sample's features → raw density, raw colour and view
-/// features; a ray's composited view features and direction → what is added to the raw colours of
-/// its samples.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Layers {
-    pub(crate) density: [Layer; 2],
-    pub(crate) view: [Layer; 3],
-}
-
-impl Layers {
-    fn new(features: usize, hidden: usize) -> Self {
-        let mut offset = 0;
-        let mut layer = |inputs, outputs| {
-            let layer = Layer { inputs, outputs, offset };
-            offset += inputs * outputs;
-            layer
-        };
-        Self {
-            density: [layer(features, hidden), layer(hidden, DENSITY_OUTPUTS)],
-            view: [layer(VIEW_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
-        }
-    }
-
-    pub(crate) fn all(&self) -> [Layer; 5] {
-        let ([a, b], [c, d, e]) = (self.density, self.view);
-        [a, b, c, d, e]
-    }
-
-    fn len(&self) -> usize {
-        self.view[2].range().end
-    }
-}
-
-/// What a ray sees.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Pixel {
-    /// Colour over the ray's background.
-    pub colour: [f32; 3],
-    /// Colour of the scene alone, weighted by opacity (premultiplied).
-    pub premultiplied: [f32; 3],
-    /// Share of the ray that is stopped.
-    pub opacity: f32,
-    /// Expected distance where it is stopped, in scene units; the far end where nothing stops it.
-    pub depth: f32,
-    /// Distance at which half of the ray is stopped; the far end where it never is.
-    pub median_depth: f32,
-}
-
-impl Pixel {
-    /// Whether all of it is finite.
-    pub fn is_finite(&self) -> bool {
-        let depths = [self.opacity, self.depth, self.median_depth];
-        self.colour.iter().chain(&self.premultiplied).chain(&depths).all(|v| v.is_finite())
-    }
-}
-
-/// Rays that couldn't be cast.
-#[derive(Debug, thiserror::Error)]
-pub enum RenderError {
-    /// What the field is computed by refused: a library, or its device.
-    #[error("the field can't be rendered: {0}")]
-    Backend(String),
-    /// A pixel isn't finite.
-    #[error("the field renders numbers that aren't finite; train it again, with a lower rate")]
-    NotFinite,
-}
-
-/// Whatever rays can be cast through: what renders views needn't know which field it has.
-pub trait RayField {
-    /// Colour, opacity and depth of each ray.
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError>;
-}
-
-impl<F: RayField + ?Sized> RayField for &F {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
-        (**self).render(rays)
-    }
-}
-
-impl RayField for Field {
-    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
-        Ok(Self::render(self, rays))
-    }
-}
-
-/// A field that can't be read or written.
-#[derive(Debug, thiserror::Error)]
-pub enum FieldError {
-    /// The file can't be opened.
-    #[error("{path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file isn't a field.
-    #[error("{path}: {reason}")]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-}
-
-/// Rays in one chunk: enough samples to fill the vectors, few enough to stay in the cache.
-pub(crate) const CHUNK_RAYS: usize = 64;
 
 impl Field {
     /// A field before training: faint density, drawn from a seed.
@@ -234,37 +55,6 @@ impl Field {
     /// Distance between samples, in cube sides.
     pub fn step(&self) -> f32 {
         3.0f32.sqrt() / self.architecture.steps as f32
-    }
-
-    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number
-    /// of threads.
-    pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
-        rays.par_chunks(CHUNK_RAYS)
-            .map_init(Chunk::default, |chunk, rays| {
-                let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
-                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
-                let pixel = |(i, ray): (usize, &Ray)| {
-                    let sum = &chunk.sums[i];
-                    let far = if clipped[i].leave > clipped[i].enter {
-                        clipped[i].distance(clipped[i].leave)
-                    } else {
-                        self.bounds.far as f32
-                    };
-                    let opacity = 1.0 - sum.transmittance;
-                    Pixel {
-                        colour: std::array::from_fn(|c| {
-                            sum.transmittance.mul_add(ray.background[c], sum.colour[c])
-                        }),
-                        premultiplied: sum.colour,
-                        opacity,
-                        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
-                        median_depth: sum.median.map_or(far, |t| clipped[i].distance(t)),
-                    }
-                };
-                rays.iter().enumerate().map(pixel).collect::<Vec<_>>()
-            })
-            .flatten_iter()
-            .collect()
     }
 
     /// Share of the cells that may hold something.
@@ -348,7 +138,7 @@ impl Field {
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
         let format = |reason: String| FieldError::Format { path: path.to_path_buf(), reason };
-        architecture.check().map_err(format)?;
+        architecture.check().map_err(|e| format(e.to_string()))?;
         if !bounds.is_valid() {
             return Err(format(format!("the box {bounds:?} has no inside")));
         }
@@ -365,99 +155,6 @@ impl Field {
         }
         Ok(field)
     }
-}
-
-/// A tensor to write.
-pub(crate) enum Tensor<'a> {
-    F32(&'a [f32]),
-    U8(&'a [u8]),
-}
-
-/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest
-/// tensor at a time.
-struct Written<'a>(&'a Tensor<'a>, [usize; 1]);
-
-impl View for Written<'_> {
-    fn dtype(&self) -> Dtype {
-        match self.0 {
-            Tensor::F32(_) => Dtype::F32,
-            Tensor::U8(_) => Dtype::U8,
-        }
-    }
-
-    fn shape(&self) -> &[usize] {
-        &self.1
-    }
-
-    fn data(&self) -> Cow<'_, [u8]> {
-        match self.0 {
-            Tensor::F32(numbers) => {
-                Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect())
-            }
-            Tensor::U8(bytes) => Cow::Borrowed(bytes),
-        }
-    }
-
-    fn data_len(&self) -> usize {
-        match self.0 {
-            Tensor::F32(numbers) => size_of_val(*numbers),
-            Tensor::U8(bytes) => bytes.len(),
-        }
-    }
-}
-
-impl Tensor<'_> {
-    fn len(&self) -> usize {
-        match self {
-            Self::F32(numbers) => numbers.len(),
-            Self::U8(bytes) => bytes.len(),
-        }
-    }
-}
-
-pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
-    let views = tensors.iter().map(|(name, tensor)| (*name, Written(tensor, [tensor.len()])));
-    let io = |source| FieldError::Io { path: path.to_path_buf(), source };
-    let whole = safetensors::serialize(views, None)
-        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
-    std::fs::write(path, whole).map_err(io)
-}
-
-pub(crate) fn read_f32(
-    tensors: &SafeTensors<'_>,
-    name: &str,
-    into: &mut [f32],
-) -> Result<(), String> {
-    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
-    let (data, rest) = tensor.data().as_chunks::<4>();
-    if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(format!(
-            "tensor {name}: {:?} {:?} where {} f32 are expected",
-            tensor.dtype(),
-            tensor.shape(),
-            into.len()
-        ));
-    }
-    for (value, bytes) in into.iter_mut().zip(data) {
-        *value = f32::from_le_bytes(*bytes);
-    }
-    Ok(())
-}
-
-pub(crate) fn read_u8(
-    tensors: &SafeTensors<'_>,
-    name: &str,
-    len: usize,
-) -> Result<Vec<u8>, String> {
-    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
-    if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(format!(
-            "tensor {name}: {:?} {:?} where {len} u8 are expected",
-            tensor.dtype(),
-            tensor.shape()
-        ));
-    }
-    Ok(tensor.data().to_vec())
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@ use serde::{Deserialize, Serialize};
 
 use scene::Bounds;
 
-use crate::Architecture;
+use crate::architecture::Architecture;
+use crate::ranges::{OutOfRange, in_ranges};
 
 /// Name of the description in a field's artifact; the weights lie beside it, each member's in
 /// [`FieldFile::member`].
@@ -37,6 +38,20 @@ fn first_format() -> u32 {
     1
 }
 
+/// A description of a field that no field can have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum FieldFileError {
+    /// A number out of its bounds.
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
+    /// The file has another format.
+    #[error(
+        "another build trained this field, in format {0}; this build reads format {FIELD_FORMAT}: \
+        train it again"
+    )]
+    Format(u32),
+}
+
 impl FieldFile {
     /// Name of a member's weights, beside [`FIELD_FILE`].
     pub fn member(index: u32) -> String {
@@ -44,18 +59,14 @@ impl FieldFile {
     }
 
     /// Says which number can't be.
-    pub fn check(&self) -> Result<(), String> {
-        if !(1..=16).contains(&self.members) {
-            return Err(format!("members = {} is not in 1..=16", self.members));
-        }
+    pub fn check(&self) -> Result<(), FieldFileError> {
+        in_ranges(&[("members", self.members, 1, 16)])?;
         match self.field {
-            FieldModel::Grid(_) if self.format != FIELD_FORMAT => Err(format!(
-                "another build trained this field, in format {}; this build reads format \
-                {FIELD_FORMAT}: train it again",
-                self.format
-            )),
-            FieldModel::Grid(architecture) => architecture.check(),
-            FieldModel::Mlp(architecture) => architecture.check(),
+            FieldModel::Grid(_) if self.format != FIELD_FORMAT => {
+                Err(FieldFileError::Format(self.format))
+            }
+            FieldModel::Grid(architecture) => Ok(architecture.check()?),
+            FieldModel::Mlp(architecture) => Ok(architecture.check()?),
         }
     }
 }
@@ -107,7 +118,7 @@ impl Default for MlpArchitecture {
 
 impl MlpArchitecture {
     /// Says which number can't be.
-    pub fn check(&self) -> Result<(), String> {
+    pub fn check(&self) -> Result<(), OutOfRange> {
         let ranges = [
             ("position_octaves", self.position_octaves, 0, 16),
             ("direction_octaves", self.direction_octaves, 0, 16),
@@ -118,15 +129,4 @@ impl MlpArchitecture {
         ];
         in_ranges(&ranges)
     }
-}
-
-/// Says which of some named numbers isn't between its bounds.
-pub(crate) fn in_ranges(ranges: &[(&str, u32, u32, u32)]) -> Result<(), String> {
-    ranges.iter().try_for_each(|(name, value, low, high)| {
-        if (low..=high).contains(&value) {
-            Ok(())
-        } else {
-            Err(format!("{name} = {value} is not in {low}..={high}"))
-        }
-    })
 }

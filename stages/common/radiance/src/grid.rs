@@ -6,13 +6,20 @@
 //! al. 2022, "Instant neural graphics primitives", eq. 4), and collisions are left to the networks.
 
 use crate::adam::Touched;
-use crate::field::Architecture;
+use crate::architecture::Architecture;
 use crate::math::floor;
 use crate::simd::{LANES, Quad as _, kernel};
 use crate::spec::{BRICK, FEATURES, HASH_FACTORS};
 
 /// Entries in a block that the optimiser takes at once.
 const PER_BLOCK: usize = LANES / FEATURES;
+
+impl Architecture {
+    /// Numbers in the grid of a field with this architecture.
+    pub fn grid_len(&self) -> usize {
+        levels(self).last().map_or(0, |level| level.range().end)
+    }
+}
 
 /// One level.
 #[derive(Clone, Copy, Debug, PartialEq)]

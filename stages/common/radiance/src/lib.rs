@@ -11,6 +11,7 @@
 //!   through the unit cube.
 //! * [`spec`]: the constants that the libtorch twin shares.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
+//! * [`PointSample`]: what a field holds at a place, for whoever bakes it into something else.
 //! * [`Architecture`]: what a field is made of; [`scene::Bounds`]: where it lies.
 //!
 //! Shading is deferred (SNeRG, Hedman et al. 2021): a sample has a density, a raw colour and view
@@ -36,6 +37,7 @@
 //! ```
 
 mod adam;
+mod architecture;
 mod chunk;
 mod composite;
 mod field;
@@ -45,23 +47,37 @@ mod math;
 mod mlp;
 mod occupancy;
 mod passes;
+mod points;
+mod ranges;
 mod ray;
 #[cfg(test)]
 mod reference;
+mod render;
 mod samples;
 mod shading;
 mod simd;
 pub mod spec;
 mod spherical;
+mod supervisor;
 mod tally;
+mod tensors;
 mod trainer;
 
+pub use architecture::Architecture;
 pub use composite::LIKE_BACKGROUND;
-pub use field::{Architecture, Field, FieldError, Pixel, RayField, RenderError};
-pub use field_file::{FIELD_FILE, FIELD_FORMAT, FieldFile, FieldModel, MlpArchitecture};
+pub use field::Field;
+pub use field_file::{
+    FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
+};
 pub use occupancy::{Occupancy, Strides};
 pub use passes::Passes;
+pub use points::PointSample;
+pub use ranges::OutOfRange;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
+pub use render::{Pixel, RayField, RenderError};
 pub use simd::{Family, set_family};
+pub use spherical::spherical_harmonics;
+pub use supervisor::Supervisor;
 pub use tally::Tally;
-pub use trainer::{StepReport, Supervisor, Trainer, TrainingError, TrainingOptions};
+pub use tensors::FieldError;
+pub use trainer::{StepReport, Trainer, TrainingError, TrainingOptions};

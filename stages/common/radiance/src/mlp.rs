@@ -3,6 +3,7 @@
 //! harmonic is a constant input already.
 
 use crate::simd::{LANES, Lanes, kernel};
+use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
 
 #[inline(always)]
 fn row<L: Lanes>(from: &[f32], at: usize) -> L {
@@ -216,6 +217,39 @@ impl Layer {
                 t[j * self.inputs + i] = w[i * self.outputs + j];
             }
         }
+    }
+}
+
+/// The five layers of the two networks: a sample's features → raw density, raw colour and view
+/// features; a ray's composited view features and direction → what is added to the raw colours of
+/// its samples.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Layers {
+    pub(crate) density: [Layer; 2],
+    pub(crate) view: [Layer; 3],
+}
+
+impl Layers {
+    pub(crate) fn new(features: usize, hidden: usize) -> Self {
+        let mut offset = 0;
+        let mut layer = |inputs, outputs| {
+            let layer = Layer { inputs, outputs, offset };
+            offset += inputs * outputs;
+            layer
+        };
+        Self {
+            density: [layer(features, hidden), layer(hidden, DENSITY_OUTPUTS)],
+            view: [layer(VIEW_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
+        }
+    }
+
+    pub(crate) fn all(&self) -> [Layer; 5] {
+        let ([a, b], [c, d, e]) = (self.density, self.view);
+        [a, b, c, d, e]
+    }
+
+    pub(crate) fn len(&self) -> usize {
+        self.view[2].range().end
     }
 }
 

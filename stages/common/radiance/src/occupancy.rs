@@ -38,6 +38,12 @@ fn corner(cell: usize) -> [usize; 3] {
     [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)]
 }
 
+/// The cell along each axis that a place of the unit cube lies in.
+#[inline(always)]
+pub(crate) fn cell_of(place: [f32; 3]) -> [usize; 3] {
+    place.map(|x| (x * GRID as f32).max(0.0).min(GRID as f32 - 1.0) as i32 as usize)
+}
+
 /// Density of a cell that hasn't been looked at.
 const UNKNOWN: f32 = -1.0;
 
@@ -288,7 +294,6 @@ kernel! {
     /// of both. `next` is each ray's k, from 0 to [`DONE`].
     pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
         samples: &mut Marched) {
-        let last = GRID as f32 - 1.0;
         let March { occupancy, rays, offsets, step, strides } = *march;
         let always = u64::from(strides == Strides::Even);
         let per_step = 1.0 / step;
@@ -305,7 +310,7 @@ kernel! {
                     break;
                 }
                 let p = ray.position(at);
-                let cell = p.map(|x| (x * GRID as f32).max(0.0).min(last) as i32 as usize);
+                let cell = cell_of(p);
                 let brick = cell.map(|c| c / SIDE);
                 let (block_word, brick_bit) = place(brick, BLOCKS);
                 let (brick_word, cell_bit) = place(cell, BRICKS);

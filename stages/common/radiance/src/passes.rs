@@ -1,6 +1,7 @@
+use crate::chunk::CHUNK_RAYS;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::composite::Regularisers;
-use crate::field::{CHUNK_RAYS, Field};
+use crate::field::Field;
 use crate::occupancy::Strides;
 use crate::ray::{Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};

@@ -1,5 +1,5 @@
 use glam::DVec3;
-use scene::{Bounds, Frustum, Space};
+use scene::{Bounds, CameraRay, Frustum, Space};
 
 use crate::math::exp;
 
@@ -12,6 +12,17 @@ pub struct Ray {
     pub direction: [f32; 3],
     /// What it sees where nothing stands in its way.
     pub background: [f32; 3],
+}
+
+impl Ray {
+    /// A camera's ray before a background, in single precision.
+    pub fn new(ray: &CameraRay, background: [f32; 3]) -> Self {
+        Self {
+            origin: ray.origin.as_vec3().to_array(),
+            direction: ray.direction.as_vec3().to_array(),
+            background,
+        }
+    }
 }
 
 /// A ray in the unit cube, by a parameter t that moves through it evenly: for a box the distance in
@@ -279,10 +290,8 @@ mod tests {
         let turned = glam::DMat3::from_axis_angle(unit([0.3, 1.0, -0.2]), 0.4);
         for scale in [1e-4, 1.0, 1e4f64] {
             let centre = scale * DVec3::new(0.1, 0.2, 0.3);
-            let row = |i: usize| [turned.x_axis[i], turned.y_axis[i], turned.z_axis[i], centre[i]];
-            let pose = [row(0), row(1), row(2)];
             let frustum = Frustum {
-                camera_to_world: pose,
+                camera_to_world: scene::pose_of(turned, centre),
                 min: [-0.9, -0.6],
                 max: [0.8, 0.7],
                 near: 0.8 * scale,

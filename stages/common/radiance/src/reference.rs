@@ -3,9 +3,10 @@
 use counter_rng::CounterRng;
 use scene::Bounds;
 
+use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::composite::{Regularisers, likeness};
-use crate::field::{Architecture, Field};
+use crate::field::Field;
 use crate::grid::{Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
 use crate::occupancy::{Cell, March, Marched, Strides, march};

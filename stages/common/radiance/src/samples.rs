@@ -101,6 +101,13 @@ impl DensityRows {
         );
     }
 
+    /// Outputs of the network at `n` positions (three rows): a row each.
+    pub(crate) fn outputs_at(&mut self, field: &Field, positions: &[f32], n: usize) -> &[f32] {
+        fit(&mut self.positions, 3 * n).copy_from_slice(positions);
+        self.run(field, Round { start: 0, n, first: 0 });
+        &self.outputs[..DENSITY_OUTPUTS * n]
+    }
+
     /// Density of `n` positions (three rows): for the occupancy.
     pub(crate) fn densities(
         &mut self,
@@ -109,9 +116,7 @@ impl DensityRows {
         n: usize,
         densities: &mut [f32],
     ) {
-        fit(&mut self.positions, 3 * n).copy_from_slice(positions);
-        self.run(field, Round { start: 0, n, first: 0 });
-        optical_depths(&self.outputs[..n], 1.0, densities);
+        optical_depths(&self.outputs_at(field, positions, n)[..n], 1.0, densities);
     }
 }
 

@@ -3,8 +3,9 @@
 //! raw colours of all the ray's samples. So colours cost a network a ray.
 
 use crate::composite::{Regularisers, add_distortion_gradients, likeness, optical_depth_gradients};
-use crate::field::{Field, Layers};
+use crate::field::Field;
 use crate::math::sigmoid;
+use crate::mlp::Layers;
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Samples, fit};
@@ -205,6 +206,29 @@ kernel! {
     }
 }
 
+/// Runs the view network on `n` columns of its `input`; what is added to raw colours: three rows of
+/// n.
+pub(crate) fn view_network<'a>(
+    field: &Field,
+    input: &[f32],
+    hidden: &mut [Vec<f32>; 2],
+    added: &'a mut Vec<f32>,
+    n: usize,
+) -> &'a mut [f32] {
+    let Layers { view, .. } = field.layers;
+    let [hidden1, hidden2] = hidden;
+    let run = |layer: Layer, x: &[f32], y: &mut [f32], after| {
+        multiply(&field.network[layer.range()], x, y, layer.inputs, layer.outputs, n, after);
+    };
+    let hidden1 = fit(hidden1, view[0].outputs * n);
+    run(view[0], input, hidden1, After::Relu);
+    let hidden2 = fit(hidden2, view[1].outputs * n);
+    run(view[1], hidden1, hidden2, After::Relu);
+    let added = fit(added, view[2].outputs * n);
+    run(view[2], hidden2, added, After::Linear);
+    added
+}
+
 impl AlongRay {
     fn fit(&mut self, longest: usize) {
         for buffer in [
@@ -235,38 +259,7 @@ impl Shading {
             row[counted.rays.len()..].fill(0.0);
         }
         composite(samples, counted, rays, sums, input, n);
-        let Layers { view: [first, second, third], .. } = field.layers;
-        let [hidden1, hidden2] = &mut self.hidden;
-        let (hidden1, hidden2) =
-            (fit(hidden1, first.outputs * n), fit(hidden2, second.outputs * n));
-        multiply(
-            &field.network[first.range()],
-            input,
-            hidden1,
-            first.inputs,
-            first.outputs,
-            n,
-            After::Relu,
-        );
-        multiply(
-            &field.network[second.range()],
-            hidden1,
-            hidden2,
-            second.inputs,
-            second.outputs,
-            n,
-            After::Relu,
-        );
-        let added = fit(&mut self.added, third.outputs * n);
-        multiply(
-            &field.network[third.range()],
-            hidden2,
-            added,
-            third.inputs,
-            third.outputs,
-            n,
-            After::Linear,
-        );
+        let added = view_network(field, input, &mut self.hidden, &mut self.added, n);
         let colour = fit(&mut self.colour, 3 * m);
         raw_colours(counted, added, n, colour, m);
         sigmoids(colour);

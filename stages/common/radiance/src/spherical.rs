@@ -1,7 +1,7 @@
 use crate::spec::BASIS;
 
 /// Real spherical harmonics up to degree 2 of a unit direction.
-pub(crate) fn spherical_harmonics([x, y, z]: [f32; 3]) -> [f32; BASIS] {
+pub fn spherical_harmonics([x, y, z]: [f32; 3]) -> [f32; BASIS] {
     [
         0.282_094_8,
         -0.488_602_5 * y,

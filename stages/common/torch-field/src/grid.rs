@@ -38,6 +38,22 @@ pub(crate) struct TorchLevel {
     hashed: bool,
 }
 
+/// Samples of n rays, of at most `count` steps each.
+struct Marched {
+    /// Distance in the cube of every step (n × count).
+    t: Tensor,
+    /// Numbers of the steps that are samples, and their positions (… × 3) and lengths.
+    kept: Tensor,
+    positions: Tensor,
+    length: Tensor,
+    count: i64,
+}
+
+/// Sums of samples' rows over each of n rays.
+fn sum_by_ray(rows: &Tensor, ray: &Tensor, n: i64) -> Result<Tensor, TchError> {
+    Tensor::f_zeros([n, rows.size()[1]], (Kind::Float, rows.device()))?.f_index_add(0, ray, rows)
+}
+
 /// What rays see.
 pub(crate) struct GridSeen {
     /// n × 3, of the scene alone.
@@ -245,41 +261,14 @@ impl TorchGrid {
     ) -> Result<GridSeen, TchError> {
         let n = rays.len() as i64;
         let maps = RayMaps::new(&self.bounds, rays, self.device, false)?;
-        let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
-        let count = ((longest / self.step()).ceil() as i64).max(1);
-        let steps = Tensor::f_arange(count, (Kind::Float, self.device))?;
-        let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
-        let at = |k: &Tensor| fused(k, &k.f_full_like(self.step())?, &maps.enter);
-        let t = at(&k)?;
-        let held = self
-            .held(&maps.positions(&t)?)?
-            .f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
-        // Every other step of a thin cell is one sample, in the middle of both.
-        let thin = match strides {
-            // Nowhere.
-            Strides::Even => held.f_lt(0.0)?,
-            Strides::ByCell => held.f_eq(1.0)?,
-        };
-        let middle = at(&k.f_add_scalar(0.5)?)?;
-        let (t, length) =
-            (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
-        let positions = maps.positions(&t)?;
-        let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
-        let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
-        let inside = inside.f_logical_and(&thin.f_logical_and(&odd)?.f_logical_not()?)?;
-        let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
-        let positions = positions.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
+        let Marched { t, kept, positions, length, count } = self.march(&maps, offsets, strides)?;
 
         let outputs = self.outputs(&positions)?;
-        let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
         let density =
             outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
-        let spread = |of: &Tensor, like: &Tensor| {
-            like.f_index_put(&[Some(&kept)], of, false)?.f_reshape([n, count])
-        };
-        let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
         let optical = |density: &Tensor| -> Result<[Tensor; 3], TchError> {
-            let tau = spread(density, &nothing)?;
+            let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
+            let tau = nothing.f_index_put(&[Some(&kept)], density, false)?.f_reshape([n, count])?;
             let through = tau.f_cumsum(1, None::<Kind>)?;
             let transmittance = through.f_sub(&tau)?.f_neg()?.f_exp()?;
             let weights = transmittance.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
@@ -298,24 +287,10 @@ impl TorchGrid {
         let ray = at.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
-        let sum = |of: &Tensor| {
-            Tensor::f_zeros([n, of.size()[1]], (Kind::Float, self.device))?.f_index_add(0, &ray, of)
-        };
-        let features = sum(&weight.f_mul(&outputs.f_narrow(
-            1,
-            VIEW_FEATURE as i64,
-            VIEW_FEATURES as i64,
-        )?)?)?;
-        let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
-        let hidden =
-            input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
-        let added = hidden.f_matmul(&self.layers[4])?.f_index_select(0, &ray)?;
-        let colour = outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&added)?.f_sigmoid()?;
-        let premultiplied = sum(&weight.f_mul(&colour)?)?;
-        let transmittance = through.i((.., count - 1)).f_neg()?.f_exp()?;
+        let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
         Ok(GridSeen {
-            premultiplied,
-            transmittance,
+            premultiplied: sum_by_ray(&weight.f_mul(&colour)?, &ray, n)?,
+            transmittance: through.i((.., count - 1)).f_neg()?.f_exp()?,
             weights,
             t,
             counted,
@@ -325,6 +300,58 @@ impl TorchGrid {
             samples: kept.numel(),
             maps,
         })
+    }
+
+    /// Samples of rays where cells are occupied.
+    fn march(
+        &self,
+        maps: &RayMaps,
+        offsets: &Tensor,
+        strides: Strides,
+    ) -> Result<Marched, TchError> {
+        let longest = maps.leave.f_sub(&maps.enter)?.f_max()?.f_double_value(&[])?;
+        let count = ((longest / self.step()).ceil() as i64).max(1);
+        let steps = Tensor::f_arange(count, (Kind::Float, self.device))?;
+        let k = steps.f_add(&offsets.f_unsqueeze(-1)?)?;
+        let at = |k: &Tensor| fused(k, &k.f_full_like(self.step())?, &maps.enter);
+        let t = at(&k)?;
+        let held = self
+            .held(&maps.positions(&t)?)?
+            .f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
+        // Every other step of a thin cell is one sample, in the middle of both.
+        let thin = match strides {
+            // Nowhere.
+            Strides::Even => held.f_lt(0.0)?,
+            Strides::ByCell => held.f_eq(1.0)?,
+        };
+        let middle = at(&k.f_add_scalar(0.5)?)?;
+        let (t, length) =
+            (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
+        let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
+        let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
+        let inside = inside.f_logical_and(&thin.f_logical_and(&odd)?.f_logical_not()?)?;
+        let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
+        let positions = maps.positions(&t)?.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
+        let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;
+        Ok(Marched { t, kept, positions, length, count })
+    }
+
+    /// Colours of shaded samples: each one's own raw colour and its ray's part of it.
+    fn shade(
+        &self,
+        maps: &RayMaps,
+        outputs: &Tensor,
+        weight: &Tensor,
+        ray: &Tensor,
+        rays: i64,
+    ) -> Result<Tensor, TchError> {
+        let features = outputs.f_narrow(1, VIEW_FEATURE as i64, VIEW_FEATURES as i64)?;
+        let features = sum_by_ray(&weight.f_mul(&features)?, ray, rays)?;
+        let input = Tensor::f_cat(&[&features, &harmonics(&maps.view)?], -1)?;
+        let hidden =
+            input.f_matmul(&self.layers[2])?.f_relu()?.f_matmul(&self.layers[3])?.f_relu()?;
+        let added = hidden.f_matmul(&self.layers[4])?.f_index_select(0, ray)?;
+        outputs.f_narrow(1, RAW_COLOUR as i64, 3)?.f_add(&added)?.f_sigmoid()
     }
 
     /// What the cells at positions (… × 3) hold, as numbers.

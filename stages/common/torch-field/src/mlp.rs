@@ -140,9 +140,10 @@ impl Mlp {
         bounds: Bounds,
         device: Device,
     ) -> Result<Self, TorchFieldError> {
-        architecture
-            .check()
-            .map_err(|reason| TorchFieldError::Format { path: path.to_path_buf(), reason })?;
+        architecture.check().map_err(|error| TorchFieldError::Format {
+            path: path.to_path_buf(),
+            reason: error.to_string(),
+        })?;
         let weights = nets::Weights::read(path)?;
         let network = |prefix: &str| -> Result<MlpNetwork, TorchFieldError> {
             let read = MlpNetwork::read(architecture, |name, shape| {

@@ -1,0 +1,91 @@
+use rayon::prelude::*;
+
+use crate::chunk::{CHUNK_RAYS, Chunk};
+use crate::field::Field;
+use crate::occupancy::Strides;
+use crate::ray::{Ray, clip};
+
+/// What a ray sees.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Pixel {
+    /// Colour over the ray's background.
+    pub colour: [f32; 3],
+    /// Colour of the scene alone, weighted by opacity (premultiplied).
+    pub premultiplied: [f32; 3],
+    /// Share of the ray that is stopped.
+    pub opacity: f32,
+    /// Expected distance where it is stopped, in scene units; the far end where nothing stops it.
+    pub depth: f32,
+    /// Distance at which half of the ray is stopped; the far end where it never is.
+    pub median_depth: f32,
+}
+
+impl Pixel {
+    /// Whether all of it is finite.
+    pub fn is_finite(&self) -> bool {
+        let depths = [self.opacity, self.depth, self.median_depth];
+        self.colour.iter().chain(&self.premultiplied).chain(&depths).all(|v| v.is_finite())
+    }
+}
+
+/// Rays that couldn't be cast.
+#[derive(Debug, thiserror::Error)]
+pub enum RenderError {
+    /// What the field is computed by refused: a library, or its device.
+    #[error("the field can't be rendered: {0}")]
+    Backend(String),
+    /// A pixel isn't finite.
+    #[error("the field renders numbers that aren't finite; train it again, with a lower rate")]
+    NotFinite,
+}
+
+/// Whatever rays can be cast through: what renders views needn't know which field it has.
+pub trait RayField {
+    /// Colour, opacity and depth of each ray.
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError>;
+}
+
+impl<F: RayField + ?Sized> RayField for &F {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        (**self).render(rays)
+    }
+}
+
+impl RayField for Field {
+    fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+        Ok(Self::render(self, rays))
+    }
+}
+
+impl Field {
+    /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number
+    /// of threads.
+    pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
+        rays.par_chunks(CHUNK_RAYS)
+            .map_init(Chunk::default, |chunk, rays| {
+                let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
+                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
+                let pixel = |(i, ray): (usize, &Ray)| {
+                    let sum = &chunk.sums[i];
+                    let far = if clipped[i].leave > clipped[i].enter {
+                        clipped[i].distance(clipped[i].leave)
+                    } else {
+                        self.bounds.far as f32
+                    };
+                    let opacity = 1.0 - sum.transmittance;
+                    Pixel {
+                        colour: std::array::from_fn(|c| {
+                            sum.transmittance.mul_add(ray.background[c], sum.colour[c])
+                        }),
+                        premultiplied: sum.colour,
+                        opacity,
+                        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
+                        median_depth: sum.median.map_or(far, |t| clipped[i].distance(t)),
+                    }
+                };
+                rays.iter().enumerate().map(pixel).collect::<Vec<_>>()
+            })
+            .flatten_iter()
+            .collect()
+    }
+}

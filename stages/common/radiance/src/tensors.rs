@@ -1,0 +1,118 @@
+use std::borrow::Cow;
+use std::path::{Path, PathBuf};
+
+use safetensors::tensor::{Dtype, SafeTensors, View};
+
+/// A field that can't be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum FieldError {
+    /// The file can't be opened.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file isn't a field.
+    #[error("{path}: {reason}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// A tensor to write.
+pub(crate) enum Tensor<'a> {
+    F32(&'a [f32]),
+    U8(&'a [u8]),
+}
+
+/// A tensor with its shape, whose bytes are made when they are written: a copy of the largest
+/// tensor at a time.
+struct Written<'a>(&'a Tensor<'a>, [usize; 1]);
+
+impl View for Written<'_> {
+    fn dtype(&self) -> Dtype {
+        match self.0 {
+            Tensor::F32(_) => Dtype::F32,
+            Tensor::U8(_) => Dtype::U8,
+        }
+    }
+
+    fn shape(&self) -> &[usize] {
+        &self.1
+    }
+
+    fn data(&self) -> Cow<'_, [u8]> {
+        match self.0 {
+            Tensor::F32(numbers) => {
+                Cow::Owned(numbers.iter().flat_map(|x| x.to_le_bytes()).collect())
+            }
+            Tensor::U8(bytes) => Cow::Borrowed(bytes),
+        }
+    }
+
+    fn data_len(&self) -> usize {
+        match self.0 {
+            Tensor::F32(numbers) => size_of_val(*numbers),
+            Tensor::U8(bytes) => bytes.len(),
+        }
+    }
+}
+
+impl Tensor<'_> {
+    fn len(&self) -> usize {
+        match self {
+            Self::F32(numbers) => numbers.len(),
+            Self::U8(bytes) => bytes.len(),
+        }
+    }
+}
+
+pub(crate) fn write_tensors(path: &Path, tensors: &[(&str, Tensor<'_>)]) -> Result<(), FieldError> {
+    let views = tensors.iter().map(|(name, tensor)| (*name, Written(tensor, [tensor.len()])));
+    let io = |source| FieldError::Io { path: path.to_path_buf(), source };
+    let whole = safetensors::serialize(views, None)
+        .map_err(|e| io(std::io::Error::other(e.to_string())))?;
+    std::fs::write(path, whole).map_err(io)
+}
+
+pub(crate) fn read_f32(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    into: &mut [f32],
+) -> Result<(), String> {
+    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+    let (data, rest) = tensor.data().as_chunks::<4>();
+    if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
+        return Err(format!(
+            "tensor {name}: {:?} {:?} where {} f32 are expected",
+            tensor.dtype(),
+            tensor.shape(),
+            into.len()
+        ));
+    }
+    for (value, bytes) in into.iter_mut().zip(data) {
+        *value = f32::from_le_bytes(*bytes);
+    }
+    Ok(())
+}
+
+pub(crate) fn read_u8(
+    tensors: &SafeTensors<'_>,
+    name: &str,
+    len: usize,
+) -> Result<Vec<u8>, String> {
+    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+    if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
+        return Err(format!(
+            "tensor {name}: {:?} {:?} where {len} u8 are expected",
+            tensor.dtype(),
+            tensor.shape()
+        ));
+    }
+    Ok(tensor.data().to_vec())
+}

@@ -1,0 +1,89 @@
+use std::path::Path;
+
+use safetensors::SafeTensors;
+
+use super::{Moments, Trainer};
+use crate::occupancy::CELLS;
+use crate::tally::Tally;
+use crate::tensors::{FieldError, Tensor, read_f32, read_u8, write_tensors};
+
+impl Trainer {
+    /// Writes all that a resumed training needs to end in the same bytes. The caller makes it
+    /// atomic.
+    pub fn write_checkpoint(&self, path: &Path) -> Result<(), FieldError> {
+        let counters = self.tally.counters().into_iter().chain([self.samples_per_ray.to_bits()]);
+        let counters: Vec<u8> = counters.flat_map(u64::to_le_bytes).collect();
+        let occupied = self.field.occupancy.to_bytes();
+        let average = self.average.iter();
+        let average = average.flat_map(|a| {
+            [("average.grid", Tensor::F32(&a.grid)), ("average.network", Tensor::F32(&a.network))]
+        });
+        let tensors: Vec<_> = average
+            .chain([
+                ("counters", Tensor::U8(&counters)),
+                ("density", Tensor::F32(self.field.occupancy.density())),
+                ("first.grid", Tensor::F32(&self.first.grid)),
+                ("first.network", Tensor::F32(&self.first.network)),
+                ("grid", Tensor::F32(&self.field.grid)),
+                ("network", Tensor::F32(&self.field.network)),
+                ("occupied", Tensor::U8(&occupied)),
+                ("second.grid", Tensor::F32(&self.second.grid)),
+                ("second.network", Tensor::F32(&self.second.network)),
+            ])
+            .collect();
+        write_tensors(path, &tensors)
+    }
+
+    /// The step a checkpoint was written at.
+    pub fn checkpoint_step(path: &Path) -> Result<u64, FieldError> {
+        read_counters(path, |_, counters| Ok(counters[0]))
+    }
+
+    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
+        read_counters(path, |tensors, counters| {
+            let field = &mut self.field;
+            let averaged = tensors.names().contains(&"average.grid");
+            self.average = averaged.then(|| Moments {
+                grid: vec![0.0; field.grid.len()],
+                network: vec![0.0; field.network.len()],
+            });
+            if let Some(average) = &mut self.average {
+                read_f32(tensors, "average.grid", &mut average.grid)?;
+                read_f32(tensors, "average.network", &mut average.network)?;
+            }
+            for (name, into) in [
+                ("first.grid", &mut self.first.grid),
+                ("first.network", &mut self.first.network),
+                ("grid", &mut field.grid),
+                ("network", &mut field.network),
+                ("second.grid", &mut self.second.grid),
+                ("second.network", &mut self.second.network),
+            ] {
+                read_f32(tensors, name, into)?;
+            }
+            let mut density = vec![0.0; CELLS];
+            read_f32(tensors, "density", &mut density)?;
+            field.occupancy.restore(density, &read_u8(tensors, "occupied", CELLS)?);
+            let [tally @ .., samples_per_ray] = counters;
+            self.tally = Tally::from_counters(tally);
+            self.samples_per_ray = f64::from_bits(samples_per_ray);
+            Ok(())
+        })
+    }
+}
+
+/// Opens a checkpoint and reads its six counters.
+fn read_counters<T>(
+    path: &Path,
+    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>,
+) -> Result<T, FieldError> {
+    let bytes = std::fs::read(path)
+        .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
+    let read = || {
+        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
+        let counters = read_u8(&tensors, "counters", 48)?;
+        then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
+    };
+    read().map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+}

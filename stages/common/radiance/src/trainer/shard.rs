@@ -1,0 +1,134 @@
+use std::ops::Range;
+
+use super::TrainingOptions;
+use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
+use crate::composite::Regularisers;
+use crate::field::Field;
+use crate::mlp::drain_lanes;
+use crate::occupancy::Strides;
+use crate::ray::{NormalizedRay, Ray, clip};
+use crate::shading::{NetworkGradients, RayGradients};
+use crate::simd::LANES;
+use crate::supervisor::Supervisor;
+
+/// What all shards of a step read.
+pub(super) struct StepWork<'a, S> {
+    pub(super) field: &'a Field,
+    /// The networks' weights output by output.
+    pub(super) transposed: &'a [f32],
+    pub(super) supervision: &'a S,
+    pub(super) options: &'a TrainingOptions,
+    pub(super) first_bundle: u64,
+    pub(super) first_ray: u64,
+    /// Bundles of the step.
+    pub(super) bundles: usize,
+}
+
+/// What a shard leaves for the sums.
+#[derive(Default)]
+pub(super) struct Shard {
+    pub(super) colours: Vec<[f32; 3]>,
+    pub(super) features: FeatureGradients,
+    pub(super) network: Vec<f32>,
+    pub(super) loss: f64,
+    pub(super) samples: usize,
+}
+
+/// Buffers of one thread.
+#[derive(Default)]
+pub(super) struct Worker {
+    chunk: Chunk,
+    lanes: Vec<f32>,
+    rays: Vec<Ray>,
+    clipped: Vec<NormalizedRay>,
+    offsets: Vec<f32>,
+    backgrounds: Vec<[f32; 3]>,
+    colours: Vec<[f32; 3]>,
+    gradients: Vec<[f32; 3]>,
+}
+
+impl Shard {
+    /// Takes a range of the step's bundles forward and back.
+    pub(super) fn run(
+        &mut self,
+        worker: &mut Worker,
+        work: &StepWork<'_, impl Supervisor>,
+        range: Range<usize>,
+    ) {
+        self.colours.clear();
+        self.features.clear();
+        self.network.resize(work.field.network.len(), 0.0);
+        self.network.fill(0.0);
+        (self.loss, self.samples) = (0.0, 0);
+        worker.lanes.resize(work.field.network.len() * LANES, 0.0);
+        let chunk_bundles = (CHUNK_RAYS / work.supervision.rays_per_bundle()).max(1);
+        let mut next = range.start;
+        while next < range.end {
+            let here = next..(next + chunk_bundles).min(range.end);
+            next = here.end;
+            self.run_chunk(worker, work, here);
+        }
+        drain_lanes(&mut worker.lanes, &mut self.network);
+    }
+
+    /// Takes a few bundles forward and back.
+    fn run_chunk(
+        &mut self,
+        worker: &mut Worker,
+        work: &StepWork<'_, impl Supervisor>,
+        here: Range<usize>,
+    ) {
+        let StepWork { field, supervision, options, .. } = *work;
+        let bundle = supervision.rays_per_bundle();
+        let rays = here.len() * bundle;
+        worker.rays.resize(rays, Ray::default());
+        worker.colours.resize(rays, [0.0; 3]);
+        worker.gradients.resize(rays, [0.0; 3]);
+        let numbers = here.clone().map(|g| work.first_bundle + g as u64);
+        for (number, rays) in numbers.clone().zip(worker.rays.chunks_exact_mut(bundle)) {
+            supervision.sample_rays(number, rays);
+        }
+        worker.clipped.clear();
+        worker.clipped.extend(worker.rays.iter().map(|r| clip(&field.bounds, r)));
+        worker.backgrounds.clear();
+        worker.backgrounds.extend(worker.rays.iter().map(|r| r.background));
+        let first_ray = work.first_ray + (here.start * bundle) as u64;
+        worker.offsets.clear();
+        worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
+        worker.chunk.forward(field, &worker.clipped, &worker.offsets, Strides::ByCell);
+        self.samples += worker.chunk.samples();
+        for (colour, (sum, background)) in
+            worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds))
+        {
+            *colour =
+                std::array::from_fn(|c| sum.transmittance.mul_add(background[c], sum.colour[c]));
+        }
+        let judged =
+            worker.colours.chunks_exact(bundle).zip(worker.gradients.chunks_exact_mut(bundle));
+        for (number, (colours, gradients)) in numbers.zip(judged) {
+            self.loss += supervision.loss_and_gradient(number, colours, gradients);
+        }
+        self.colours.extend_from_slice(&worker.colours);
+        let scale = 1.0 / work.bundles as f32;
+        worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
+        let of_ray = |weight: f32| weight * scale / bundle as f32;
+        let regularisers = Regularisers {
+            distortion: of_ray(options.distortion),
+            floater_loss: of_ray(options.floater_loss),
+        };
+        let towards = RayGradients {
+            colours: &worker.gradients,
+            backgrounds: &worker.backgrounds,
+            regularisers,
+        };
+        let mut network =
+            NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };
+        worker.chunk.backward(
+            field,
+            towards,
+            options.roulette(first_ray),
+            &mut network,
+            &mut self.features,
+        );
+    }
+}

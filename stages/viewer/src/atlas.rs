@@ -1,0 +1,127 @@
+//! The volume as bytes, as the page reads them.
+//!
+//! First a byte for each place of the grid of bricks, x fastest: how far the next brick is, 0 in
+//! one. Then one plane a channel, each with a byte for every voxel of all bricks: opacity, red,
+//! green and blue (premultiplied), then the view's components, 128 for 0, premultiplied, too. The
+//! whole is deflated (zlib).
+
+use std::io::Write as _;
+
+use flate2::{Compression, write::ZlibEncoder};
+
+use crate::bake::Volume;
+use crate::bricks::{Bricks, SIDE, VOXELS};
+use crate::view::Components;
+
+/// Components of the view dependence that voxels have: those of one texture.
+pub(crate) const COMPONENTS: usize = 4;
+/// Channels of a voxel.
+const CHANNELS: usize = 4 + COMPONENTS;
+
+/// A volume, packed.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Atlas {
+    pub(crate) resolution: usize,
+    pub(crate) bricks: usize,
+    pub(crate) components: Components,
+    /// Deflated.
+    pub(crate) bytes: Vec<u8>,
+}
+
+impl Atlas {
+    /// Packs a volume.
+    pub(crate) fn pack(volume: &Volume) -> std::io::Result<Self> {
+        let side = volume.resolution / SIDE;
+        let mut is_kept = vec![false; side * side * side];
+        for voxel in &volume.voxels {
+            let [x, y, z] = voxel.place.map(|c| usize::from(c) / SIDE);
+            is_kept[x + side * (y + side * z)] = true;
+        }
+        let bricks = Bricks::new(volume.resolution, |[x, y, z]| is_kept[x + side * (y + side * z)]);
+        let components =
+            Components::of(volume.voxels.iter().map(|v| (&v.view, v.opacity)), COMPONENTS);
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
+        encoder.write_all(&bricks.distances())?;
+        encoder.write_all(&planes(volume, &bricks, &components))?;
+        Ok(Self {
+            resolution: volume.resolution,
+            bricks: bricks.len(),
+            components,
+            bytes: encoder.finish()?,
+        })
+    }
+}
+
+/// All channels of all voxels.
+fn planes(volume: &Volume, bricks: &Bricks, components: &Components) -> Vec<u8> {
+    let count = bricks.len() * VOXELS;
+    let mut planes = vec![0; 4 * count];
+    planes.resize(CHANNELS * count, 128);
+    for voxel in &volume.voxels {
+        let Some(at) = bricks.voxel(voxel.place.map(usize::from)) else { continue };
+        let level = |x: f32| (255.0 * x.max(0.0).min(1.0)).round() as u8;
+        planes[at] = level(voxel.opacity);
+        for c in 0..3 {
+            planes[(1 + c) * count + at] = level(voxel.opacity * voxel.colour[c]);
+        }
+        for (k, value) in components.of_voxel(&voxel.view).enumerate() {
+            planes[(4 + k) * count + at] = (128.0 + 127.0 * voxel.opacity * value).round() as u8;
+        }
+    }
+    planes
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read as _;
+
+    use super::*;
+    use crate::bake::bake;
+    use crate::bake::tests::{Ball, bounds, cameras};
+
+    fn packed() -> (Volume, Atlas) {
+        let ball = Ball { radius: 0.3, density: 200.0 };
+        let volume = bake(&[ball], &bounds(), &cameras(), 64);
+        let atlas = Atlas::pack(&volume).unwrap();
+        (volume, atlas)
+    }
+
+    /// Every voxel is found again in the bytes, as near as a byte comes.
+    #[test]
+    fn bytes_say_what_voxels_are() {
+        let (volume, atlas) = packed();
+        let mut bytes = Vec::new();
+        flate2::read::ZlibDecoder::new(&atlas.bytes[..]).read_to_end(&mut bytes).unwrap();
+        let (distances, planes) = bytes.split_at(8 * 8 * 8);
+        assert_eq!(planes.len(), CHANNELS * VOXELS * atlas.bricks);
+        let bricks = Bricks::new(64, |[x, y, z]| distances[x + 8 * (y + 8 * z)] == 0);
+        assert_eq!((bricks.len(), &bricks.distances()[..]), (atlas.bricks, distances));
+        let count = atlas.bricks * VOXELS;
+        let mut opaque = 0;
+        for voxel in &volume.voxels {
+            let at = bricks.voxel(voxel.place.map(usize::from)).unwrap();
+            let byte = |plane: usize| f32::from(planes[plane * count + at]);
+            opaque += usize::from(byte(0) > 0.0);
+            assert!((byte(0) / 255.0 - voxel.opacity).abs() < 0.51 / 255.0);
+            for c in 0..3 {
+                let expected = voxel.opacity * voxel.colour[c];
+                assert!((byte(1 + c) / 255.0 - expected).abs() < 0.51 / 255.0);
+            }
+            for (k, value) in atlas.components.of_voxel(&voxel.view).enumerate() {
+                let found = (byte(4 + k) - 128.0) / 127.0;
+                assert!((found - voxel.opacity * value).abs() < 0.51 / 127.0);
+            }
+        }
+        assert!(opaque == volume.voxels.len() && opaque > 0);
+        // Besides there is nothing.
+        assert_eq!(planes[..count].iter().filter(|&&opacity| opacity > 0).count(), opaque);
+    }
+
+    /// A ball's surface takes a few bytes a voxel.
+    #[test]
+    fn packing_is_small_and_repeats() {
+        let (volume, atlas) = packed();
+        assert!(atlas.bytes.len() < 8 * volume.voxels.len(), "{}", atlas.bytes.len());
+        assert!(packed().1 == atlas);
+    }
+}

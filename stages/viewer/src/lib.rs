@@ -1,0 +1,231 @@
+//! `viewer`: a trained field as one HTML page to look around in, without the field or a network.
+//!
+//! A sink. It bakes the field into a sparse volume and puts this volume, the training cameras,
+//! their LR photographs and a small WebGL2 renderer into `index.html`. A sweep's points get a
+//! folder each.
+//!
+//! * `bake`: the field as voxels: opacity, mean colour, and how this changes with the direction
+//!   (`view`). As in SNeRG (Hedman et al. 2021) the direction changes a ray's composited colour,
+//!   once a ray. Voxels that no training camera sees are left out (`visibility`).
+//! * `bricks`, `atlas`: voxels in bricks of 8³, packed into deflated bytes.
+//! * `page`: the HTML file; script, style and shader lie in `src/page/`.
+//! * `overview`: where the view starts, and around what it turns.
+//!
+//! Places are those of the field's unit cube ([`scene::Space`]), and the shader maps its rays there
+//! as the field does. Only boxes are shown: fields of the other spaces are too hazy to be baked so.
+
+mod atlas;
+mod bake;
+mod bricks;
+mod overview;
+mod page;
+mod source;
+mod space;
+mod view;
+mod visibility;
+
+use std::path::Path;
+
+use anyhow::Context as _;
+use artifact::{
+    Context, Failure, FailureExt as _, GivenInput, Input, Output, RunNode, RunRecord, Stage,
+};
+use base64::Engine as _;
+use pixels::{Filter, encode_png, resize_pillow};
+use radiance::{FIELD_FILE, Field, FieldFile, FieldModel};
+use scene::{Bounds, Camera, Space, Views};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::atlas::Atlas;
+use crate::page::{ImageSize, PageCamera, PageScene};
+
+/// Parameters of `viewer`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Voxels along each side of the field's unit cube; a multiple of 8. Memory and file grow with
+    /// its square, the time to bake with its cube.
+    #[schemars(range(min = 32, max = 512), extend("multipleOf" = 8))]
+    pub resolution: u32,
+    /// Number of LR photographs in the page at most, spread evenly over the training views.
+    #[schemars(range(min = 0, max = 1000))]
+    pub photographs: u32,
+    /// Width of these photographs at most; wider ones are shrunk.
+    #[schemars(range(min = 16, max = 4096))]
+    pub photograph_width: u32,
+}
+
+impl Default for Params {
+    fn default() -> Self {
+        Self { resolution: 256, photographs: 100, photograph_width: 400 }
+    }
+}
+
+/// The stage.
+pub struct Viewer;
+
+impl Stage for Viewer {
+    type Params = Params;
+    const NAME: &'static str = "viewer";
+    const SUMMARY: &'static str = "Bakes a field into one HTML page to look around in.";
+    const SINK: bool = true;
+
+    fn inputs() -> Vec<(&'static str, Input)> {
+        vec![(
+            "run",
+            Input::required(&["run"], "folder with run.json: the record of what trained the field"),
+        )]
+    }
+
+    fn output() -> Output {
+        Output::kind("page")
+    }
+
+    fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+        let run: RunRecord = context.input("run")?.read_json("run.json")?;
+        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
+        let fields: Vec<&RunNode> =
+            run.nodes.iter().filter(|n| n.is_shown && n.kind == "field").collect();
+        if fields.is_empty() {
+            let message = "run.json: nothing that it shows is a field; give `run: train-ss`";
+            return Err(Failure::BadInput(message.to_owned()).into());
+        }
+        for (i, node) in fields.iter().enumerate() {
+            let prefix = if fields.len() == 1 {
+                String::new()
+            } else {
+                format!("{}-{}/", i + 1, folder_name(node))
+            };
+            show(context, params, &run, node, &prefix)
+                .with_context(|| format!("{} {}", node.stage, node.point).trim_end().to_owned())?;
+        }
+        Ok(())
+    }
+}
+
+/// What tells a sweep's page from the others: its values, as far as a folder can have them in its
+/// name.
+fn folder_name(node: &RunNode) -> String {
+    let text = if node.point.is_empty() { &node.stage } else { &node.point };
+    text.replace(", ", "-")
+        .chars()
+        .map(|c| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' })
+        .collect()
+}
+
+/// Writes the page of one field.
+fn show(
+    context: &Context,
+    params: &Params,
+    run: &RunRecord,
+    node: &RunNode,
+    prefix: &str,
+) -> anyhow::Result<()> {
+    let (file, fields) = read_fields(&node.folder)?;
+    check_space(&file.bounds)?;
+    let scene = node.inputs.get("scene").map(|input| run.folder_of(input));
+    let scene = scene.with_context(|| "the field's training has no input `scene`")?;
+    let views = Views::of_folder(&scene)?;
+    let cameras: Vec<&Camera> = views.views.iter().map(|view| &view.camera).collect();
+    let resolution = params.resolution as usize;
+    let progress = context.progress("baking", 2);
+    let looking = visibility::looking(&cameras, resolution);
+    let volume = bake::bake(&fields, &file.bounds, &looking, resolution);
+    progress.add(1);
+    let atlas = Atlas::pack(&volume)?;
+    progress.add(1);
+    let (centre, size) = overview::middle(&file.bounds, &volume);
+    let up = overview::up(&cameras);
+    let described = PageScene {
+        resolution,
+        bricks: atlas.bricks,
+        components: atlas.components.for_shader(),
+        background: file.background.shown(),
+        bounds: page_bounds(file.bounds),
+        centre: centre.to_array(),
+        size,
+        up: up.to_array(),
+        start: overview::start(&cameras, up),
+        cameras: page_cameras(params, &scene, &views)?,
+    };
+    let html = page::page(&described, &atlas)?.into_string();
+    let path = context.output_path(&format!("{prefix}index.html"))?;
+    std::fs::write(&path, html).with_context(|| format!("cannot write {}", path.display()))
+}
+
+/// Refuses the spaces of scenes without end. Their fields are hazy: a voxel's own view features say
+/// too little of what a ray through haze composites, and pages look washed out.
+fn check_space(bounds: &Bounds) -> Result<(), Failure> {
+    let space = match bounds.space {
+        Space::Box => return Ok(()),
+        Space::Ndc(_) => "ndc",
+        Space::Contraction => "contraction",
+    };
+    Err(Failure::BadInput(format!(
+        "field.json: the field's space is {space}; the viewer shows only a box: give prep `space: \
+        box` where the scene ends"
+    )))
+}
+
+/// What limits the page's rays: of a box its faces alone, since people come nearer than cameras did
+/// and go farther away.
+fn page_bounds(bounds: Bounds) -> Bounds {
+    match bounds.space {
+        Space::Box => Bounds { near: 0.0, far: 1e30, ..bounds },
+        Space::Ndc(_) | Space::Contraction => bounds,
+    }
+}
+
+/// All fields of an artifact.
+fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
+    let input = GivenInput::open("field", folder)?;
+    let file: FieldFile = input.read_json(FIELD_FILE)?;
+    file.check().map_err(|reason| {
+        Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
+    })?;
+    let FieldModel::Grid(architecture) = file.field else {
+        let message = "the paper's field can't be baked; train with `field: grid` to view it";
+        return Err(Failure::BadInput(message.to_owned()).into());
+    };
+    let fields = (0..file.members)
+        .map(|i| Field::read(&input.path(&FieldFile::member(i)), architecture, file.bounds))
+        .collect::<Result<_, _>>()
+        .bad_input("field")?;
+    Ok((file, fields))
+}
+
+/// The training cameras, some of them with their photograph.
+fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result<Vec<PageCamera>> {
+    let (count, most) = (views.views.len(), params.photographs as usize);
+    let camera = |(i, view): (usize, &scene::View)| {
+        // One in so many: where the share so far passes a whole number.
+        let is_shown = (i + 1) * most / count > i * most / count;
+        let photograph = match &view.image {
+            Some(file) if is_shown => {
+                let image = pixels::read_premultiplied(&folder.join(file))?;
+                let image = image.over(views.background.shown()).to_rgba8();
+                let times = image.width.div_ceil(params.photograph_width as usize);
+                let less = |size: usize| size.div_ceil(times).max(1);
+                Some(if times < 2 {
+                    image
+                } else {
+                    resize_pillow(&image, less(image.width), less(image.height), Filter::Box)
+                })
+            }
+            _ => None,
+        };
+        let data = |image: &pixels::Rgba8| {
+            let text = base64::engine::general_purpose::STANDARD.encode(encode_png(image));
+            format!("data:image/png;base64,{text}")
+        };
+        Ok(PageCamera {
+            name: view.camera.name.clone(),
+            camera_to_world: view.camera.camera_to_world,
+            intrinsics: view.camera.intrinsics,
+            photograph: photograph.as_ref().map(data),
+            photograph_size: photograph.map(|p| ImageSize { width: p.width, height: p.height }),
+        })
+    };
+    views.views.iter().enumerate().map(camera).collect()
+}

@@ -1,0 +1,124 @@
+//! Where a view of the scene starts, and around what it turns.
+
+use glam::{DMat3, DVec3};
+use nalgebra::{Matrix3, SymmetricEigen};
+use scene::{Bounds, Camera, Space, common_direction};
+
+use crate::bake::Volume;
+use crate::space::to_world;
+
+/// Sine of the angle above the horizon from which things look best.
+const FROM_ABOVE: f64 = 0.4;
+
+/// Middle and extent of a scene, in scene units: the box of a contraction, else where voxels lie.
+pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
+    let of_box = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
+    if bounds.space == Space::Contraction || volume.voxels.is_empty() {
+        return (of_box, bounds.longest_side());
+    }
+    let resolution = volume.resolution as f64;
+    let points: Vec<DVec3> = volume
+        .voxels
+        .iter()
+        .map(|v| {
+            let place = DVec3::from(v.place.map(|c| (f64::from(c) + 0.5) / resolution));
+            to_world(bounds, place)
+        })
+        .collect();
+    let at = |mut values: Vec<f64>, share: f64| {
+        values.sort_by(f64::total_cmp);
+        values[((values.len() - 1) as f64 * share) as usize]
+    };
+    // A floater or two, and what lies far behind, don't move a median.
+    let centre =
+        DVec3::from([0, 1, 2].map(|axis| at(points.iter().map(|p| p[axis]).collect(), 0.5)));
+    let reach = at(points.iter().map(|p| p.distance(centre)).collect(), 0.9);
+    (centre, (2.0 * reach).max(f64::MIN_POSITIVE))
+}
+
+/// The scene's up direction: level cameras have their x axes across it. Where these say too little,
+/// the mean of the cameras' own up directions.
+pub(crate) fn up(cameras: &[&Camera]) -> DVec3 {
+    let axis = |i: usize| cameras.iter().map(move |c: &&Camera| c.rotation().col(i));
+    let mean = axis(1).sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z);
+    let moments: DMat3 =
+        axis(0).fold(DMat3::ZERO, |sum, x| sum + DMat3::from_cols(x * x.x, x * x.y, x * x.z));
+    let eigen = SymmetricEigen::new(Matrix3::from_fn(|i, j| moments.col(j)[i]));
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
+    let [least, second, most] = order.map(|i| eigen.eigenvalues[i]);
+    if second < 0.1 * most || least > 0.3 * second {
+        return mean;
+    }
+    let across = DVec3::from([0, 1, 2].map(|i| eigen.eigenvectors[(i, order[0])]));
+    if across.dot(mean) < 0.0 { -across } else { across }
+}
+
+/// The camera to begin with: one that looks from a little above; of cameras that look one way the
+/// one in their middle.
+pub(crate) fn start(cameras: &[&Camera], up: DVec3) -> usize {
+    let middle = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
+    let one_way = common_direction(cameras.iter().copied()).is_some();
+    let off = |camera: &Camera| {
+        if one_way {
+            camera.centre().distance(middle)
+        } else {
+            (-camera.forward().dot(up) - FROM_ABOVE).abs()
+        }
+    };
+    (0..cameras.len())
+        .min_by(|&a, &b| off(cameras[a]).total_cmp(&off(cameras[b])))
+        .unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bake::Voxel;
+    use crate::view::NUMBERS;
+    use scene::Intrinsics;
+
+    /// A level camera at a place, looking at the origin.
+    fn camera(centre: DVec3, up: DVec3) -> Camera {
+        let back = centre.normalize();
+        let right = up.cross(back).normalize();
+        let above = back.cross(right);
+        let row = |i: usize| [right[i], above[i], back[i], centre[i]];
+        Camera {
+            name: "a".into(),
+            intrinsics: Intrinsics::from_angle_x(8, 8, 0.5),
+            camera_to_world: [row(0), row(1), row(2)],
+        }
+    }
+
+    #[test]
+    fn level_cameras_say_what_is_up() {
+        let up_is = DVec3::new(0.1, -0.5, 0.8).normalize();
+        let side = up_is.any_orthonormal_vector();
+        // All on one side, so that the mean of their up directions leans away.
+        let places = (0..12).map(|i| {
+            let turn = glam::DQuat::from_axis_angle(up_is, 0.25 * f64::from(i));
+            turn * side * 3.0 + up_is * (0.5 + 0.2 * f64::from(i))
+        });
+        let cameras: Vec<Camera> = places.map(|p| camera(p, up_is)).collect();
+        let cameras: Vec<&Camera> = cameras.iter().collect();
+        assert!(up(&cameras).dot(up_is) > 0.9999, "{}", up(&cameras));
+        let start = cameras[start(&cameras, up_is)];
+        assert!((-start.forward().dot(up_is) - FROM_ABOVE).abs() < 0.1);
+        // One camera alone says it by itself.
+        assert!(up(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
+    }
+
+    #[test]
+    fn the_middle_is_that_of_most_voxels() {
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
+        let voxel = |place| Voxel { place, opacity: 1.0, colour: [0.5; 3], view: [0.0; NUMBERS] };
+        let mut voxels: Vec<Voxel> = (0..100).map(|i| voxel([40 + i % 5, 20, 32])).collect();
+        voxels.push(voxel([0, 63, 63]));
+        let (centre, size) = middle(&bounds, &Volume { resolution: 64, voxels });
+        let at = |c: f64| (c + 0.5) / 32.0 - 1.0;
+        assert!(centre.distance(DVec3::new(at(42.0), at(20.0), at(32.0))) < 1e-9, "{centre}");
+        assert!(size < 0.2, "{size}");
+    }
+}

@@ -1,0 +1,251 @@
+#version 300 es
+// One ray a pixel through the volume: opacity, colour and view components of every step are
+// composited; then the direction changes the colour, once a ray (deferred shading, as the field
+// has it itself).
+precision highp float;
+precision highp int;
+precision highp sampler3D;
+precision highp usampler3D;
+
+// The volume. A place of `bricks` has the brick's place in the atlas (rgb) and the distance to the
+// next brick in bricks (a), 0 in one. A brick is 8³ voxels and the first of its neighbours behind.
+uniform usampler3D bricks;
+uniform sampler3D colours;  // rgb: colour times opacity; a: opacity of a step of a voxel's length
+uniform sampler3D views;    // components of the view dependence times opacity
+uniform vec3 atlas_size;    // of both textures, in texels
+uniform float resolution;   // voxels along the cube's side
+uniform vec3 components[36];  // four times nine spherical harmonics' red, green and blue
+
+// The field's space: how the world is mapped to its unit cube.
+const int BOX = 0, NDC = 1, CONTRACTION = 2;
+uniform int space;
+uniform vec3 box_min, box_max;
+uniform vec2 range;               // distances between which there is anything
+uniform mat3 frustum_rotation;    // world to the virtual camera of NDC, whose depth is positive
+uniform vec3 frustum_centre;
+uniform vec4 frustum_slopes;      // smallest x and y, largest x and y
+uniform vec2 frustum_depths;
+
+// The camera: OpenGL's axes; pixels from the top left corner.
+uniform mat3 rotation;
+uniform vec3 centre;
+uniform vec4 intrinsics;  // fx, fy, cx, cy
+uniform float height;
+
+const int COLOUR = 0, DEPTH = 1, OPACITY = 2, READS = 3;
+uniform int mode;
+uniform vec3 background;
+uniform vec2 depth_range;
+
+out vec4 shown;
+
+const float FAR = 1e30;
+// Steps in voxels. Shorter ones show the same, with more reads.
+const float STEP = 1.0;
+// Light below which a ray ends.
+const float DARK = 1.0 / 256.0;
+const int MOST_STEPS = 4096;
+
+int reads = 0;
+
+// A ray in the cube, by a parameter t: see RayMap in stages/common/radiance/src/ray.rs.
+struct CubeRay {
+  vec3 origin, direction;
+  float enter, leave;
+  // Distance: start + scale * t / (1 - bend * t), or start + scale * sinh(4t) where it is contracted.
+  float start, scale, bend;
+};
+
+const CubeRay MISS = CubeRay(vec3(0), vec3(0), 0.0, 0.0, 0.0, 1.0, 0.0);
+
+// Limits [enter, leave] to where offset + slope * x >= 0.
+void clip_to(float offset, float slope, inout vec2 part) {
+  if (slope > 0.0) part.x = max(part.x, -offset / slope);
+  else if (slope < 0.0) part.y = min(part.y, -offset / slope);
+  else if (offset < 0.0) part = vec2(1.0, 0.0);
+}
+
+CubeRay through_box(vec3 from, vec3 along) {
+  float side = max(max(box_max.x - box_min.x, box_max.y - box_min.y), box_max.z - box_min.z);
+  vec3 origin = (from - box_min) / side, extent = (box_max - box_min) / side;
+  vec2 part = range / side;
+  for (int i = 0; i < 3; i++) {
+    clip_to(origin[i], along[i], part);
+    clip_to(extent[i] - origin[i], -along[i], part);
+  }
+  return CubeRay(origin, along, part.x, part.y, 0.0, side, 0.0);
+}
+
+vec3 frustum_to_cube(vec3 p) {
+  vec2 low = frustum_slopes.xy, wide = frustum_slopes.zw - low;
+  float front = 1.0 / frustum_depths.x, back = 1.0 / frustum_depths.y;
+  return vec3((p.xy / p.z - low) / max(wide.x, wide.y), (front - 1.0 / p.z) / (front - back));
+}
+
+CubeRay through_frustum(vec3 from, vec3 along) {
+  vec3 o = frustum_rotation * (from - frustum_centre), d = frustum_rotation * along;
+  vec2 part = vec2(range.x, FAR);
+  clip_to(o.z - frustum_depths.x, d.z, part);
+  clip_to(frustum_depths.y - o.z, -d.z, part);
+  for (int i = 0; i < 2; i++) {
+    float low = frustum_slopes[i], high = frustum_slopes[i + 2];
+    clip_to(o[i] - low * o.z, d[i] - low * d.z, part);
+    clip_to(high * o.z - o[i], high * d.z - d[i], part);
+  }
+  if (part.x >= part.y || part.y >= FAR) return MISS;
+  vec3 first = o + part.x * d, last = o + part.y * d;
+  vec3 start = frustum_to_cube(first), way = frustum_to_cube(last) - start;
+  float len = length(way);
+  float c = len * last.z / (part.y - part.x);
+  return CubeRay(start, way / len, 0.0, len, part.x, first.z / c, d.z / c);
+}
+
+float asinh4(float x) { return 0.25 * sign(x) * log(abs(x) + sqrt(x * x + 1.0)); }
+
+CubeRay through_contraction(vec3 from, vec3 along) {
+  vec3 sides = box_max - box_min;
+  float radius = 0.5 * max(max(sides.x, sides.y), sides.z);
+  vec3 own = (from - 0.5 * (box_min + box_max)) / radius;
+  float to_nearest = -dot(own, along);
+  vec3 nearest = own + to_nearest * along;
+  float radii = max(length(nearest), 1.0);
+  float enter = asinh4((range.x / radius - to_nearest) / radii);
+  float leave = asinh4((range.y / radius - to_nearest) / radii);
+  return CubeRay(nearest, along, enter, leave, to_nearest * radius, radii * radius, radii);
+}
+
+CubeRay into_cube(vec3 from, vec3 along) {
+  if (space == BOX) return through_box(from, along);
+  if (space == NDC) return through_frustum(from, along);
+  return through_contraction(from, along);
+}
+
+float sinh4(float t) { float e = exp(4.0 * t); return 0.5 * (e - 1.0 / e); }
+
+vec3 place_at(CubeRay ray, float t) {
+  if (space != CONTRACTION) return ray.origin + t * ray.direction;
+  vec3 u = ray.origin + ray.bend * sinh4(t) * ray.direction;
+  float len = length(u);
+  return 0.5 + 0.25 * u * (len > 1.0 ? (2.0 - 1.0 / len) / len : 1.0);
+}
+
+float distance_at(CubeRay ray, float t) {
+  if (space == CONTRACTION) return ray.start + ray.scale * sinh4(t);
+  return ray.start + ray.scale * t / (1.0 - ray.bend * t);
+}
+
+// How far t goes until a ray leaves the empty bricks around, at least: `low` and `high` are their
+// corners in voxels.
+float way_out(CubeRay ray, vec3 at, vec3 low, vec3 high) {
+  if (space == CONTRACTION) {
+    // A place moves at most twice as fast as t.
+    vec3 free = min(at - low, high - at);
+    return 0.5 * min(min(free.x, free.y), free.z) / resolution;
+  }
+  vec3 speed = ray.direction * resolution;
+  vec3 wall = mix(low, high, step(0.0, speed));
+  vec3 way = mix((wall - at) / speed, vec3(FAR), lessThan(abs(speed), vec3(1e-6)));
+  return min(min(way.x, way.y), way.z);
+}
+
+// What is added to the colour's logit along a direction, for composited components.
+vec3 view_part(vec4 weights, vec3 d) {
+  float basis[9] = float[9](
+    0.2820948, -0.4886025 * d.y, 0.4886025 * d.z, -0.4886025 * d.x, 1.0925484 * d.x * d.y,
+    -1.0925484 * d.y * d.z, 0.31539157 * (3.0 * d.z * d.z - 1.0), -1.0925484 * d.x * d.z,
+    0.5462742 * (d.x * d.x - d.y * d.y));
+  vec3 sum = vec3(0);
+  for (int i = 0; i < 9; i++) {
+    sum += basis[i] * (weights.x * components[i] + weights.y * components[9 + i]
+      + weights.z * components[18 + i] + weights.w * components[27 + i]);
+  }
+  return sum;
+}
+
+struct Seen {
+  vec3 colour;    // times opacity
+  vec4 view;      // times opacity
+  float through;  // light that nothing stops
+  float median;   // t at which half of it is stopped; negative where that never is
+};
+
+Seen march(CubeRay ray) {
+  Seen seen = Seen(vec3(0), vec4(0), 1.0, -FAR);
+  float h = STEP / resolution;
+  ivec3 last = ivec3(resolution) / 8 - 1, current = ivec3(-1);
+  uvec4 brick;
+  float t = ray.enter + 0.5 * h;
+  for (int i = 0; i < MOST_STEPS && t < ray.leave && seen.through > DARK; i++) {
+    vec3 at = clamp(place_at(ray, t) * resolution - 0.5, 0.0, resolution - 1.0);
+    ivec3 own = min(ivec3(at) / 8, last);
+    if (own != current) {
+      brick = texelFetch(bricks, own, 0);
+      reads++;
+      current = own;
+    }
+    if (brick.a > 0u) {
+      float far = float(brick.a);
+      vec3 low = 8.0 * (vec3(own) - far + 1.0), high = 8.0 * (vec3(own) + far);
+      t += h * max(ceil(way_out(ray, at, low, high) / h), 1.0);
+      continue;
+    }
+    vec3 texel = (9.0 * vec3(brick.rgb) + at - 8.0 * vec3(own) + 0.5) / atlas_size;
+    vec4 colour = texture(colours, texel);
+    reads++;
+    if (colour.a > 0.0) {
+      float kept = STEP == 1.0 ? 1.0 - colour.a : pow(1.0 - colour.a, STEP);
+      float weight = seen.through * (1.0 - kept) / colour.a;
+      seen.colour += weight * colour.rgb;
+      seen.view += weight * (255.0 * texture(views, texel) - 128.0) / 127.0;
+      reads++;
+      float through = seen.through * max(kept, 1e-6);
+      if (seen.through > 0.5 && through <= 0.5) {
+        // Within the step light fades evenly.
+        seen.median = t + h * (log(2.0 * seen.through) / log(seen.through / through) - 0.5);
+      }
+      seen.through = through;
+    }
+    t += h;
+  }
+  return seen;
+}
+
+// Colours of depth from near (warm) to far.
+vec3 of_depth(float share) {
+  const vec3 stops[5] = vec3[5](
+    vec3(0.75, 0.15, 0.10), vec3(0.95, 0.60, 0.20), vec3(0.90, 0.90, 0.55), vec3(0.25, 0.65, 0.70),
+    vec3(0.15, 0.20, 0.50));
+  float at = 4.0 * clamp(share, 0.0, 1.0);
+  int k = min(int(at), 3);
+  return mix(stops[k], stops[k + 1], at - float(k));
+}
+
+vec3 logit(vec3 c) { c = clamp(c, 1.0 / 512.0, 511.0 / 512.0); return log(c / (1.0 - c)); }
+
+void main() {
+  vec2 pixel = vec2(gl_FragCoord.x, height - gl_FragCoord.y);
+  vec2 slope = (pixel - intrinsics.zw) / intrinsics.xy;
+  vec3 own = normalize(vec3(slope.x, -slope.y, -1.0));
+  vec3 along = rotation * own;
+  CubeRay ray = into_cube(centre, along);
+  Seen seen = march(ray);
+  float opacity = 1.0 - seen.through;
+  if (mode == READS) {
+    shown = vec4(float(reads % 256) / 255.0, float(reads / 256) / 255.0, 0.0, 1.0);
+  } else if (mode == OPACITY) {
+    shown = vec4(vec3(opacity), 1.0);
+  } else if (mode == DEPTH) {
+    float z = -own.z * distance_at(ray, seen.median);
+    // Even in disparity, so that what is near has most colours.
+    vec2 ends = 1.0 / depth_range;
+    vec3 colour = of_depth((1.0 / z - ends.x) / (ends.y - ends.x));
+    shown = vec4(seen.median > -FAR ? mix(vec3(1), colour, opacity) : vec3(1), 1.0);
+  } else {
+    vec3 colour = vec3(0);
+    if (opacity > 1.0 / 512.0) {
+      vec3 raw = logit(seen.colour / opacity) + view_part(seen.view / opacity, along);
+      colour = opacity / (1.0 + exp(-raw));
+    }
+    shown = vec4(colour + seen.through * background, 1.0);
+  }
+}

@@ -1,0 +1,212 @@
+//! `nerf-sr run viewer`: the page shows in a real browser what the field shows, and people can use
+//! it.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::path::{Path, PathBuf};
+
+use common::Project;
+use common::browser::run_in_browser;
+use glam::DVec3;
+use pixels::Rgba8;
+use serde_json::{Value, json};
+
+/// Views with the same size as the page's.
+const SIZE: &str = "render-depth.size=512";
+
+/// Letters of five columns, seven bits each, the lowest on top.
+const LETTERS: [[u8; 5]; 4] = [
+    [0x7f, 0x04, 0x08, 0x10, 0x7f], // N
+    [0x7f, 0x49, 0x49, 0x49, 0x41], // E
+    [0x7f, 0x09, 0x19, 0x29, 0x46], // R
+    [0x7f, 0x09, 0x09, 0x09, 0x01], // F
+];
+
+/// Whether a place of a board, 0 to 1 to the right and downwards, is ink: "NERF".
+fn is_ink(right: f64, down: f64) -> bool {
+    let (column, row) = ((26.0 * right - 1.5).floor(), (10.0 * down - 1.5).floor());
+    if !(0.0..24.0).contains(&column) || !(0.0..7.0).contains(&row) {
+        return false;
+    }
+    let (letter, column) = (column as usize / 6, column as usize % 6);
+    column < 5 && LETTERS[letter][column] >> row as u32 & 1 == 1
+}
+
+/// A board that stands on a plate, both with text that can be read from the front, or from above:
+/// red, green, blue and alpha.
+fn colour_along(origin: DVec3, direction: DVec3) -> [u8; 4] {
+    let blocks = [
+        (DVec3::new(-0.9, -0.05, -0.3), DVec3::new(0.9, 0.05, 0.5)),
+        (DVec3::new(-1.0, -0.7, -0.4), DVec3::new(1.0, 0.7, -0.3)),
+    ];
+    let mut nearest: Option<(f64, usize, usize)> = None;
+    for (block, (low, high)) in blocks.iter().enumerate() {
+        let (a, b) = ((low - origin) / direction, (high - origin) / direction);
+        let (enter, leave) = (a.min(b).max_element(), a.max(b).min_element());
+        if enter < leave && nearest.is_none_or(|(t, ..)| enter < t) {
+            let axis = (0..3).find(|&i| a.min(b)[i] == enter).unwrap();
+            nearest = Some((enter, block, axis));
+        }
+    }
+    let Some((t, block, axis)) = nearest else { return [0; 4] };
+    let ((low, high), p) = (blocks[block], origin + t * direction);
+    let share = (p - low) / (high - low);
+    let ink = match (block, axis) {
+        (0, 1) => direction.y > 0.0 && is_ink(share.x, 1.0 - share.z),
+        (1, 2) => direction.z < 0.0 && is_ink(share.x, 2.0 * (1.0 - share.y) - 1.0),
+        _ => false,
+    };
+    match (ink, block) {
+        (true, _) => [20, 20, 120, 255],
+        (false, 0) => [235, 200, 90, 255],
+        _ => [90, 170 + (10.0 * share.y) as u8, 120, 255],
+    }
+}
+
+/// A camera that looks at the middle.
+fn pose(centre: DVec3) -> [[f64; 4]; 4] {
+    let back = centre.normalize();
+    let right = if back.z > 0.999 { DVec3::X } else { DVec3::Z.cross(back).normalize() };
+    let above = back.cross(right);
+    let row = |i: usize| [right[i], above[i], back[i], centre[i]];
+    [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]]
+}
+
+/// Writes one of the data set's lists, and its images of 64 pixels.
+fn write_split(folder: &Path, split: &str, centres: &[DVec3]) {
+    const PIXELS: usize = 64;
+    let angle: f64 = 0.75;
+    let slope = |i: f64| (2.0 * i / PIXELS as f64 - 1.0) * (0.5 * angle).tan();
+    std::fs::create_dir_all(folder.join(split)).unwrap();
+    let mut frames = Vec::new();
+    for (k, centre) in centres.iter().enumerate() {
+        let matrix = pose(*centre);
+        let column = |c: usize| DVec3::from([0, 1, 2].map(|i| matrix[i][c]));
+        let data = (0..4 * PIXELS * PIXELS)
+            .step_by(4)
+            .flat_map(|at| {
+                let (x, y) = ((at / 4 % PIXELS) as f64, (at / 4 / PIXELS) as f64);
+                let way = |x: f64, y: f64| column(0) * slope(x) - column(1) * slope(y) - column(2);
+                // The mean of 16 rays, premultiplied.
+                let mut sum = [0.0; 4];
+                for sub in 0..16 {
+                    let within = |k: i32| (f64::from(k) + 0.5) / 4.0;
+                    let ray = way(x + within(sub % 4), y + within(sub / 4));
+                    let seen = colour_along(*centre, ray.normalize());
+                    (0..4).for_each(|c| sum[c] += f64::from(seen[c]));
+                }
+                let opaque = (sum[3] / 255.0).max(1.0);
+                [sum[0] / opaque, sum[1] / opaque, sum[2] / opaque, sum[3] / 16.0]
+                    .map(|v| v.round() as u8)
+            })
+            .collect();
+        let file = format!("{split}/r_{k}.png");
+        pixels::write_png(&folder.join(&file), &Rgba8::new(PIXELS, PIXELS, data)).unwrap();
+        frames.push(json!({"file_path": format!("./{split}/r_{k}"), "transform_matrix": matrix}));
+    }
+    let list = json!({"camera_angle_x": angle, "frames": frames});
+    std::fs::write(folder.join(format!("transforms_{split}.json")), list.to_string()).unwrap();
+}
+
+/// A data set of the boards; test views are one from the front, one from the side, and one that
+/// looks straight down.
+fn text_scene(folder: &Path) {
+    let around = |turn: f64, height: f64| {
+        let level = (1.0 - height * height).sqrt();
+        3.5 * DVec3::new(level * turn.sin(), -level * turn.cos(), height)
+    };
+    let train: Vec<DVec3> =
+        (0..40).map(|i| around(2.4 * f64::from(i), 0.02 + 0.97 * f64::from(i) / 40.0)).collect();
+    write_split(folder, "train", &train);
+    write_split(folder, "test", &[around(0.1, 0.25), around(0.9, 0.4), around(0.0, 1.0)]);
+}
+
+/// A project whose field was trained, baked and rendered; the page and the rendered views.
+fn viewed(project: &Project, arguments: &[&str]) -> (PathBuf, PathBuf) {
+    project.ok(&[&["run", "viewer"], arguments].concat());
+    let rendering = [&["run", "render-depth", "-p", SIZE], arguments].concat();
+    project.ok(&rendering);
+    let views =
+        project.artifact("render-depth", &[&["render-depth", "-p", SIZE], arguments].concat());
+    (project.path("out/viewer/index.html"), views)
+}
+
+/// Each view of the page: its name, and its figures.
+#[track_caller]
+fn checked(page: &Path, views: &Path, least: f64, most_reads: f64) -> Option<Vec<Value>> {
+    let found = run_in_browser("viewer.mjs", [page, views])?;
+    assert_eq!(found["problems"], json!([]));
+    let views = found["views"].as_array().unwrap().clone();
+    println!("{views:#?}");
+    for view in &views {
+        let number = |key: &str| view[key].as_f64().unwrap();
+        assert!(number("psnr") >= least, "{view}");
+        assert!(number("reads") <= most_reads && number("reads") >= 1.0, "{view}");
+    }
+    Some(views)
+}
+
+#[test]
+fn the_page_shows_text_as_the_field_does() {
+    let project = Project::shipped(&["viewer"], "  prep:\n    parameters: {lr_width: 32}\n");
+    text_scene(&project.path("text"));
+    let arguments = ["-i", "dataset=./text", "-p", "rays=300000", "-p", "hidden_dim=32"];
+    let (page, views) = viewed(&project, &arguments);
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(html.len() < 25_000_000 && !html.contains("://"), "{} bytes", html.len());
+    let Some(views) = checked(&page, &views, 27.0, 64.0) else { return };
+    assert_eq!(views.len(), 3);
+    // A mirrored page would show mirrored text.
+    for view in &views {
+        let [psnr, mirrored] = ["psnr", "mirrored"].map(|key| view[key].as_f64().unwrap());
+        assert!(mirrored < psnr - 6.0, "{view}");
+    }
+}
+
+/// Fields of scenes without end aren't shown wrong, but refused.
+#[test]
+fn other_spaces_are_refused() {
+    let blocks = "  demo-scene:\n    parameters: {layout: forward, backdrop: true}\n";
+    let project = Project::shipped(&["viewer"], blocks);
+    project.run(&["run", "viewer", "-p", "rays=4000"]).fails(1, &["viewer", "ndc", "box"]);
+    assert!(!project.path("out/viewer/index.html").exists());
+}
+
+/// What people do with mouse, keys and fingers changes the view as they expect.
+#[test]
+fn people_can_look_around() {
+    let project = Project::shipped(&["viewer"], "");
+    project.ok(&["run", "viewer", "-p", "resolution=64", "-p", "photographs=6"]);
+    let page = project.path("out/viewer/index.html");
+    let Some(found) = run_in_browser("viewer-controls.mjs", [&page]) else { return };
+    let at = |device: &str, when: &str| found[device]["states"][when].clone();
+    for device in ["desktop", "phone"] {
+        assert_eq!(found[device]["problems"], json!([]), "{device}");
+    }
+    let desktop = |when: &str| at("desktop", when);
+    let (first, next) = (desktop("first"), desktop("next"));
+    assert_eq!(next["camera"], (first["camera"].as_i64().unwrap() + 1) % 12);
+    // Every other camera has its photograph.
+    assert_ne!(first["photograph"], next["photograph"]);
+    let steps = ["first", "next", "arrow", "wheel", "drag", "depth", "opacity"];
+    for pair in steps.windows(2) {
+        assert_ne!(desktop(pair[0])["hash"], desktop(pair[1])["hash"], "{pair:?}");
+    }
+    assert!(desktop("arrow")["camera"] == -1 && desktop("arrow")["frusta"] == false);
+    assert_eq!(desktop("frusta")["frusta"], true);
+    let far = |state: &Value| {
+        let centre = state["centre"].as_array().unwrap().iter();
+        centre.map(|c| c.as_f64().unwrap().powi(2)).sum::<f64>().sqrt()
+    };
+    assert!(far(&desktop("wheel")) > 1.1 * far(&desktop("arrow")), "the wheel moves away");
+    for state in ["hash", "camera", "centre", "frusta"] {
+        assert_eq!(desktop("reset")[state], first[state], "{state}");
+    }
+    let (start, finger, pinch) =
+        (at("phone", "first"), at("phone", "finger"), at("phone", "pinch"));
+    assert!((far(&finger) - far(&start)).abs() < 0.1 * far(&start), "a finger orbits");
+    assert_ne!(finger["right"], start["right"]);
+    assert_eq!(pinch["right"], finger["right"], "two fingers don't turn the view");
+    assert!(far(&pinch) < 0.8 * far(&finger), "fingers that part come nearer");
+}
