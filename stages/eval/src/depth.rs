@@ -49,15 +49,15 @@ impl Metric for DepthMetric {
 
     fn figures(&self) -> Vec<Figure> {
         vec![
-            Figure::new("depth/mean_absolute", "depth error ↓ mean", 4, false),
-            Figure::new("depth/median_absolute", "depth error ↓ median", 4, false),
-            Figure::new("depth/missed", "depth ↓ missed", 4, false),
+            Figure::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
+            Figure::new("depth/median_absolute", "depth error, median of pixels ↓", 4, false),
+            Figure::new("depth/missed", "share of surface missed ↓", 4, false),
         ]
     }
 
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "z-depth, where the truth sees a surface at the pixel's centre; missed: opacity below one \
-        half there"
+        "z-depth in scene units, of the pixels at whose centre the truth sees a surface; missed: \
+        the share of them where the render's opacity is below one half"
             .to_owned()
     }
 

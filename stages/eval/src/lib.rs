@@ -1,6 +1,6 @@
 //! `eval`: scores views against ground truth, and says by which conventions.
 //!
-//! * `metric`: what a metric is, and the list of all: a new one is a file and a line there.
+//! * `metric`: what a metric is; `metrics`: the list of all. A new one is a file and a line there.
 //! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are given
 //!   and the build has libtorch): against HR truth.
 //! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there is, no
@@ -18,6 +18,7 @@ mod low_resolution;
 #[cfg(feature = "torch")]
 mod lpips;
 mod metric;
+mod metrics;
 mod perceptual;
 mod psnr;
 mod scored_view;
@@ -39,7 +40,8 @@ use derived::{least_gain, near_references};
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
 pub use metric::{Figure, Score, Scores};
-use metric::{Metric, mean_of, metrics};
+use metric::{Metric, mean_of};
+use metrics::metrics;
 pub use perceptual::LpipsNetwork;
 use perceptual::Perceptual;
 pub use psnr::psnr;

@@ -4,16 +4,10 @@ use pixels::Rgba8;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::depth::DepthMetric;
-use crate::low_resolution::LowResolutionMetric;
-use crate::perceptual::Perceptual;
-use crate::psnr::PsnrMetric;
 use crate::scored_view::{ScoredScene, ScoredView};
-use crate::ssim::SsimMetric;
-use crate::warp::WarpMetric;
 
 /// Something that views are scored by. A new one is a type in a file of its own, and a line in
-/// [`metrics`]: `metrics.json`, the page and the summary follow from what it says of itself.
+/// `metrics.rs`: `metrics.json`, the page and the summary follow from what it says of itself.
 pub(crate) trait Metric: Sync {
     /// Its key among the conventions, and its pictures' folder.
     fn name(&self) -> &'static str;
@@ -25,18 +19,6 @@ pub(crate) trait Metric: Sync {
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
     /// What a line for people says of means over all views.
     fn in_words(&self, mean: &Scores) -> Option<String>;
-}
-
-/// All metrics, in the order in which they are shown.
-pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
-    vec![
-        Box::new(PsnrMetric),
-        Box::new(SsimMetric),
-        Box::new(perceptual),
-        Box::new(LowResolutionMetric),
-        Box::new(WarpMetric),
-        Box::new(DepthMetric),
-    ]
 }
 
 /// A figure of `metrics.json`, and how it is shown.
@@ -170,16 +152,5 @@ mod tests {
             serde_json::to_value(&mean).unwrap(),
             serde_json::json!({"psnr": 31.0, "depth": {"missed": 0.5}})
         );
-    }
-
-    /// Every figure's number is among the scores, and has a name of its own.
-    #[test]
-    fn figures_are_told_apart() {
-        let all = metrics(Perceptual::new(None).unwrap());
-        let figures: Vec<Figure> = all.iter().flat_map(|metric| metric.figures()).collect();
-        for (i, figure) in figures.iter().enumerate() {
-            assert!(figures[..i].iter().all(|f| f.path != figure.path && f.label != figure.label));
-        }
-        assert_eq!(figures[0].path, "psnr");
     }
 }

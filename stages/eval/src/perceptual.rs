@@ -98,7 +98,7 @@ impl LpipsPool {
         self.free.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
 
-    fn take(&self) -> anyhow::Result<Lpips> {
+    fn take(&self) -> Result<Lpips, Failure> {
         use artifact::FailureExt as _;
         let free = self.pool().pop();
         free.map_or_else(|| Lpips::read(&self.folder, self.network).bad_input("weights"), Ok)
@@ -155,8 +155,8 @@ impl Perceptual {
 impl Perceptual {
     pub(crate) fn new(weights: Option<&GivenInput>) -> anyhow::Result<Self> {
         if weights.is_some() {
-            let message = "input weights: this build has no libtorch, which LPIPS needs; build \
-                eval with its default features";
+            let message = "input weights: LPIPS needs libtorch, and eval was built without it; run \
+                `make build`";
             return Err(Failure::Usage(message.to_owned()).into());
         }
         Ok(Self { given: Vec::new() })

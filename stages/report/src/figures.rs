@@ -1,7 +1,7 @@
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::page::Point;
+use crate::gather::Row;
 
 /// A figure of the scores, and how its metric says that it is shown.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
@@ -17,9 +17,9 @@ pub(crate) struct Figure {
 }
 
 impl Figure {
-    /// The mean over a point's views.
-    pub(crate) fn mean(&self, point: &Point<'_>) -> Option<f64> {
-        self.of(&point.metrics["mean"])
+    /// The mean over a row's views.
+    pub(crate) fn mean(&self, row: &Row<'_>) -> Option<f64> {
+        self.of(&row.metrics["mean"])
     }
 
     /// Among scores.
@@ -27,36 +27,43 @@ impl Figure {
         scores.pointer(&format!("/{}", self.path))?.as_f64()
     }
 
+    /// Whether some row has it.
+    pub(crate) fn is_known(&self, rows: &[Row<'_>]) -> bool {
+        rows.iter().any(|row| self.mean(row).is_some())
+    }
+
     /// In words.
     pub(crate) fn text(&self, value: f64) -> String {
         format!("{value:.*}", self.digits)
     }
 
-    /// Whether it is a point's best. One point alone has none.
-    pub(crate) fn is_best(&self, value: f64, points: &[Point<'_>]) -> bool {
-        let values = || points.iter().filter_map(|point| self.mean(point));
-        match self.higher_is_better {
-            _ if points.len() < 2 => false,
-            Some(true) => value == values().fold(f64::NEG_INFINITY, f64::max),
-            Some(false) => value == values().fold(f64::INFINITY, f64::min),
-            None => false,
-        }
+    /// Whether a row has the best of it among those of its data set. One row alone has none.
+    pub(crate) fn is_best(&self, row: &Row<'_>, rows: &[Row<'_>]) -> bool {
+        let others = || rows.iter().filter(|other| other.scene == row.scene);
+        let values = || others().filter_map(|row| self.mean(row));
+        let best = match self.higher_is_better {
+            _ if others().count() < 2 => None,
+            Some(true) => values().reduce(f64::max),
+            Some(false) => values().reduce(f64::min),
+            None => None,
+        };
+        best.is_some() && self.mean(row) == best
     }
 }
 
-/// The figures that points have, or that would be there with more inputs: as their metrics say it, and
+/// The figures that rows have, or that would be there with more inputs: as their metrics say it, and
 /// of metrics that say nothing the numbers among their means.
-pub(crate) fn figures(points: &[Point<'_>]) -> Vec<Figure> {
+pub(crate) fn figures(rows: &[Row<'_>]) -> Vec<Figure> {
     let mut figures: Vec<Figure> = Vec::new();
-    for point in points {
-        let said = serde_json::from_value::<Vec<Figure>>(point.metrics["figures"].clone());
-        for figure in said.unwrap_or_else(|_| numbers(&point.metrics["mean"])) {
+    for row in rows {
+        let said = serde_json::from_value::<Vec<Figure>>(row.metrics["figures"].clone());
+        for figure in said.unwrap_or_else(|_| numbers(&row.metrics["mean"])) {
             if figures.iter().all(|other| other.path != figure.path) {
                 figures.push(figure);
             }
         }
     }
-    let is_shown = |f: &Figure| f.missing.is_some() || points.iter().any(|p| f.mean(p).is_some());
+    let is_shown = |f: &Figure| f.missing.is_some() || rows.iter().any(|r| f.mean(r).is_some());
     figures.retain(is_shown);
     figures
 }

@@ -1,23 +1,41 @@
-//! `report`: the record of a run as one self-contained HTML page: no network, nothing it needs
-//! beside it.
+//! `report`: the record of a run as one HTML page. It opens from disk without a network; pictures
+//! at full size lie beside it in `views/`, and without them the page works, too.
 //!
 //! A sink: it reads `run.json`, looks into the artifacts it names, and is never cached, since it
 //! shows times and hashes.
 //!
-//! * `compare`: where several blocks score, what each made of a crop of one view, beside its error
-//!   map.
-//! * `page`: scores of every point of a sweep, views side by side, stages with parameters, hashes
-//!   and times.
-//! * `images`: views and depth as embedded PNG data.
+//! * `gather`: results, data sets and figures of a run. `figures`: numbers and how they are shown.
+//! * `layers`: the pictures that there are of each view. `pictures`: their originals, and copies
+//!   that a page has room for. `scale`: colour scales of error and depth maps.
+//! * `data`: all that the page's script works on, as JSON.
+//! * `page`: the page's frame. `tables`, `viewer`, `pipeline`, `commands`: its parts. `layout`:
+//!   draws the pipeline's graph.
+//! * `page.css`; `chart.js`: charts as SVG; `viewer.js`: the comparison; `plots.js`: what is
+//!   plotted; `page.js`: starts them.
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
+//!
+//! ```
+//! use artifact::Stage as _;
+//! let params = report::Params { views: 8, ..report::Params::default() };
+//! assert_eq!(report::Report::NAME, "report");
+//! assert!(params.compare.is_none());
+//! ```
 
-mod compare;
+mod commands;
+mod data;
 mod figures;
-mod images;
+mod gather;
+mod layers;
+mod layout;
 mod page;
+mod pictures;
+mod pipeline;
 mod results;
+mod scale;
+mod tables;
+mod viewer;
 
-use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
+use artifact::{Context, Failure, Input, Output, RunRecord, Stage, counted, sized};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -27,31 +45,38 @@ pub use results::{ResultRow, StageResult};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct Params {
-    /// Number of views on the page, spread evenly over the test views.
-    #[schemars(range(min = 1, max = 100))]
+    /// Maximum number of views with pictures, spread evenly over the test views. A page of many
+    /// results has room for fewer.
+    #[schemars(range(min = 1, max = 1000))]
     pub views: u32,
-    /// Name of the view that all methods show side by side.
+    /// Name of the view that the page shows first.
     #[schemars(extend("x-default" = "the first"))]
     pub compare: Option<String>,
-    /// Square of that view to show: x, y and side, in pixels.
-    #[schemars(extend("x-default" = "the one with most detail"))]
+    /// Square of that view to show first: x, y and side, in pixels.
+    #[schemars(extend("x-default" = "the whole view"))]
     pub crop: Option<[u32; 3]>,
 }
 
 impl Default for Params {
     fn default() -> Self {
-        Self { views: 4, compare: None, crop: None }
+        Self { views: 50, compare: None, crop: None }
     }
 }
 
 /// The stage.
 pub struct Report;
 
+/// Bytes that a page has at most, but for the text of very long runs.
+const PAGE_BYTES: usize = 15_000_000;
+/// Bytes for what is said of each picture beside the picture itself.
+const MARGIN: usize = 700_000;
+
 impl Stage for Report {
     type Params = Params;
     const NAME: &'static str = "report";
-    const SUMMARY: &'static str = "Writes the record of a run as one self-contained HTML page.";
+    const SUMMARY: &'static str = "Writes the record of a run as one HTML page.";
     const SINK: bool = true;
+    const PARTIAL: bool = true;
 
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
@@ -70,9 +95,17 @@ impl Stage for Report {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
-        let html = page::page(&run, params)?;
-        std::fs::write(context.output_path("index.html")?, html.into_string())?;
-        context.write_json("results.json", &results::results(&run)?)
+        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let report = gather::Report::new(&run);
+        let text = page::page(&report, None)?.into_string().len();
+        let budget = PAGE_BYTES.saturating_sub(text + MARGIN);
+        let data = data::Data::new(context, &report, params, budget)?;
+        let html = page::page(&report, Some(&data))?.into_string();
+        std::fs::write(context.output_path("index.html")?, &html)?;
+        context.write_json("results.json", &results::results(&run))?;
+        let results = counted(report.rows.len(), "result");
+        let pictures = counted(data.pictures.len(), "picture");
+        let size = sized(html.len() as u64);
+        context.write_summary(&format!("{results}, {pictures}, {size}"))
     }
 }

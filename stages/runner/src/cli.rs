@@ -2,6 +2,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use anyhow::Context as _;
 use artifact::{machine_memory, print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Choice;
@@ -132,6 +133,12 @@ enum Verb {
         /// The task's number
         number: usize,
     },
+    /// Write a commented pipeline for a folder of posed photographs
+    Init {
+        /// The folder: Blender's form, transforms.json, LLFF or COLMAP
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
     /// Show what `run` would do, and run nothing
     Plan {
         #[command(flatten)]
@@ -235,6 +242,12 @@ enum Verb {
         /// The stage
         stage: String,
     },
+    /// Write man pages of all verbs into a folder; `make install` calls this
+    #[command(hide = true)]
+    Man {
+        /// The folder
+        folder: PathBuf,
+    },
     /// Print shell completions
     Completions {
         /// For which shell
@@ -285,6 +298,8 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
                 stage,
             );
         }
+        Verb::Init { folder } => return verbs::init(folder, &cli.pipeline),
+        Verb::Man { folder } => return man(folder),
         Verb::Job { submission, number } => return verbs::job(submission, *number),
         _ => {}
     }
@@ -337,7 +352,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             let choice = Choice { keep_days, drop_unfinished, drop_old };
             verbs::gc(&session, &what.into(), choice, Style { dry_run, json })
         }
-        Verb::Completions { .. } | Verb::Describe { .. } | Verb::Job { .. } => {
+        Verb::Completions { .. }
+        | Verb::Describe { .. }
+        | Verb::Init { .. }
+        | Verb::Job { .. }
+        | Verb::Man { .. } => {
             unreachable!("handled before the session")
         }
     }
@@ -349,6 +368,13 @@ fn completions(shell: clap_complete::Shell) -> ExitCode {
     // Whoever asked for it may have gone.
     std::io::stdout().write_all(&script).ok();
     ExitCode::SUCCESS
+}
+
+fn man(folder: &Path) -> anyhow::Result<ExitCode> {
+    std::fs::create_dir_all(folder)
+        .and_then(|()| clap_mangen::generate_to(Cli::command(), folder))
+        .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
+    Ok(ExitCode::SUCCESS)
 }
 
 /// What a run may take, as far as the machine can use it.

@@ -6,10 +6,12 @@
 //! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all
 //!   that they were made of.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
-//! * `sink`: hands the run's record to stages that show it (the report).
+//! * `sink`: hands the run's record (`recorded`) to stages that show it (the report), and puts what
+//!   they make in its place (`publish`, `aside`).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
+mod aside;
 mod cli;
 mod counts;
 mod execute;
@@ -18,6 +20,7 @@ mod limits;
 mod lineage;
 mod node_report;
 mod publish;
+mod recorded;
 mod remedy;
 mod session;
 mod sink;

@@ -1,5 +1,6 @@
 //! Publishing of what a sink made: written whole beside the old folder, then put in its place at
-//! once. A folder is replaced only where all in it is ours and untouched.
+//! once. A folder is replaced only where all in it is ours and untouched. One that shows another
+//! data set, or a whole run where the new one shows a part, is put aside ([`crate::aside`]).
 
 use std::fs::{self, File, TryLockError};
 use std::io;
@@ -9,16 +10,21 @@ use std::sync::atomic::AtomicBool;
 use artifact::{Locked, MANIFEST_FILE, Manifest, StoreError, list_files};
 use stage_call::StageFailure;
 
+use crate::aside::{MARK, Mark, place_aside};
 use crate::waiting::until_held;
-
-/// In a published folder: the identity of what it shows.
-pub(crate) const MARK: &str = ".shows";
 
 /// Whether a folder shows this already, with all its files.
 pub(crate) fn shows(target: &Path, identity: &str) -> bool {
     let is_whole =
         || Manifest::read(target).is_ok_and(|manifest| manifest.check_sizes(target).is_ok());
-    fs::read_to_string(target.join(MARK)).is_ok_and(|shown| shown == identity) && is_whole()
+    Mark::read(target).is_some_and(|mark| mark.identity == identity) && is_whole()
+}
+
+/// A folder that was put in its place.
+pub(crate) struct Published {
+    pub(crate) folder: PathBuf,
+    /// Where what stood there is now, if it was put aside.
+    pub(crate) aside: Option<PathBuf>,
 }
 
 /// Puts a made folder, with its mark, in a target's place. `out` is the target's folder, `kind`
@@ -29,7 +35,7 @@ pub(crate) fn publish(
     name: &str,
     kind: &str,
     stop: &AtomicBool,
-) -> Result<PathBuf, StageFailure> {
+) -> Result<Published, StageFailure> {
     let target = out.join(name);
     let fail = |place: &Path, e: io::Error| StageFailure {
         code: 1,
@@ -40,12 +46,16 @@ pub(crate) fn publish(
     // With the lock held, what lies there is a killed run's.
     let fresh = out.join(format!(".{name}.nerf-sr-new"));
     remove(&fresh).map_err(|e| fail(&fresh, e))?;
+    let aside = place_aside(made, &target, |folder| owned(folder, kind).is_ok());
     let placed = copy_folder(made, &fresh)
         .map_err(|e| fail(&fresh, e))
         .and_then(|()| put(&fresh, &target, kind));
     // What is left is the old page, or what couldn't be put there.
+    if let (Ok(()), Some(aside)) = (&placed, &aside) {
+        remove(aside).and_then(|()| fs::rename(&fresh, aside)).map_err(|e| fail(&fresh, e))?;
+    }
     remove(&fresh).ok();
-    placed.map(|()| target)
+    placed.map(|()| Published { folder: target, aside })
 }
 
 /// Puts a whole folder in the target's place; what was there takes the fresh one's name.
@@ -169,12 +179,14 @@ mod tests {
         fs::write(folder.join("views/a.png"), "png").unwrap();
         write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap())
             .unwrap();
-        fs::write(folder.join(MARK), text).unwrap();
+        let mark = Mark { identity: text.to_owned(), is_whole: true, data_sets: Vec::new() };
+        mark.write(&folder).unwrap();
         folder
     }
 
     fn published(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
         publish(&made(dir, text), &dir.join("out"), "report", "page", &AtomicBool::new(false))
+            .map(|published| published.folder)
     }
 
     #[test]
@@ -197,6 +209,41 @@ mod tests {
         remove(&empty).unwrap();
         fs::create_dir(&empty).unwrap();
         published(dir.path(), "three").unwrap();
+    }
+
+    /// Pages of data sets, one after the other: what was whole before is found again.
+    #[test]
+    fn what_shows_something_else_is_put_aside() {
+        let dir = tempfile::tempdir().unwrap();
+        let publish = |text: &str, data_set: &str, is_whole: bool| {
+            let folder = made(dir.path(), text);
+            let data_sets = vec![data_set.to_owned()];
+            let mark = Mark { identity: text.to_owned(), is_whole, data_sets };
+            mark.write(&folder).unwrap();
+            let out = dir.path().join("out");
+            let published =
+                publish(&folder, &out, "report", "page", &AtomicBool::new(false)).unwrap();
+            published.aside.map(|aside| aside.file_name().unwrap().to_owned())
+        };
+        let text = |folder: &str| {
+            fs::read_to_string(dir.path().join("out").join(folder).join("index.html")).unwrap()
+        };
+        assert_eq!(publish("lego 1", "data/lego", true), None);
+        assert_eq!(publish("lego 2", "data/lego", true), None, "a newer one of the same");
+        assert_eq!(publish("chair 1", "data/chair", true).unwrap(), "report-lego");
+        assert_eq!(publish("lego 3", "data/lego", true).unwrap(), "report-chair");
+        assert_eq!((text("report"), text("report-lego")), ("lego 3".into(), "lego 2".into()));
+        assert_eq!(publish("lego broken", "data/lego", false).unwrap(), "report-lego");
+        assert_eq!(text("report-lego"), "lego 3");
+        // Another folder of that name has its own place, and so has what isn't ours.
+        assert_eq!(publish("other 1", "more/lego", true).unwrap(), "report-lego-2");
+        fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
+        assert_eq!(publish("chair 2", "data/chair", true).unwrap(), "report-lego-3");
+        assert_eq!(
+            (text("report-lego"), text("report-lego-2")),
+            ("lego 3".into(), "lego broken".into())
+        );
+        assert_eq!((text("report-lego-3"), text("report")), ("other 1".into(), "chair 2".into()));
     }
 
     /// Whatever isn't ours stays to the byte, and is named.

@@ -22,7 +22,7 @@ impl Session {
         store: Option<&Path>,
         devices: Devices,
     ) -> anyhow::Result<Self> {
-        check_device(&devices.given).map_err(PlanError::Usage)?;
+        check_device(&devices.given).map_err(|e| PlanError::Usage(e.to_string()))?;
         let pipeline = Pipeline::read(pipeline).map_err(PlanError::from)?;
         let root = store.map_or_else(|| pipeline.home().join(".nerf-sr"), Path::to_path_buf);
         std::fs::create_dir_all(&root).with_context(|| {

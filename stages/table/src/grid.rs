@@ -2,8 +2,9 @@
 
 use serde_json::Value;
 
+use crate::figures::Figures;
 use crate::rows::MISSING;
-use crate::values::{distinct, is_less_better, mean, of, plain, shown, titles, together};
+use crate::values::{distinct, mean, of, plain, together};
 use crate::{Params, Row};
 
 /// Names that aren't keys: what a result has, not what it is of.
@@ -12,6 +13,7 @@ pub(crate) const PLACES: [&str; 2] = ["commit", "machine"];
 /// What lines and columns of a table are.
 pub(crate) struct Shape<'a> {
     pub(crate) params: &'a Params,
+    pub(crate) figures: &'a Figures,
     /// Keys that make a row.
     pub(crate) keys: Vec<String>,
     /// The value that others are compared with.
@@ -48,10 +50,10 @@ impl Shape<'_> {
         match self.params.columns.is_empty() {
             false => {
                 head.extend(columns.iter().map(|column| {
-                    format!("{} ({})", column.join(", "), titles(values).join(" / "))
+                    format!("{} ({})", column.join(", "), self.figures.titles(values).join(" / "))
                 }));
             }
-            true => head.extend(titles(values)),
+            true => head.extend(self.figures.titles(values)),
         }
         head.extend(self.first.is_some().then(|| "against the first".to_owned()));
         head.extend(PLACES.map(str::to_owned));
@@ -73,7 +75,7 @@ impl Shape<'_> {
             let here = of(&mine, &self.params.columns, column);
             let cells: Vec<String> = values
                 .iter()
-                .map(|name| marked(name, mean(&here, name), self.best(&rivals, column, name)))
+                .map(|name| self.marked(name, mean(&here, name), self.best(&rivals, column, name)))
                 .collect();
             match (self.params.columns.is_empty(), reason(&here)) {
                 (false, Some(reason)) => line.push(reason),
@@ -116,8 +118,20 @@ impl Shape<'_> {
             mean(&of(&of(rivals, &self.keys, keys), &self.params.columns, column), name)
         });
         means
-            .reduce(if is_less_better(name) { f64::min } else { f64::max })
+            .reduce(if self.figures.is_less_better(name) { f64::min } else { f64::max })
             .filter(|_| lines.len() > 1)
+    }
+
+    /// A value as it is shown; the best of its column in bold.
+    fn marked(&self, name: &str, value: Option<f64>, best: Option<f64>) -> String {
+        let Some(value) = value else { return NOTHING.to_owned() };
+        let text = self.figures.shown(name, value);
+        // What is shown alike is as good.
+        if best.is_some_and(|best| self.figures.shown(name, best) == text) {
+            format!("**{text}**")
+        } else {
+            text
+        }
     }
 
     /// Whether results have the keys of a row from elsewhere: one of their columns, and in all else
@@ -141,14 +155,6 @@ pub(crate) const NOTHING: &str = "–";
 fn reason(rows: &[Row]) -> Option<String> {
     let are_missing = !rows.is_empty() && rows.iter().all(|row| row.contains_key(MISSING));
     are_missing.then(|| together(rows, MISSING))
-}
-
-/// A value as it is shown; the best of its column in bold.
-fn marked(name: &str, value: Option<f64>, best: Option<f64>) -> String {
-    let Some(value) = value else { return NOTHING.to_owned() };
-    let text = shown(name, value);
-    // What is shown alike is as good.
-    if best.is_some_and(|best| shown(name, best) == text) { format!("**{text}**") } else { text }
 }
 
 /// Lines as a Markdown table; the first is its head.

@@ -9,6 +9,7 @@
 //! A sink: it gets the run's record and is never cached. What a failed point would have shown is
 //! named; what was left out says why.
 
+mod figures;
 mod grid;
 mod markdown;
 mod rows;
@@ -21,6 +22,8 @@ use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+
+use figures::Figures;
 
 pub use rows::Row;
 
@@ -153,14 +156,16 @@ impl Stage for Table {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
-        let rows = rows::rows(&run, params)?;
+        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
+        let mut figures = Figures::default();
+        let rows = rows::rows(&run, params, &mut figures)?;
         if rows.is_empty() && run.failed.is_empty() {
             return Err(Failure::BadInput("run.json: nothing in it was scored".to_owned()).into());
         }
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;
-        let text = markdown::markdown(params, &rows, &run.failed).map_err(Failure::Usage)?;
+        let text =
+            markdown::markdown(params, &rows, &figures, &run.failed).map_err(Failure::Usage)?;
         let path = context.output_path("table.md")?;
         std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
         context.write_summary(&format!("{} results", rows.len()))

@@ -2,18 +2,21 @@
 
 use artifact::{FailedPoint, label};
 
+use crate::figures::Figures;
 use crate::grid::{NOTHING, PLACES, Shape, grid};
 use crate::rows::MISSING;
-use crate::values::{distinct, mean, of, shown, titles};
+use crate::values::{distinct, mean, of};
 use crate::{Params, Row};
 
 /// The tables, and the points that failed.
 pub(crate) fn markdown(
     params: &Params,
     rows: &[Row],
+    figures: &Figures,
     failed: &[FailedPoint],
 ) -> Result<String, String> {
-    let shape = Shape { params, keys: row_keys(params, rows)?, first: reference(params, rows)? };
+    let shape =
+        Shape { params, figures, keys: row_keys(params, rows)?, first: reference(params, rows)? };
     let each = std::slice::from_ref(&params.each);
     let parts = if params.each.is_empty() { Vec::new() } else { distinct(rows, each).concat() };
     let parts = if parts.len() > 1 { parts } else { Vec::new() };
@@ -28,7 +31,8 @@ pub(crate) fn markdown(
         text += &format!("\n## {part}\n\n{}", shape.table(&mine, true));
     }
     text += &gains(params, rows);
-    params.spread.iter().filter_map(|name| spread(rows, name)).for_each(|line| text += &line);
+    let spreads = params.spread.iter().filter_map(|name| spread(rows, figures, name));
+    spreads.for_each(|line| text += &line);
     let failed: Vec<&FailedPoint> = failed.iter().filter(|point| point.reason.is_none()).collect();
     if !failed.is_empty() {
         text += "\nFailed, or waiting for what failed:\n\n";
@@ -129,15 +133,15 @@ fn gains(params: &Params, rows: &[Row]) -> String {
 }
 
 /// How far a value is spread over all results.
-fn spread(rows: &[Row], name: &str) -> Option<String> {
+fn spread(rows: &[Row], figures: &Figures, name: &str) -> Option<String> {
     let values: Vec<f64> = rows.iter().filter_map(|row| row.get(name)?.as_f64()).collect();
     let mean = mean(rows, name)?;
     let squares: f64 = values.iter().map(|value| (value - mean).powi(2)).sum();
     let deviation = (squares / values.len().saturating_sub(1).max(1) as f64).sqrt();
     let [least, most] =
         [f64::min, f64::max].map(|pick| values.iter().copied().reduce(pick).unwrap_or(mean));
-    let title = titles(&[&name.to_owned()]).concat();
-    let [mean, least, most] = [mean, least, most].map(|value| shown(name, value));
+    let title = figures.title(name);
+    let [mean, least, most] = [mean, least, most].map(|value| figures.shown(name, value));
     Some(format!(
         "\n{title} over {} results: {mean} ± {deviation:.2}, from {least} to {most}\n",
         values.len()

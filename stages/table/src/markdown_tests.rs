@@ -5,6 +5,18 @@ use crate::{Gain, Group};
 use serde_json::json;
 use std::collections::BTreeMap;
 
+/// As `metrics.json` describes them.
+fn figures() -> Figures {
+    let figure = |path: &str, label: &str, digits: usize, higher: bool| json!({"path": path, "label": label, "digits": digits, "higher_is_better": higher});
+    let mut figures = Figures::default();
+    figures.add(&json!({"figures": [
+        figure("psnr", "PSNR", 2, true),
+        figure("ssim", "SSIM", 4, true),
+        figure("lpips", "LPIPS", 4, false),
+    ]}));
+    figures
+}
+
 fn rows() -> Vec<Row> {
     let row = |scene: &str,
                variant: &str,
@@ -38,7 +50,7 @@ fn results_of_one_row_are_averaged_and_the_best_is_marked() {
 | as it is | **31.00** | **0.0450** | **2.0 min** | +0.00 | abc1234 | 2 cores |
 | no warm-up | 30.88 | – | 3.3 min | -0.12 | abc1234 | 2 cores |
 ";
-    assert_eq!(markdown(&params, &rows(), &[]).unwrap(), expected);
+    assert_eq!(markdown(&params, &rows(), &figures(), &[]).unwrap(), expected);
 }
 
 #[test]
@@ -66,7 +78,7 @@ Failed, or waiting for what failed:
 
 * eval [scene=ship]
 ";
-    assert_eq!(markdown(&params, &rows(), &failed).unwrap(), expected);
+    assert_eq!(markdown(&params, &rows(), &figures(), &failed).unwrap(), expected);
 }
 
 #[test]
@@ -92,14 +104,15 @@ fn keys_that_no_result_has_are_refused() {
                 .collect(),
             ..Params::default()
         };
-        assert_eq!(markdown(&params, &rows(), &[]).unwrap_err(), words);
+        assert_eq!(markdown(&params, &rows(), &figures(), &[]).unwrap_err(), words);
     }
     let spread = Params { spread: vec!["psnr".to_owned()], ..Params::default() };
-    let text = markdown(&spread, &rows(), &[]).unwrap();
+    let text = markdown(&spread, &rows(), &figures(), &[]).unwrap();
     assert!(text.ends_with("\nPSNR over 4 results: 30.94 ± 1.39, from 29.50 to 32.25\n"), "{text}");
     let nothing = markdown(
         &Params::default(),
         &[],
+        &figures(),
         &[FailedPoint { stage: "eval".to_owned(), ..FailedPoint::default() }],
     )
     .unwrap();
@@ -205,9 +218,9 @@ Means over lego, chair:
 
 * One.
 ";
-    assert_eq!(markdown(&params, &methods(), &[]).unwrap(), expected);
+    assert_eq!(markdown(&params, &methods(), &figures(), &[]).unwrap(), expected);
     let unknown = Params { each: "scena".to_owned(), ..Params::default() };
-    let problem = markdown(&unknown, &methods(), &[]).unwrap_err();
+    let problem = markdown(&unknown, &methods(), &figures(), &[]).unwrap_err();
     assert!(
         problem.starts_with("parameter each: no result has a key \"scena\"; did you mean scene?"),
         "{problem}"
@@ -231,7 +244,9 @@ fn rows_follow_the_groups() {
     let params = params(json!({"methods": {"eval-ss": "ours"}, "grouped_by": "seen",
         "groups": [{"name": "LR", "methods": ["eval-ss", "eval-liif"]},
         {"name": "HR", "methods": ["eval-hr"]}]}));
-    let rows = crate::rows::rows(&serde_json::from_value(run).unwrap(), &params).unwrap();
+    let rows =
+        crate::rows::rows(&serde_json::from_value(run).unwrap(), &params, &mut Figures::default())
+            .unwrap();
     let told: Vec<[&str; 3]> = rows
         .iter()
         .map(|row| {

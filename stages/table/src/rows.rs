@@ -1,12 +1,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::process::Command;
 
 use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
 use serde_json::{Map, Value, json};
 
 use crate::Params;
+use crate::figures::Figures;
 
 /// Why a row has no values.
 pub(crate) const MISSING: &str = "missing";
@@ -16,8 +16,14 @@ pub type Row = Map<String, Value>;
 
 /// A row for every result of a run, and for what was left out of it: in the order of the groups,
 /// and otherwise of the run.
-pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>> {
-    let commit = commit(&run.home);
+///
+/// Figures of their metrics go into `figures`.
+pub(crate) fn rows(
+    run: &RunRecord,
+    params: &Params,
+    figures: &mut Figures,
+) -> anyhow::Result<Vec<Row>> {
+    let commit = run.commit().unwrap_or_default();
     let mut scored: Vec<(usize, &RunNode)> =
         run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
     // Blocks that come through fewer stages stand first: rendered views before refined ones.
@@ -29,7 +35,7 @@ pub(crate) fn rows(run: &RunRecord, params: &Params) -> anyhow::Result<Vec<Row>>
     let mut rows: Vec<(usize, Row)> = Vec::new();
     for (index, node) in scored {
         let mut row = keys(params, &node.stage, &node.values);
-        row.extend(scores(node)?);
+        row.extend(scores(node, figures)?);
         row.extend(times(run, index)?);
         row.extend(seconds_per_view(&row));
         row.insert("commit".to_owned(), json!(commit));
@@ -82,24 +88,8 @@ fn seconds_per_view(row: &Row) -> Option<(String, Value)> {
     Some(("seconds_per_view".to_owned(), json!(seconds / views.filter(|views| *views > 0.0)?)))
 }
 
-/// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where it
-/// isn't under git.
-fn commit(home: &Path) -> String {
-    let Some(folder) = home.ancestors().find(|folder| folder.is_dir()) else {
-        return String::new();
-    };
-    let describe = ["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"];
-    let git = Command::new("git").arg("-C").arg(folder).args(describe).output();
-    let said = git
-        .ok()
-        .filter(|output| output.status.success())
-        .map(|output| output.stdout)
-        .unwrap_or_default();
-    String::from_utf8_lossy(&said).trim().to_owned()
-}
-
 /// What a result's own file says: means of metrics, or what a refiner's training says of itself.
-fn scores(node: &RunNode) -> anyhow::Result<Row> {
+fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
     let mut found = Row::new();
     if node.kind == "refiner" {
         let file = read(&node.folder.join("refiner.json"))?;
@@ -115,6 +105,7 @@ fn scores(node: &RunNode) -> anyhow::Result<Row> {
         return Ok(found);
     }
     let file = read(&node.folder.join("metrics.json"))?;
+    figures.add(&file);
     numbers("", &file["mean"], &mut found);
     let near = &file["near_references"];
     for (name, value) in [

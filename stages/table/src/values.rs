@@ -43,34 +43,3 @@ pub(crate) fn together(rows: &[Row], name: &str) -> String {
 pub(crate) fn plain(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
-
-/// Whether less of it is better.
-pub(crate) fn is_less_better(name: &str) -> bool {
-    name.starts_with("lpips") || name.ends_with("_s") || name.starts_with("depth")
-}
-
-/// A value as people read it.
-pub(crate) fn shown(name: &str, value: f64) -> String {
-    match name {
-        "rays_per_s" => format!("{:.0} k", value / 1e3),
-        "samples_per_ray" => format!("{value:.1}"),
-        name if name.ends_with("_s") && value >= 120.0 => format!("{:.1} min", value / 60.0),
-        name if name.ends_with("_s") => format!("{value:.1} s"),
-        name if name.contains("psnr") || name.contains("gain") => format!("{value:.2}"),
-        _ if value.fract() == 0.0 => format!("{value:.0}"),
-        _ => format!("{value:.4}"),
-    }
-}
-
-/// Column titles of values.
-pub(crate) fn titles(values: &[&String]) -> Vec<String> {
-    let title = |name: &str| match name {
-        "psnr" | "ssim" | "lpips" => name.to_uppercase(),
-        "train_s" => "training".to_owned(),
-        "render_s" => "rendering".to_owned(),
-        "refine_s" => "refining".to_owned(),
-        "rays_per_s" => "rays/s".to_owned(),
-        name => name.replace('_', " "),
-    };
-    values.iter().map(|name| title(name)).collect()
-}

@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_text};
+use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_line, report_text};
 use planning::{Plan, Sink};
 use stage_call::{Display, StageFailure};
 
@@ -17,8 +17,9 @@ use super::node::{Action, Found};
 use super::places::{Budget, Need, Place, Places};
 use super::{Executor, NodeJob, Work};
 use crate::counts;
+use crate::recorded::Course;
 use crate::remedy::Remedy;
-use crate::session::Session;
+use crate::session::{Session, command_line};
 use crate::sink::{Showing, Shown, show};
 
 /// This machine.
@@ -41,8 +42,11 @@ impl Executor for Local {
         let showing =
             Showing { plan, store: &session.store, run, out, threads: self.budget.threads, stop };
         if let Some((index, failure)) = outcome.failures.first() {
-            if self.keep_going {
-                show_partly(&showing, &outcome)?;
+            // Without any result there is hardly a page; a table names what failed.
+            if self.keep_going || outcome.records.iter().any(Option::is_some) {
+                // Of two failures, the stage's is the run's.
+                show_partly(&showing, &outcome)
+                    .unwrap_or_else(|error| report_line!("nerf-sr: {error:#}"));
             }
             let node = &plan.nodes[*index];
             report_text(&self.remedy.after_failure(
@@ -280,19 +284,36 @@ fn show_partly(showing: &Showing<'_>, outcome: &Outcome) -> anyhow::Result<()> {
 
 /// Calls a sink and says where its page is; whether it wrote one.
 fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Result<bool> {
-    let shown = show(showing, sink, &outcome.records);
+    let command = command_line();
+    let course = Course {
+        records: &outcome.records,
+        ran: Some(&outcome.ran),
+        failures: &outcome.failures,
+        command: &command,
+    };
+    let shown = show(showing, sink, &course);
     if showing.stop.load(Ordering::Relaxed) {
         return Err(Failure::Interrupted.into());
     }
     let shown = shown.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
     match &shown {
-        Shown::Written(folder) => print_line!("{}: {}", sink.stage, page(folder).display()),
+        Shown::Written { folder, aside } => {
+            say_aside(sink, aside.as_deref());
+            print_line!("{}: {}", sink.stage, page(folder).display());
+        }
         Shown::UpToDate(folder) => {
             print_line!("{}: {} (up to date)", sink.stage, page(folder).display());
         }
         Shown::Missing => print_line!("{}: nothing to show", sink.stage),
     }
-    Ok(matches!(shown, Shown::Written(_)))
+    Ok(matches!(shown, Shown::Written { .. }))
+}
+
+/// Says where what stood in a sink's place is now.
+pub(crate) fn say_aside(sink: &Sink, aside: Option<&Path>) {
+    if let Some(folder) = aside {
+        print_line!("{}: what was there before is now {}", sink.stage, page(folder).display());
+    }
 }
 
 /// Calls the sinks and says what the run came to.

@@ -14,7 +14,7 @@ use planning::Plan;
 
 use crate::session::Session;
 
-pub(crate) use local::Local;
+pub(crate) use local::{Local, say_aside};
 pub(crate) use node::NodeJob;
 pub(crate) use places::Budget;
 pub(crate) use slurm::{Cluster, JOB_VERB, identities};

@@ -12,6 +12,7 @@ pub(crate) fn describe(pipeline: &Pipeline, stage: &str) -> anyhow::Result<ExitC
     }
     let program = executable(&pipeline, stage);
     let status = Command::new(&program).arg("--help").status();
-    let status = status.with_context(|| format!("{}; build it (make build)", program.display()))?;
+    let status = status
+        .with_context(|| format!("{} can't be started; run `make build`", program.display()))?;
     Ok(if status.success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }

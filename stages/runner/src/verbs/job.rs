@@ -11,7 +11,8 @@ use slurm::{Slurm, Submission};
 use stage_call::{Display, StageFailure, ask_all};
 
 use super::run::register;
-use crate::execute::NodeJob;
+use crate::execute::{NodeJob, say_aside};
+use crate::recorded::Course;
 use crate::sink::{Showing, Shown, show};
 
 /// Does one task of a submission, as a job of a cluster: a node, whose parents' jobs are over, or a
@@ -28,8 +29,9 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
     let frozen = Frozen::read(&Submission::plan(folder))?;
     let plan = frozen.part(number)?;
     let result = register(&store, &plan, &stop).and_then(|run| {
-        let result = Task { plan: &plan, store: &store, run: &run, out: &frozen.out, stop: &stop }
-            .carry_out();
+        let (out, command) = (&frozen.out, &submitted_by(&store, folder));
+        let task = Task { plan: &plan, store: &store, run: &run, out, stop: &stop, command };
+        let result = task.carry_out();
         run.end().ok();
         result
     });
@@ -39,6 +41,13 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
         go_on_later(&plan, &store)?;
     }
     Ok(ExitCode::from(failure.code))
+}
+
+/// The command line of the run whose submission this is; nothing where that is forgotten.
+fn submitted_by(store: &Store, folder: &Path) -> Vec<String> {
+    let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let runs = store.runs().unwrap_or_default();
+    runs.into_iter().find(|run| run.id == id).map(|run| run.command).unwrap_or_default()
 }
 
 /// Puts the job into the queue once more, where its stage has left something to go on from.
@@ -66,6 +75,8 @@ struct Task<'a> {
     run: &'a RunFile,
     out: &'a Path,
     stop: &'a AtomicBool,
+    /// The command line that submitted it.
+    command: &'a [String],
 }
 
 impl Task<'_> {
@@ -101,10 +112,16 @@ impl Task<'_> {
     fn show(&self, sink: &Sink, records: &[Option<Record>]) -> Result<(), StageFailure> {
         self.check(&sink.stage, sink.shows.iter().copied(), records)?;
         self.check_program(&sink.program)?;
-        let Self { plan, store, run, out, stop } = *self;
+        let Self { plan, store, run, out, stop, command } = *self;
         let showing = Showing { plan, store, run, out, threads: slurm::cores(), stop };
-        if let Shown::Written(folder) | Shown::UpToDate(folder) = show(&showing, sink, records)? {
-            print_line!("{}: {}", sink.stage, folder.display());
+        let course = Course { command, ..Course::before(records) };
+        match show(&showing, sink, &course)? {
+            Shown::Written { folder, aside } => {
+                say_aside(sink, aside.as_deref());
+                print_line!("{}: {}", sink.stage, folder.display());
+            }
+            Shown::UpToDate(folder) => print_line!("{}: {}", sink.stage, folder.display()),
+            Shown::Missing => {}
         }
         Ok(())
     }

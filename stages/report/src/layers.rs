@@ -1,0 +1,253 @@
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use pixels::{
+    ExrImage, Rgba8, common_range, depth_range, draw_depth, read_exr, read_png, read_premultiplied,
+};
+use scene::{View, Views};
+use serde_json::Value;
+
+use crate::gather::{Report, Row};
+
+/// One picture of every view of a data set, such as ground truth or a method's error maps.
+pub(crate) struct Layer<'a> {
+    pub(crate) label: String,
+    pub(crate) group: Group,
+    /// Its place among the report's data sets.
+    pub(crate) scene: usize,
+    /// The row that it belongs to; none for observations.
+    pub(crate) row: Option<usize>,
+    source: Source<'a>,
+}
+
+/// Label of the layers of a method without others.
+pub(crate) const ONLY_RENDER: &str = "Render";
+
+/// Kinds of pictures.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Group {
+    LowResolution,
+    Truth,
+    Render,
+    Error,
+    Depth,
+    Warp,
+}
+
+/// Where a layer's pictures lie.
+enum Source<'a> {
+    Image(Arc<Folder>),
+    LowResolution(Arc<Folder>),
+    Depth(Arc<Folder>),
+    /// Files that a result names: the pointer of their names among a view's scores.
+    Scored(&'a Row<'a>, &'static str),
+}
+
+/// A folder of views.
+pub(crate) struct Folder {
+    path: PathBuf,
+    pub(crate) views: Views,
+}
+
+impl Folder {
+    fn read(path: PathBuf) -> anyhow::Result<Arc<Self>> {
+        let views = Views::of_folder(&path)?;
+        Ok(Arc::new(Self { path, views }))
+    }
+
+    fn view(&self, name: &str) -> Option<&View> {
+        self.views.views.iter().find(|view| view.camera.name == name)
+    }
+
+    /// An image of it over the background.
+    fn colour(&self, file: &str) -> anyhow::Result<Rgba8> {
+        let image = read_premultiplied(&self.path.join(file))?;
+        Ok(image.over(self.views.background.shown()).to_rgba8())
+    }
+
+    fn depth(&self, name: &str) -> anyhow::Result<Option<ExrImage>> {
+        let file = self.view(name).and_then(|view| view.depth.as_ref());
+        Ok(file.map(|file| read_exr(&self.path.join(file))).transpose()?)
+    }
+}
+
+impl Layer<'_> {
+    /// Its picture of a view, where there is one. Depths are shown within a range.
+    pub(crate) fn picture(&self, view: &str, range: (f32, f32)) -> anyhow::Result<Option<Rgba8>> {
+        match &self.source {
+            Source::Image(folder) => {
+                let file = folder.view(view).and_then(|view| view.image.as_ref());
+                file.map(|file| folder.colour(file)).transpose()
+            }
+            Source::LowResolution(folder) => {
+                let file = folder.view(view).and_then(|view| view.low_resolution.as_ref());
+                file.map(|file| folder.colour(file)).transpose()
+            }
+            Source::Depth(folder) => Ok(folder.depth(view)?.and_then(|image| {
+                let (z, a) = image.channel("Z").zip(image.channel("A"))?;
+                Some(draw_depth(image.width, z, a, range))
+            })),
+            Source::Scored(row, pointer) => {
+                let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
+                // Without truth of its size there is no error map, though it has a name.
+                let path = file.map(|file| row.node.folder.join(file)).filter(|path| path.exists());
+                Ok(path.map(|path| read_png(&path)).transpose()?)
+            }
+        }
+    }
+
+    /// The range of depths that it shows of views; none where it shows none.
+    pub(crate) fn depth_range<'a>(
+        &self,
+        views: impl Iterator<Item = &'a String>,
+    ) -> anyhow::Result<Option<(f32, f32)>> {
+        let Source::Depth(folder) = &self.source else { return Ok(None) };
+        let mut ranges = Vec::new();
+        for view in views {
+            let range = folder.depth(view)?.and_then(|image| {
+                let (z, a) = image.channel("Z").zip(image.channel("A"))?;
+                depth_range(z, a)
+            });
+            ranges.extend(range);
+        }
+        Ok(common_range(ranges))
+    }
+}
+
+/// Pixels of a data set's largest view; 1 where that isn't known.
+pub(crate) fn pixels_of(layers: &[Layer<'_>], scene: usize) -> u64 {
+    let of_scene = layers.iter().filter(|layer| layer.scene == scene);
+    let sizes = of_scene.flat_map(|layer| match &layer.source {
+        Source::Image(folder) => folder.views.views.as_slice(),
+        _ => &[],
+    });
+    let pixels = sizes.map(|view| {
+        let k = view.camera.intrinsics;
+        u64::from(k.width) * u64::from(k.height)
+    });
+    pixels.max().unwrap_or(1).max(1)
+}
+
+/// All layers: observations first, then what each method made.
+pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>>> {
+    let mut layers = Vec::new();
+    let mut truths: Vec<(PathBuf, usize, Option<Arc<Folder>>)> = Vec::new();
+    for row in &report.rows {
+        let Some(path) = folder_of(report, row, "truth") else { continue };
+        if !truths.iter().any(|(other, scene, _)| *other == path && *scene == row.scene) {
+            let folder = is_views(&path).then(|| Folder::read(path.clone())).transpose()?;
+            truths.push((path, row.scene, folder));
+        }
+    }
+    for (path, scene, folder) in &truths {
+        let Some(folder) = folder else { continue };
+        let is_alone = truths.iter().filter(|(_, other, _)| other == scene).count() == 1;
+        let whose = if is_alone { String::new() } else { format!(" of {}", users(report, path)) };
+        add_observations(&mut layers, *scene, folder, &whose);
+    }
+    for index in 0..report.rows.len() {
+        add_method(&mut layers, report, index)?;
+    }
+    Ok(layers)
+}
+
+/// Ground truth, photographs and true depth, where there are any.
+fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, whose: &str) {
+    let views = &folder.views.views;
+    let mut add = |label: &str, group, source| {
+        let label = format!("{label}{whose}");
+        layers.push(Layer { label, group, scene, row: None, source });
+    };
+    if views.iter().any(|view| view.low_resolution.is_some()) {
+        add("LR photograph", Group::LowResolution, Source::LowResolution(Arc::clone(folder)));
+    }
+    if views.iter().any(|view| view.image.is_some()) {
+        add("Ground truth", Group::Truth, Source::Image(Arc::clone(folder)));
+    }
+    if views.iter().any(|view| view.depth.is_some()) {
+        add("Ground truth", Group::Depth, Source::Depth(Arc::clone(folder)));
+    }
+}
+
+/// What a method made, and what its scores show.
+fn add_method<'a>(
+    layers: &mut Vec<Layer<'a>>,
+    report: &'a Report<'a>,
+    index: usize,
+) -> anyhow::Result<()> {
+    let row = &report.rows[index];
+    let label = if report.rows.len() == 1 { ONLY_RENDER.to_owned() } else { row.label.clone() };
+    let mut add = |group, source| {
+        layers.push(Layer {
+            label: label.clone(),
+            group,
+            scene: row.scene,
+            row: Some(index),
+            source,
+        });
+    };
+    if let Some(path) = folder_of(report, row, "views").filter(|path| is_views(path)) {
+        let folder = Folder::read(path)?;
+        let has_depth = folder.views.views.iter().any(|view| view.depth.is_some());
+        add(Group::Render, Source::Image(Arc::clone(&folder)));
+        if has_depth {
+            add(Group::Depth, Source::Depth(folder));
+        }
+    }
+    let has = |pointer: &str| {
+        let views = row.metrics["views"].as_array();
+        views.into_iter().flatten().any(|view| view.pointer(pointer).is_some_and(Value::is_string))
+    };
+    for (group, pointer) in [(Group::Error, "/error_map"), (Group::Warp, "/pictures/warp")] {
+        if has(pointer) {
+            add(group, Source::Scored(row, pointer));
+        }
+    }
+    Ok(())
+}
+
+fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf> {
+    row.node.inputs.get(input).map(|input| report.run.folder_of(input))
+}
+
+fn is_views(folder: &Path) -> bool {
+    folder.join(scene::VIEWS_FILE).is_file()
+}
+
+/// The rows that are scored on a truth, in words.
+fn users(report: &Report<'_>, truth: &Path) -> String {
+    let is_user =
+        |row: &&Row<'_>| folder_of(report, row, "truth").is_some_and(|path| path == truth);
+    let labels: Vec<&str> =
+        report.rows.iter().filter(is_user).map(|row| row.label.as_str()).collect();
+    match labels.as_slice() {
+        [one] => (*one).to_owned(),
+        [first, ..] => format!("{first} and {} more", labels.len() - 1),
+        [] => String::new(),
+    }
+}
+
+impl Group {
+    /// Heading of its layers in lists.
+    pub(crate) fn heading(self) -> &'static str {
+        match self {
+            Self::LowResolution | Self::Truth => "Observations",
+            Self::Render => "Renders",
+            Self::Error => "Error maps",
+            Self::Depth => "Depth maps",
+            Self::Warp => "Neighbours by depth (red: not seen)",
+        }
+    }
+
+    /// Stem of its originals' names.
+    pub(crate) fn file_name(self) -> &'static str {
+        match self {
+            Self::LowResolution => "low-resolution",
+            Self::Truth => "ground-truth",
+            Self::Render => "render",
+            Self::Error => "error",
+            Self::Depth => "depth",
+            Self::Warp => "neighbour",
+        }
+    }
+}

@@ -1,0 +1,46 @@
+"use strict";
+// Starts the page's parts.
+
+function copyButtons() {
+  for (const command of document.querySelectorAll(".command")) {
+    const button = element("button", { type: "button", class: "copy" }, command, "Copy");
+    button.addEventListener("click", async () => {
+      try {
+        await navigator.clipboard.writeText(command.querySelector("code").textContent);
+        button.textContent = "Copied";
+      } catch {
+        getSelection().selectAllChildren(command.querySelector("code"));
+        button.textContent = "Press Ctrl+C";
+      }
+    });
+  }
+}
+
+/** A link into a folded part opens it. */
+function openTargets() {
+  for (const link of document.querySelectorAll(".graph a")) {
+    link.addEventListener("click", () => {
+      const details = document.querySelector(link.getAttribute("href")).closest("details");
+      details.open = true;
+    });
+  }
+}
+
+function startPage() {
+  copyButtons();
+  openTargets();
+  const text = document.getElementById("data").textContent;
+  if (!text) return;
+  const data = JSON.parse(text);
+  let plots = null;
+  const rowsOf = ({ left, right }) => [left, right].map((layer) => data.layers[layer]?.row ?? -1);
+  const viewer = data.pictures.length ? new Viewer(data, (state) => plots?.choose(rowsOf(state))) : null;
+  if (!data.rows.length) return;
+  plots = new Plots(data, (view) => {
+    viewer?.show({ view });
+    document.getElementById("compare").scrollIntoView({ block: "start" });
+  });
+  if (viewer) plots.choose(rowsOf(viewer.state));
+}
+
+startPage();

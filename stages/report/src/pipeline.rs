@@ -1,0 +1,322 @@
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use artifact::{RunInput, RunNode, RunRecord, UnfinishedNode, counted, sized};
+use maud::{Markup, html};
+use serde_json::Value;
+use stage_call::{seconds, utc};
+
+use crate::commands::stage_command;
+use crate::layout::{Drawing, HEIGHT, WIDTH, draw};
+
+/// All nodes of a block, at every point of a sweep.
+#[derive(Default)]
+struct Block<'a> {
+    name: &'a str,
+    done: Vec<&'a RunNode>,
+    undone: Vec<&'a UnfinishedNode>,
+}
+
+/// How a node stands.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum State {
+    Failed,
+    Waiting,
+    Ran,
+    Cached,
+    Done,
+}
+
+impl State {
+    fn of(node: &RunNode) -> Self {
+        match node.is_cached {
+            Some(true) => Self::Cached,
+            Some(false) => Self::Ran,
+            None => Self::Done,
+        }
+    }
+
+    fn of_unfinished(node: &UnfinishedNode) -> Self {
+        if node.message.is_some() { Self::Failed } else { Self::Waiting }
+    }
+
+    fn words(self) -> &'static str {
+        match self {
+            Self::Failed => "failed",
+            Self::Waiting => "not run",
+            Self::Ran => "ran",
+            Self::Cached => "cached",
+            Self::Done => "done",
+        }
+    }
+
+    /// A sign, so that colour alone says nothing.
+    fn sign(self) -> &'static str {
+        match self {
+            Self::Failed => "✕",
+            Self::Waiting => "–",
+            Self::Ran | Self::Done => "●",
+            Self::Cached => "○",
+        }
+    }
+}
+
+/// The graph of blocks, and what is known of each node.
+pub(crate) fn pipeline(run: &RunRecord) -> Markup {
+    let (blocks, edges, folders) = graph(run);
+    let drawing = draw(folders.len() + blocks.len(), &edges);
+    html! {
+        section id="pipeline" aria-labelledby="pipeline-heading" {
+            h2 id="pipeline-heading" { "Pipeline" }
+            p class="note" {
+                "Time and peak memory are those of when a stage ran. "
+                "A stage that is cached was made by an earlier run."
+            }
+            div class="pipeline" {
+                div class="graph" tabindex="0" role="region" aria-label="Graph of the stages" {
+                    (boxes(&blocks, &folders, &drawing))
+                }
+                div class="stages" {
+                    @for (number, block) in blocks.iter().enumerate() {
+                        (block_details(run, block, number))
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Blocks, edges between them, and the folders outside that they read, which come first.
+fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>) {
+    let mut blocks: Vec<Block<'_>> = Vec::new();
+    let mut block_of: Vec<usize> = Vec::new();
+    let names = run.nodes.iter().map(|node| &node.stage);
+    for name in names.chain(run.unfinished.iter().map(|node| &node.stage)) {
+        let place = blocks.iter().position(|block| block.name == name);
+        block_of.push(place.unwrap_or_else(|| {
+            blocks.push(Block { name, ..Block::default() });
+            blocks.len() - 1
+        }));
+    }
+    let mut folders: Vec<&PathBuf> = Vec::new();
+    for folder in run.nodes.iter().flat_map(|node| node.inputs.values()) {
+        folders.extend(folder.folder.as_ref().filter(|folder| !folders.contains(folder)));
+    }
+    let first = folders.len();
+    let mut edges: Vec<(usize, usize)> = Vec::new();
+    for (index, node) in run.nodes.iter().enumerate() {
+        blocks[block_of[index]].done.push(node);
+        for input in node.inputs.values() {
+            let by_node = input.node.map(|parent| first + block_of[parent]);
+            let by_folder = input.folder.as_ref();
+            let by_folder = by_folder.and_then(|folder| folders.iter().position(|f| *f == folder));
+            edges.extend(by_node.or(by_folder).map(|from| (from, first + block_of[index])));
+        }
+    }
+    for (index, node) in run.unfinished.iter().enumerate() {
+        let block = block_of[run.nodes.len() + index];
+        blocks[block].undone.push(node);
+        edges.extend(node.needs.iter().map(|&needed| (first + block_of[needed], first + block)));
+    }
+    // A block is after all it needs, as nodes are.
+    edges.retain(|(from, to)| from < to);
+    edges.sort_unstable();
+    edges.dedup();
+    (blocks, edges, folders)
+}
+
+fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Markup {
+    let Drawing { width, height, boxes, edges } = drawing;
+    let place =
+        |[x, y]: [f64; 2]| format!("left:{x:.0}px;top:{y:.0}px;width:{WIDTH}px;height:{HEIGHT}px");
+    html! {
+        div class="canvas" style=(format!("width:{width:.0}px;height:{height:.0}px")) {
+            svg width=(width) height=(height) aria-hidden="true" {
+                defs {
+                    marker id="arrow" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7"
+                        markerHeight="7" orient="auto" { path d="M0 0L8 4L0 8z" {} }
+                }
+                @for edge in edges { path class="edge" d=(edge) marker-end="url(#arrow)" {} }
+            }
+            @for (folder, corner) in folders.iter().zip(boxes) {
+                div class="box folder" style=(place(*corner)) title=(folder.display()) {
+                    b { (name_of(folder)) } small { "folder" }
+                }
+            }
+            @let of_blocks = blocks.iter().zip(&boxes[folders.len()..]);
+            @for (number, (block, corner)) in of_blocks.enumerate() {
+                @let state = block.states().next().map_or(State::Done, |(state, _)| state);
+                a class={ "box " (state.words().replace(' ', "-")) } style=(place(*corner))
+                    href={ "#stage-" (number) } {
+                    b { (block.name) }
+                    small { (block.cost()) }
+                    small class="state" { (block.stand()) }
+                }
+            }
+        }
+    }
+}
+
+/// The last part of a path.
+pub(crate) fn name_of(path: &Path) -> String {
+    let name = path.file_name().unwrap_or(path.as_os_str());
+    name.to_string_lossy().into_owned()
+}
+
+impl Block<'_> {
+    /// How many nodes stand how, the worst first.
+    fn states(&self) -> impl Iterator<Item = (State, usize)> {
+        let mut states: BTreeMap<State, usize> = BTreeMap::new();
+        let done = self.done.iter().map(|node| State::of(node));
+        let undone = self.undone.iter().map(|node| State::of_unfinished(node));
+        for state in done.chain(undone) {
+            *states.entry(state).or_default() += 1;
+        }
+        states.into_iter()
+    }
+
+    fn count(&self) -> usize {
+        self.done.len() + self.undone.len()
+    }
+
+    /// Time and memory.
+    fn cost(&self) -> String {
+        if self.done.is_empty() {
+            return String::new();
+        }
+        let time = seconds(self.done.iter().map(|node| node.seconds).sum());
+        let memory = self.done.iter().filter_map(|node| node.peak_memory).max();
+        memory.map_or(time.clone(), |bytes| format!("{time} · {}", sized(bytes)))
+    }
+
+    /// State and hash, or the number of points.
+    fn stand(&self) -> String {
+        let of_state = |(state, count): (State, usize)| match self.count() {
+            1 => format!("{} {}", state.sign(), state.words()),
+            _ => format!("{} {count} {}", state.sign(), state.words()),
+        };
+        let states: Vec<String> = self.states().map(of_state).collect();
+        let hash = match self.done.as_slice() {
+            [node] if self.count() == 1 => short(&node.output),
+            _ => "",
+        };
+        if hash.is_empty() { states.join(" ") } else { format!("{} · {hash}", states.join(" ")) }
+    }
+}
+
+fn short(hash: &str) -> &str {
+    hash.get(..10).unwrap_or(hash)
+}
+
+fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
+    let program = block.done.first().map(|node| node.program.as_str()).unwrap_or_default();
+    let one = |content: Markup| html! { div class="node" { (content) } };
+    let several = |point: &str, content: Markup| {
+        html! { details class="point" { summary { (point) } (content) } }
+    };
+    html! {
+        details class="stage" {
+            summary {
+                b { (block.name) }
+                @if !program.is_empty() && program != block.name { " " small { "(" (program) ")" } }
+                " " small { (block.stand()) @if block.count() == 1 { " · " (block.cost()) } }
+            }
+            // A link's target, which opens what it is in.
+            span id={ "stage-" (number) } class="target" {}
+            @for node in &block.done {
+                @let content = node_details(run, node);
+                @if block.count() == 1 { (one(content)) } @else { (several(&node.point, content)) }
+            }
+            @for node in &block.undone {
+                @let content = unfinished_details(node);
+                @if block.count() == 1 { (one(content)) } @else { (several(&node.point, content)) }
+            }
+        }
+    }
+}
+
+fn node_details(run: &RunRecord, node: &RunNode) -> Markup {
+    let state = match State::of(node) {
+        State::Cached => "cached: an earlier run made it",
+        State::Ran => "ran in this run",
+        _ => "done",
+    };
+    let mut facts: Vec<(&str, String)> = vec![
+        ("State", state.to_owned()),
+        ("Started", utc(node.started_unix)),
+        ("Time", seconds(node.seconds)),
+    ];
+    facts.extend(node.processor_seconds.map(|time| ("Processor time", seconds(time))));
+    facts.extend(node.peak_memory.map(|bytes| ("Peak memory", sized(bytes))));
+    facts.push(("Threads", node.threads.to_string()));
+    if !node.host.is_empty() {
+        facts.push(("Machine", node.host.clone()));
+    }
+    html! {
+        dl class="facts" {
+            @for (name, value) in &facts { dt { (name) } dd { (value) } }
+            dt { "Artifact" } dd { code { (node.output) } }
+            dt { "Key" } dd { code { (node.key) } }
+            dt { "Folder" } dd { code { (node.folder.display()) } }
+            @for (name, input) in &node.inputs {
+                dt { "Input " (name) } dd { code { (source(run, input)) } }
+            }
+        }
+        (parameters(&node.parameters, &node.resolved))
+        (stage_command(run, node))
+    }
+}
+
+fn unfinished_details(node: &UnfinishedNode) -> Markup {
+    html! {
+        @if let Some(message) = &node.message {
+            p class="failure" { b { "Failed: " } (message) }
+        } @else {
+            p { "Not run: a stage that it needs failed, or the run ended before." }
+        }
+        (parameters(&node.parameters, &serde_json::Map::new()))
+    }
+}
+
+fn source(run: &RunRecord, input: &RunInput) -> String {
+    match (input.node, &input.subtree) {
+        (Some(i), Some(folder)) => format!("{}/{folder}", run.nodes[i].stage),
+        (Some(i), None) => run.nodes[i].stage.clone(),
+        (None, _) => input.folder.as_ref().map(|f| f.display().to_string()).unwrap_or_default(),
+    }
+}
+
+type Values = serde_json::Map<String, Value>;
+
+/// Parameters with the values in use.
+fn parameters(given: &Values, resolved: &Values) -> Markup {
+    html! {
+        @if !given.is_empty() {
+            table class="parameters" {
+                caption { (counted(given.len(), "parameter")) }
+                tbody {
+                    @for (name, value) in given {
+                        tr {
+                            th scope="row" { (name) }
+                            td { (parameter(value, resolved.get(name))) }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// A parameter's value; where that was left to the scene, the one in use.
+fn parameter(given: &Value, resolved: Option<&Value>) -> Markup {
+    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    html! {
+        @match resolved {
+            Some(value) if given.is_null() && !value.is_null() => {
+                (text(value)) " " small { "by scene" }
+            }
+            _ if given.is_null() => small { "default" },
+            _ => (text(given)),
+        }
+    }
+}

@@ -1,0 +1,102 @@
+use pixels::{Palette, draw_depth, heat};
+use serde::Serialize;
+
+/// A colour scale with numbers beside it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(crate) struct Scale {
+    label: String,
+    /// Colours from left to right, evenly spaced.
+    colours: Vec<String>,
+    /// Numbers: place from left (0) to right (1), and text.
+    ticks: Vec<(f64, String)>,
+}
+
+/// Colours of a scale: what a browser puts between two can't be told from the true ones.
+const COLOURS: usize = 24;
+/// Numbers beside a scale, at least: they are round.
+const TICKS: f64 = 4.0;
+
+impl Scale {
+    /// Of error maps, up to the error that has their brightest colour.
+    pub(crate) fn error(range: f64, at_lr: bool) -> Self {
+        let colour = |i: usize| css(heat(Palette::Error, i as f32 / (COLOURS - 1) as f32));
+        let of = if at_lr { "Absolute error at LR" } else { "Absolute error" };
+        let mut ticks = ticks(0.0, range);
+        // Larger errors have the brightest colour, too.
+        if let Some((_, text)) = ticks.last_mut().filter(|(place, _)| *place > 0.999) {
+            text.insert_str(0, "≥ ");
+        }
+        Self {
+            label: format!("{of}, mean of R, G, B"),
+            colours: (0..COLOURS).map(colour).collect(),
+            ticks,
+        }
+    }
+
+    /// Of depth maps, from near to far.
+    pub(crate) fn depth((near, far): (f32, f32)) -> Self {
+        let depth = |i: usize| near + (far - near) * i as f32 / (COLOURS - 1) as f32;
+        let depths: Vec<f32> = (0..COLOURS).map(depth).collect();
+        let drawn = draw_depth(COLOURS, &depths, &[1.0; COLOURS], (near, far));
+        Self {
+            label: "Depth, scene units; white where nothing is".to_owned(),
+            colours: drawn.data.chunks_exact(4).map(|p| css([p[0], p[1], p[2]])).collect(),
+            ticks: ticks(f64::from(near), f64::from(far)),
+        }
+    }
+}
+
+fn css([r, g, b]: [u8; 3]) -> String {
+    format!("#{r:02x}{g:02x}{b:02x}")
+}
+
+/// Round numbers between two.
+fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
+    let span = high - low;
+    if !(span > 0.0 && span.is_finite()) {
+        return vec![(0.0, format!("{low}"))];
+    }
+    let power = 10f64.powf((span / TICKS).log10().floor());
+    let factors = [5.0, 2.0, 1.0].map(|factor| factor * power);
+    let step = factors.into_iter().find(|step| span / step >= TICKS - 0.01).unwrap_or(power);
+    let digits = (-step.log10().floor()).max(0.0) as usize;
+    let first = (low / step - 1e-9).ceil() as i64;
+    let last = (high / step + 1e-9).floor() as i64;
+    let tick = |i: i64| {
+        let value = i as f64 * step;
+        (((value - low) / span).clamp(0.0, 1.0), format!("{value:.digits$}"))
+    };
+    (first..=last).map(tick).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scales_have_round_numbers() {
+        let texts = |scale: &Scale| -> Vec<String> {
+            scale.ticks.iter().map(|(_, text)| text.clone()).collect()
+        };
+        let error = Scale::error(0.25, false);
+        assert_eq!(texts(&error), ["0.00", "0.05", "0.10", "0.15", "0.20", "≥ 0.25"]);
+        assert_eq!((error.ticks[0].0, error.ticks[5].0), (0.0, 1.0));
+        let depth = Scale::depth((2.13, 6.4));
+        assert_eq!(texts(&depth), ["3", "4", "5", "6"]);
+        assert!(depth.ticks.windows(2).all(|pair| pair[0].0 < pair[1].0));
+        // One depth alone, and what can't be.
+        assert_eq!(texts(&Scale::depth((3.0, 3.0))), ["3"]);
+        assert_eq!(Scale::depth((3.0, f32::NAN)).ticks.len(), 1);
+    }
+
+    /// The colours are those of the pictures: near is warm.
+    #[test]
+    fn colours_are_those_of_the_maps() {
+        let (error, depth) = (Scale::error(0.25, false), Scale::depth((1.0, 9.0)));
+        assert_eq!(error.colours[0], css(heat(Palette::Error, 0.0)));
+        assert_eq!(error.colours[COLOURS - 1], css(heat(Palette::Error, 1.0)));
+        let near = draw_depth(1, &[1.0], &[1.0], (1.0, 9.0)).data;
+        assert_eq!(depth.colours[0], css([near[0], near[1], near[2]]));
+        assert!(near[0] > near[2], "{near:?}");
+    }
+}

@@ -1,0 +1,182 @@
+use maud::{Markup, html};
+use stage_call::seconds;
+
+use crate::figures::Figure;
+use crate::gather::{Report, Row};
+
+/// Figures in the summary.
+const SUMMARY: usize = 4;
+/// Cells of the table of all views' figures, from which on a page leaves it out.
+const MAX_CELLS: usize = 12_000;
+
+/// The most important figures of the best result.
+pub(crate) fn summary(report: &Report<'_>) -> Markup {
+    let Some(best) = report.best() else {
+        return html! { p class="note" { "There are no scores." } };
+    };
+    let known = report.figures.iter().filter_map(|figure| Some((figure, figure.mean(best)?)));
+    html! {
+        section class="summary" aria-label="Summary" {
+            @if report.rows.len() > 1 {
+                p { "Best by " (plain(&report.figures[0].label)) " of "
+                    (report.rows.len()) " results: " b { (best.label) } }
+            }
+            dl {
+                @for (figure, mean) in known.take(SUMMARY) {
+                    div { dt { (figure.label) } dd { (figure.text(mean)) } }
+                }
+                @if best.training > 0.0 {
+                    div { dt { "Training" } dd { (seconds(best.training)) } }
+                }
+            }
+        }
+    }
+}
+
+/// A label without the arrow that says which way is better.
+fn plain(label: &str) -> String {
+    label.replace(['↑', '↓'], "").split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// A table of means, one row a result, the best of each column marked.
+pub(crate) fn scores(report: &Report<'_>) -> Markup {
+    let rows = &report.rows;
+    if rows.is_empty() {
+        return html! {};
+    }
+    let known: Vec<&Figure> = report.figures.iter().filter(|f| f.is_known(rows)).collect();
+    let with_data_sets = report.scenes.len() > 1;
+    html! {
+        section id="scores" aria-labelledby="scores-heading" {
+            h2 id="scores-heading" { "Scores" }
+            p class="note" {
+                "Means over the test views. ↑ more is better, ↓ less is better."
+                @if rows.len() > 1 { " ★ marks the best of each column." }
+            }
+            div class="wide tall" tabindex="0" role="region" aria-labelledby="scores-heading" {
+                table {
+                    thead {
+                        tr {
+                            th scope="col" { "Result" }
+                            @if with_data_sets { th scope="col" { "Data set" } }
+                            @for figure in &known { th scope="col" class="n" { (figure.label) } }
+                            th scope="col" class="n" { "Views" }
+                            th scope="col" class="n" { "Training time" }
+                            th scope="col" class="n" { "Rendering time" }
+                        }
+                    }
+                    tbody {
+                        @for row in rows {
+                            tr {
+                                th scope="row" { (row.label) }
+                                @if with_data_sets { td { (report.scenes[row.scene].data_set) } }
+                                @for figure in &known { (mean(figure, row, rows)) }
+                                td class="n" { (row.view_count()) }
+                                td class="n" { (seconds(row.training)) }
+                                td class="n" { (seconds(row.rendering)) }
+                            }
+                        }
+                    }
+                }
+            }
+            (missing(report))
+        }
+    }
+}
+
+/// A cell of that table.
+fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
+    let Some(value) = figure.mean(row) else {
+        // Without HR truth no weights would help.
+        let has_truth = row.metrics["mean"]["psnr"].is_number();
+        let missing = figure.missing.as_deref().filter(|_| has_truth);
+        return html! { td class="n" { (missing.unwrap_or("–")) } };
+    };
+    html! {
+        @if figure.is_best(row, rows) {
+            td class="n best" {
+                span class="star" aria-label="best" role="img" { "★" } " " (figure.text(value))
+            }
+        } @else {
+            td class="n" { (figure.text(value)) }
+        }
+    }
+}
+
+/// Figures that no result has, and why.
+fn missing(report: &Report<'_>) -> Markup {
+    let has_truth = report.rows.iter().any(|row| row.metrics["mean"]["psnr"].is_number());
+    let unknown = report.figures.iter().filter(|figure| !figure.is_known(&report.rows));
+    let unknown: Vec<_> = unknown.filter_map(|f| Some((f, f.missing.as_ref()?))).collect();
+    html! {
+        @if has_truth && !unknown.is_empty() {
+            p class="note" {
+                "Not measured: "
+                @for (i, (figure, why)) in unknown.iter().enumerate() {
+                    @if i > 0 { "; " }
+                    (plain(&figure.label)) " (" (why) ")"
+                }
+                "."
+            }
+        }
+    }
+}
+
+/// Every view's figures, for reading without a pointer or a script.
+pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
+    let known: Vec<&Figure> =
+        report.figures.iter().filter(|figure| figure.is_known(&report.rows)).collect();
+    let views: usize = report.rows.iter().map(Row::view_count).sum();
+    if views == 0 || views * known.len() > MAX_CELLS {
+        return html! {};
+    }
+    html! {
+        details class="more" {
+            summary { "Numbers of every view" }
+            div class="wide tall" tabindex="0" role="region" aria-label="Numbers of every view" {
+                table {
+                    thead {
+                        tr {
+                            th scope="col" { "View" }
+                            @if report.rows.len() > 1 { th scope="col" { "Result" } }
+                            @for figure in &known { th scope="col" class="n" { (figure.label) } }
+                        }
+                    }
+                    tbody {
+                        @for row in &report.rows {
+                            @for view in row.metrics["views"].as_array().into_iter().flatten() {
+                                tr {
+                                    th scope="row" { (view["name"].as_str().unwrap_or_default()) }
+                                    @if report.rows.len() > 1 { td { (row.label) } }
+                                    @for figure in &known {
+                                        @let value = figure.of(&view["scores"]);
+                                        @let text = value.map(|value| figure.text(value));
+                                        td class="n" { (text.as_deref().unwrap_or("–")) }
+                                    }
+                                }
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// How figures were made, in the metrics' own words.
+pub(crate) fn conventions(report: &Report<'_>) -> Markup {
+    let Some(row) = report.rows.first() else { return html! {} };
+    let said = row.metrics["conventions"].as_object();
+    html! {
+        @if let Some(said) = said {
+            details class="more" {
+                summary { "How the figures are made" }
+                dl class="facts" {
+                    @for (name, text) in said {
+                        dt { (name.replace('_', " ")) } dd { (text.as_str().unwrap_or_default()) }
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,103 @@
+use std::collections::BTreeMap;
+
+use maud::{Markup, html};
+
+use crate::data::{Data, PictureData};
+use crate::gather::Report;
+
+/// Views that a reader without scripts sees.
+const STATIC_VIEWS: usize = 4;
+
+/// The comparison of pictures; its script fills it in.
+pub(crate) fn viewer(data: Option<&Data>) -> Markup {
+    html! {
+        section id="compare" aria-labelledby="compare-heading" {
+            h2 id="compare-heading" { "Compare" }
+            noscript { (static_pictures(data)) }
+            div id="viewer" hidden {
+                div class="controls" {
+                    div class="field" {
+                        label for="view" { "View" }
+                        div class="stepper" {
+                            button type="button" id="previous" aria-label="Previous view" { "‹" }
+                            select id="view" {}
+                            button type="button" id="next" aria-label="Next view" { "›" }
+                        }
+                    }
+                    div class="field pair" { label for="left" { "Left" } select id="left" {} }
+                    div class="field pair" { label for="right" { "Right" } select id="right" {} }
+                    div class="field all" { label for="kind" { "Pictures" } select id="kind" {} }
+                    div class="field modes" role="group" aria-label="Arrangement" {
+                        button type="button" id="slider-mode" aria-pressed="true" { "Slider" }
+                        button type="button" id="grid-mode" aria-pressed="false" { "Side by side" }
+                    }
+                }
+                div id="stage" tabindex="0" role="group" aria-describedby="stage-help" {}
+                div class="controls under" {
+                    label class="split" { span { "Divide" }
+                        input type="range" id="split" min="0" max="100" step="0.5" value="50"
+                            aria-label="Place of the division between left and right, per cent";
+                    }
+                    div class="field modes" role="group" aria-label="Zoom" {
+                        button type="button" id="zoom-out" aria-label="Zoom out" { "−" }
+                        output id="zoom" { "" }
+                        button type="button" id="zoom-in" aria-label="Zoom in" { "+" }
+                        button type="button" id="fit" { "Fit" }
+                        button type="button" id="one-to-one" { "1:1" }
+                    }
+                }
+                p id="stage-help" class="note" {
+                    "Drag to move the division, or to pan a zoomed view. Ctrl and wheel, pinch, + "
+                    "and − zoom; 0 fits, 1 or a double click shows one pixel as one; N and P change "
+                    "the view."
+                }
+                div id="scales" {}
+                div class="wide" tabindex="0" role="region" aria-label="Numbers of this view" {
+                    table id="numbers" aria-live="polite" {}
+                }
+                p id="originals" class="note" {}
+            }
+        }
+    }
+}
+
+/// The originals of some views, for readers without scripts.
+fn static_pictures(data: Option<&Data>) -> Markup {
+    let mut of_view: BTreeMap<usize, Vec<&PictureData>> = BTreeMap::new();
+    for picture in data.into_iter().flat_map(|data| &data.pictures) {
+        of_view.entry(picture.view).or_default().push(picture);
+    }
+    html! {
+        p { "The comparison needs JavaScript. These are pictures from the folder views/:" }
+        @for pictures in of_view.values().take(STATIC_VIEWS) {
+            div class="static" {
+                @for picture in pictures.iter().take(6) {
+                    figure {
+                        img src=(picture.original) alt="" loading="lazy";
+                        figcaption { (picture.original) }
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Plots of scores, of trade-offs and of training; their script draws them.
+pub(crate) fn plots(report: &Report<'_>) -> Markup {
+    if report.rows.is_empty() {
+        return html! { section id="plots" hidden {} };
+    }
+    html! {
+        section id="plots" aria-labelledby="plots-heading" hidden {
+            h2 id="plots-heading" { "Plots" }
+            div class="controls" {
+                div class="field" { label for="figure" { "Figure" } select id="figure" {} }
+                div class="field axis" {
+                    label for="axis" { "Swept parameter" }
+                    select id="axis" {}
+                }
+            }
+            div id="charts" class="charts" {}
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! What a published folder shows, and where it goes when something else takes its place.
+
+use std::ffi::OsStr;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+/// Name of a [`Mark`] in a published folder.
+pub(crate) const MARK: &str = ".shows";
+
+/// What a published folder shows.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Mark {
+    /// Hash of the run's record.
+    pub(crate) identity: String,
+    /// Whether all of it is there: nothing failed.
+    pub(crate) is_whole: bool,
+    /// The data sets that it is about; none where that isn't known.
+    pub(crate) data_sets: Vec<String>,
+}
+
+impl Mark {
+    /// Of a folder, where it has one. Earlier versions wrote the identity alone.
+    pub(crate) fn read(folder: &Path) -> Option<Self> {
+        let text = fs::read_to_string(folder.join(MARK)).ok()?;
+        let older = || Self { identity: text.clone(), is_whole: true, data_sets: Vec::new() };
+        Some(serde_json::from_str(&text).unwrap_or_else(|_| older()))
+    }
+
+    pub(crate) fn write(&self, folder: &Path) -> io::Result<()> {
+        fs::write(folder.join(MARK), serde_json::to_string(self)?)
+    }
+
+    /// Whether it is worth keeping when the other takes its place.
+    fn is_kept_from(&self, other: &Self) -> bool {
+        let is_other = !self.data_sets.is_empty() && self.data_sets != other.data_sets;
+        is_other || (self.is_whole && !other.is_whole)
+    }
+
+    /// Whether it may take the other's place.
+    fn succeeds(&self, other: &Self) -> bool {
+        self.data_sets == other.data_sets && (self.is_whole || !other.is_whole)
+    }
+}
+
+/// Where the target's folder goes when a made one takes its place: beside it, under its data set's
+/// name. None where it may go for good. `is_ours` says whether a folder may be replaced.
+pub(crate) fn place_aside(
+    made: &Path,
+    target: &Path,
+    is_ours: impl Fn(&Path) -> bool,
+) -> Option<PathBuf> {
+    let (new, old) = (Mark::read(made)?, Mark::read(target)?);
+    if !old.is_kept_from(&new) {
+        return None;
+    }
+    let name = format!("{}-{}", target.file_name()?.to_str()?, short_name(&old.data_sets));
+    let numbered = |number: usize| match number {
+        1 => target.with_file_name(&name),
+        _ => target.with_file_name(format!("{name}-{number}")),
+    };
+    let is_free = |place: &PathBuf| {
+        place.symlink_metadata().is_err()
+            || (Mark::read(place).is_some_and(|mark| old.succeeds(&mark)) && is_ours(place))
+    };
+    (1..).map(numbered).find(is_free)
+}
+
+/// Most data sets that a folder's name has.
+const MAX_NAMES: usize = 3;
+
+/// A name for data sets that every file system takes.
+fn short_name(data_sets: &[String]) -> String {
+    let last = |path: &String| {
+        let name = Path::new(path).file_name().and_then(OsStr::to_str).unwrap_or("data");
+        let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
+        name.chars().map(|c| if is_plain(c) { c } else { '-' }).take(60).collect::<String>()
+    };
+    let mut names: Vec<String> = data_sets.iter().take(MAX_NAMES).map(last).collect();
+    match data_sets.len() {
+        0 => names.push("before".to_owned()),
+        1..=MAX_NAMES => {}
+        more => names.push(format!("{}-more", more - MAX_NAMES)),
+    }
+    names.join("-")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_short_and_plain() {
+        let name = |paths: &[&str]| {
+            short_name(&paths.iter().map(|&path| path.to_owned()).collect::<Vec<_>>())
+        };
+        assert_eq!(name(&["/data/my lego"]), "my-lego");
+        assert_eq!(name(&["a", "b", "c", "d", "e"]), "a-b-c-2-more");
+        assert_eq!(name(&["/"]), "data");
+        assert_eq!(name(&[]), "before");
+        assert_eq!(name(&[&"x".repeat(300)]).len(), 60);
+    }
+}

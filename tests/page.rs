@@ -1,0 +1,328 @@
+//! The report page in a real browser: of runs, of one result and of many, with and without
+//! pictures' originals, and of a run that failed.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use common::browser::run_in_browser;
+use common::{Project, stage};
+use serde_json::{Value, json};
+
+/// A page may have so many bytes, with 50 views of 800 pixels.
+const PAGE_BYTES: u64 = 15_000_000;
+
+/// What the browser saw on a phone and a desktop, light and dark; checks that nothing was wrong.
+#[track_caller]
+fn look(page: &Path) -> Option<Vec<Value>> {
+    seen(page, "all", 4)
+}
+
+/// The same on a dark phone and a light desktop alone.
+#[track_caller]
+fn glance(page: &Path) -> Option<Vec<Value>> {
+    seen(page, "some", 2)
+}
+
+#[track_caller]
+fn seen(page: &Path, sizes: &str, count: usize) -> Option<Vec<Value>> {
+    let found = run_in_browser("page.mjs", [page.as_os_str(), sizes.as_ref()])?;
+    let looks = found.as_array().unwrap().clone();
+    assert_eq!(looks.len(), count);
+    for look in &looks {
+        assert_eq!(look["problems"], json!([]), "{}: {}", page.display(), look["size"]);
+    }
+    Some(looks)
+}
+
+/// `metrics.json` as the page should show it: by view and label of a figure, rounded.
+fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
+    let figures = metrics["figures"].as_array().unwrap();
+    let of_view = |view: &Value| {
+        let number = |figure: &Value| {
+            let place = format!("/scores/{}", figure["path"].as_str().unwrap());
+            let value = view.pointer(&place)?.as_f64()?;
+            let digits = figure["digits"].as_u64().unwrap() as usize;
+            Some((figure["label"].as_str().unwrap().to_owned(), format!("{value:.digits$}")))
+        };
+        (view["name"].as_str().unwrap().to_owned(), figures.iter().filter_map(number).collect())
+    };
+    metrics["views"].as_array().unwrap().iter().map(of_view).collect()
+}
+
+#[track_caller]
+fn says(look: &Value, result: &str, metrics: &Value) {
+    for (view, figures) in shown(metrics) {
+        let found = &look["numbers"][&view][result];
+        for (label, number) in figures {
+            assert_eq!(found[&label], json!(number), "{view}, {result}, {label}: {}", look["size"]);
+        }
+    }
+}
+
+#[test]
+fn a_page_shows_a_sweep_as_eval_scored_it() {
+    let project = Project::fast();
+    let sweep = ["-p", "supersample=1,2"];
+    let said = project.ok(&[&["run"], &sweep[..]].concat());
+    assert!(said.contains("out/report/index.html"), "{said}");
+    let page = project.path("out/report/index.html");
+    let text = std::fs::read_to_string(&page).unwrap();
+    for words in ["run -p supersample=1,2", "weights not given", " UTC", "<h1>demo-scene</h1>"] {
+        assert!(text.contains(words), "the page lacks {words:?}");
+    }
+    // Originals lie beside it, and what the page says of each stage is the run's.
+    let folders = std::fs::read_dir(project.path("out/report/views")).unwrap().count();
+    assert_eq!(folders, 2, "one a view");
+    for stage in ["prep", "train-ss", "eval"] {
+        let output = &project.output_of(stage, &sweep)[0];
+        assert!(text.contains(output.as_str()), "{stage}: no {output}");
+    }
+    let Some(looks) = look(&page) else { return };
+    for (point, result) in [(0, "supersample=1"), (1, "supersample=2")] {
+        let folder = project.object(&project.output_of("eval", &sweep)[point]);
+        let metrics = std::fs::read(folder.join("metrics.json")).unwrap();
+        let metrics: Value = serde_json::from_slice(&metrics).unwrap();
+        assert!(metrics["mean"]["psnr"].is_number());
+        looks.iter().for_each(|look| says(look, result, &metrics));
+    }
+    // Without the originals the page works.
+    let alone = project.path("alone.html");
+    std::fs::copy(&page, &alone).unwrap();
+    glance(&alone);
+}
+
+/// A run's record, as the runner writes it, with the same result many times.
+fn record(project: &Project, results: usize) -> Value {
+    let node = |stage: &str, kind: &str, point: &str, inputs: Value| {
+        let folder = project.artifact(stage, &[]);
+        json!({"stage": stage, "program": stage, "point": point, "kind": kind, "key": "k",
+            "values": if point.is_empty() { json!({}) } else { json!({"rays": point[5..]}) },
+            "is_cached": point.is_empty(), "peak_memory": 100_000_000,
+            "output": folder.file_name().unwrap().to_str().unwrap(), "folder": folder,
+            "parameters": {"rays": 4000, "seed": null}, "inputs": inputs,
+            "started_unix": 1_790_000_000, "seconds": 3.5, "threads": 2})
+    };
+    let mut nodes = vec![
+        node("demo-scene", "dataset", "", json!({})),
+        node("prep", "scene", "", json!({"dataset": {"node": 0}})),
+    ];
+    for result in 0..results {
+        let point = if results == 1 { String::new() } else { format!("rays={}", 1000 + result) };
+        let first = nodes.len();
+        let prep = |folder: &str| json!({"node": 1, "subtree": folder});
+        let inputs = json!({"scene": prep("train")});
+        nodes.push(node("train-ss", "field", &point, inputs));
+        let inputs = json!({"field": {"node": first}, "cameras": prep("cameras")});
+        nodes.push(node("render-depth", "views", &point, inputs));
+        let inputs = json!({"views": {"node": first + 1}, "truth": prep("truth")});
+        nodes.push(node("eval", "metrics", &point, inputs));
+    }
+    json!({"home": project.path("out"), "command": ["nerf-sr", "run"], "data_sets": ["demo-scene"],
+        "nodes": nodes})
+}
+
+/// The page of a record.
+#[track_caller]
+fn page_of(folder: &Path, record: &Value) -> PathBuf {
+    let (run, page) = (folder.join("run"), folder.join("page"));
+    std::fs::create_dir_all(&run).unwrap();
+    std::fs::write(run.join("run.json"), record.to_string()).unwrap();
+    let finished = stage("report", "{}", &[("run", &run)], &page, &[]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    page.join("index.html")
+}
+
+#[test]
+fn one_result_and_a_hundred_have_readable_pages() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    let metrics = project.json("eval", "metrics.json", &[]);
+    for (results, last) in [(1, "default"), (12, "rays=1011"), (100, "rays=1099")] {
+        let folder = tempfile::tempdir().unwrap();
+        let page = page_of(folder.path(), &record(&project, results));
+        let text = std::fs::read_to_string(&page).unwrap();
+        assert_eq!(text.matches("★</span>").count() > 0, results > 1, "{results}");
+        assert!(text.len() as u64 <= PAGE_BYTES, "{} bytes", text.len());
+        let Some(looks) = glance(&page) else { return };
+        looks.iter().for_each(|look| says(look, last, &metrics));
+    }
+}
+
+/// Views of photographs, which no filter shrinks to nothing: detail at every size, and noise.
+fn photographs(folder: &Path, count: usize, side: usize) -> Value {
+    let camera = |name: &str, side: usize| {
+        json!({"name": name, "intrinsics": {"width": side, "height": side, "fx": side, "fy": side,
+                "cx": side / 2, "cy": side / 2},
+            "camera_to_world": [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]]})
+    };
+    let (mut truths, mut renders, mut scores) = (vec![], vec![], vec![]);
+    for number in 0..count {
+        let name = format!("r_{number}");
+        let sharp = texture(side, number as u64, 1.0);
+        let write = |file: &str, image: &pixels::Rgba8| {
+            let path = folder.join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            pixels::write_png(&path, image).unwrap();
+        };
+        write(&format!("truth/images/{name}.png"), &sharp);
+        write(&format!("views/images/{name}.png"), &texture(side, number as u64, 0.5));
+        let small = pixels::resize_pillow(&sharp, side / 2, side / 2, pixels::Filter::Lanczos);
+        write(&format!("truth/low/{name}.png"), &small);
+        write(&format!("metrics/errors/{name}.png"), &texture(side, 1000 + number as u64, 1.0));
+        let view = json!({"camera": camera(&name, side), "image": format!("images/{name}.png")});
+        let mut truth = view.clone();
+        truth["low_resolution"] = json!(format!("low/{name}.png"));
+        truths.push(truth);
+        renders.push(view);
+        scores.push(json!({"name": name, "scores": {"psnr": 20.0 + number as f64 / 10.0},
+            "error_map": format!("errors/{name}.png")}));
+    }
+    let conventions = serde_json::to_value(scene::Conventions::default()).unwrap();
+    let bounds =
+        json!({"min": [-1.0, -1.0, -1.0], "max": [1.0, 1.0, 1.0], "near": 1.0, "far": 9.0});
+    for (place, views) in [("truth", truths), ("views", renders)] {
+        let file = json!({"conventions": conventions, "background": "white", "bounds": bounds,
+            "views": views});
+        std::fs::write(folder.join(place).join("views.json"), file.to_string()).unwrap();
+    }
+    let figure =
+        json!({"path": "psnr", "label": "PSNR ↑ dB", "digits": 2, "higher_is_better": true});
+    json!({"conventions": {}, "figures": [figure], "mean": {"psnr": 22.45}, "views": scores})
+}
+
+/// Waves of every length with phases that depend on the number, and noise.
+fn texture(side: usize, number: u64, detail: f64) -> pixels::Rgba8 {
+    let noise = |x: usize, y: usize, c: usize| {
+        let mut bits = (x as u64) << 40 | (y as u64) << 16 | number << 4 | c as u64;
+        for factor in [0xff51_afd7_ed55_8ccd_u64, 0xc4ce_b9fe_1a85_ec53] {
+            bits = (bits ^ (bits >> 33)).wrapping_mul(factor);
+        }
+        (bits >> 56) as f64 / 255.0 - 0.5
+    };
+    let waves = |x: usize, y: usize| {
+        let phase = number as f64;
+        (1..7)
+            .map(|octave| {
+                let length = f64::from(1 << octave) * 0.012;
+                let (u, v) = (x as f64 * length, y as f64 * length);
+                ((u + phase).sin() * (v * 1.3 - phase).cos()) / f64::from(octave)
+            })
+            .sum::<f64>()
+    };
+    let pixel = |i: usize| {
+        let (x, y) = (i % side, i / side);
+        let level = 0.5 + 0.2 * waves(x, y);
+        let channel = |c: usize| {
+            let value = level + 0.12 * detail * noise(x, y, c) + 0.05 * c as f64;
+            (value.clamp(0.0, 1.0) * 255.0) as u8
+        };
+        [channel(0), channel(1), channel(2), 255]
+    };
+    pixels::Rgba8::new(side, side, (0..side * side).flat_map(pixel).collect())
+}
+
+#[test]
+fn fifty_views_of_800_pixels_have_room() {
+    let dir = tempfile::tempdir().unwrap();
+    let metrics = photographs(dir.path(), 50, 800);
+    std::fs::write(dir.path().join("metrics/metrics.json"), metrics.to_string()).unwrap();
+    let node = |stage: &str, kind: &str, folder: &str, inputs: Value| {
+        json!({"stage": stage, "point": "", "kind": kind, "key": "", "output": "",
+            "folder": dir.path().join(folder), "parameters": {}, "inputs": inputs,
+            "started_unix": 1, "seconds": 1.0, "threads": 1})
+    };
+    let nodes = [
+        node("truth", "views", "truth", json!({})),
+        node("views", "views", "views", json!({})),
+        node("eval", "metrics", "metrics", json!({"views": {"node": 1}, "truth": {"node": 0}})),
+    ];
+    let page = page_of(dir.path(), &json!({"nodes": nodes}));
+    let bytes = page.metadata().unwrap().len();
+    println!("{bytes} bytes");
+    assert!(bytes <= PAGE_BYTES, "{bytes} bytes");
+    // All views are there, with their originals.
+    let views = std::fs::read_dir(dir.path().join("page/views")).unwrap();
+    assert_eq!(views.count(), 50);
+    let original = pixels::read_png(&dir.path().join("page/views/r_7/ground-truth.png")).unwrap();
+    let truth = pixels::read_png(&dir.path().join("truth/images/r_7.png")).unwrap();
+    assert!(original == truth, "an original isn't what it was");
+    let text = std::fs::read_to_string(&page).unwrap();
+    assert_eq!(text.matches("\"uri\":\"data:image/").count(), 50 * 4);
+}
+
+/// The second stage fails: the page shows the first, and says what happened.
+#[test]
+fn a_run_that_failed_has_a_page() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    let whole = std::fs::read(project.path("out/report/index.html")).unwrap();
+    let failed = project.run(&["run", "-p", "train-ss.rays=1"]);
+    assert_ne!(failed.code, 0);
+    assert!(failed.stdout.contains("what was there before is now"), "{}", failed.stdout);
+    assert_eq!(std::fs::read(project.path("out/report-demo-scene/index.html")).unwrap(), whole);
+    let page = project.path("out/report/index.html");
+    let text = std::fs::read_to_string(&page).unwrap();
+    for words in
+        ["This run failed", "<b>train-ss</b>: ", "✕ failed", "– not run", "There are no scores"]
+    {
+        assert!(text.contains(words), "the page lacks {words:?}");
+    }
+    look(&page);
+    // Results that are there are shown beside those that aren't.
+    let sweep = ["run", "--keep-going", "-p", "train-ss.rays=1,4000"];
+    assert_ne!(project.run(&sweep).code, 0);
+    let text = std::fs::read_to_string(&page).unwrap();
+    assert!(text.contains("This run failed") && text.contains("<b>train-ss [rays=1]</b>"));
+    let Some(looks) = glance(&page) else { return };
+    let metrics = project.json("eval", "metrics.json", &[]);
+    looks.iter().for_each(|look| says(look, "rays=4000", &metrics));
+}
+
+#[test]
+fn a_page_without_scores_to_read_says_so() {
+    let project = Project::fast();
+    project.ok(&["run"]);
+    let mut record = record(&project, 2);
+    let empty = tempfile::tempdir().unwrap();
+    record["nodes"][4]["folder"] = json!(empty.path());
+    // Metrics of somebody's own, without views or figures.
+    let own = tempfile::tempdir().unwrap();
+    std::fs::write(own.path().join("metrics.json"), r#"{"mean": {"mse": 0.25}, "views": {}}"#)
+        .unwrap();
+    record["nodes"][7]["folder"] = json!(own.path());
+    let folder = tempfile::tempdir().unwrap();
+    let page = page_of(folder.path(), &record);
+    let text = std::fs::read_to_string(&page).unwrap();
+    assert!(text.contains("Scores that can't be read") && text.contains("0.2500"), "no such page");
+    let looks: Option<Vec<Value>> = glance(&page);
+    let summary = json!(["0.2500"]);
+    looks.into_iter().flatten().for_each(|look| assert_eq!(look["summary"][0], summary[0]));
+}
+
+#[test]
+fn another_data_set_has_its_own_page() {
+    let project = Project::fast();
+    project.demo_data("first");
+    project.demo_data("second");
+    for data_set in ["first", "second"] {
+        let path = project.path("data").join(data_set).canonicalize().unwrap();
+        let copy = project.path("sets").join(data_set);
+        std::fs::create_dir_all(&copy).unwrap();
+        let all = [path.join("."), copy.clone()];
+        assert!(std::process::Command::new("cp").arg("-r").args(all).status().unwrap().success());
+    }
+    let run = |data_set: &str| project.ok(&["run", "-i", &format!("dataset=./sets/{data_set}")]);
+    assert!(!run("first").contains("before"));
+    let said = run("second");
+    assert!(said.contains("out/report-first/index.html"), "{said}");
+    let heading = |folder: &str| {
+        let text = std::fs::read_to_string(project.path(folder).join("index.html")).unwrap();
+        text.split_once("<h1>").unwrap().1.split_once("</h1>").unwrap().0.to_owned()
+    };
+    assert_eq!(heading("out/report"), "second");
+    assert_eq!(heading("out/report-first"), "first");
+    assert!(run("second").contains("up to date"));
+}
