@@ -1,4 +1,4 @@
-# make demo    set-up, build, the demo scene at ×2, and its page
+# make demo    builds what the demo needs, and makes its page
 # make test    every test · make faults · make lint · make bench · make sweep · make clean
 # make help    all targets
 
@@ -15,24 +15,40 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build remote setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean goldens
+.PHONY: help demo build-demo build remote install setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
 
+# Says every eight seconds that a silent command still runs.
+ALIVE := scripts/alive.sh
+
 setup: ## Put libtorch into .libtorch (once)
-	@scripts/setup-libtorch.sh
+	@$(ALIVE) scripts/setup-libtorch.sh
 
 # The one program with a network in it is built apart: in one build, what it asks of shared crates would have all others built again.
 REMOTE := nerf-sr-remote
 build: setup ## Build everything but nerf-sr-remote in the release profile
-	@cargo build --release --workspace --exclude $(REMOTE) --quiet
+	@$(ALIVE) cargo build --release --workspace --exclude $(REMOTE)
 
 remote: ## Build nerf-sr-remote, which shares stores between machines
-	@cargo build --release -p $(REMOTE) --quiet
+	@$(ALIVE) cargo build --release -p $(REMOTE)
 
-demo: build ## Set-up, build, demo scene ×2, and the page
+# The programs of the default pipeline do without libtorch. Once everything is built, the demo takes that: keys are the same.
+# tests/first_run.rs compares copies of these programs with the whole build.
+DEMO_PROGRAMS := nerf-sr demo-scene prep train-ss render-depth eval report
+build-demo:
+	@command -v cargo >/dev/null || { echo "cargo is missing; install Rust 1.95 or newer (rustup)" >&2; exit 1; }
+	@$(ALIVE) cargo build --release --no-default-features $(DEMO_PROGRAMS:%=-p %)
+	@mkdir -p target/without-libtorch && cp -f $(DEMO_PROGRAMS:%=target/release/%) target/without-libtorch
+
+demo: $(if $(wildcard target/release/train-refine),build,build-demo) ## Build what the demo needs, the demo scene at ×2, and its page
 	@$(NERF_SR) run
+
+PREFIX ?= /usr/local
+# With sudo there may be no cargo: then what is built is installed.
+install: $(if $(wildcard $(HOME)/.cargo/bin/cargo)$(shell command -v cargo),build remote) ## Install programs, completions and man pages: make install PREFIX=/usr/local DESTDIR=
+	@DESTDIR=$(DESTDIR) scripts/install.sh $(PREFIX) $(LIBTORCH_DIR)
 
 test: build remote ## Every test, the skipped and the slowest named; FILTER=WORDS for some of them
 	@python3 scripts/run-tests.py $(FILTER)
@@ -48,7 +64,7 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 	cargo fmt --all --check
 	cargo fmt --manifest-path tests/fuzz/Cargo.toml --check
 	cargo clippy --release --workspace --all-targets -- -D warnings
-	cargo clippy --release -p train-ss -p render-depth -p register -p eval --no-default-features --all-targets -- -D warnings
+	cargo clippy --release -p train-ss -p render-depth -p register -p eval -p export --no-default-features --all-targets -- -D warnings
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	$(IN_FUZZ) cargo clippy --release -- -D warnings
 	@if command -v cargo-deny >/dev/null; then cargo deny check bans licenses sources; else echo "cargo-deny is not installed: skipped"; fi
@@ -155,8 +171,8 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= RAYS=$(BENCH_RAYS) DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
 	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) RAYS=$(BENCH_RAYS) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
-compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS=FACTOR
-	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS))
+compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS="FACTOR …" SCENES="lego 100x2" PICTURE=FILE.svg
+	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py && .venv/bin/python scripts/make-goldens-refiner.py

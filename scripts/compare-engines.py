@@ -1,19 +1,23 @@
 #!/usr/bin/env python3
 """Compares what two builds' engines cost and bring, on withheld training views, one after the other in one run.
 
-compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR] [--seeds N]
+compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ...] [--seeds N] [--picture FILE.svg]
 
-OLD and NEW are work trees, each built by `make build`. OLD prepares each scene and scores the views of both.
+OLD and NEW are work trees, each built by `make build`. OLD prepares each scene and scores the views of both. With several
+factors of the rays, --picture draws PSNR against training time.
 """
 
 import argparse
+import itertools
 import json
 import os
 import pathlib
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
+from typing import NamedTuple
 
 # Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field.
 SCENES = {
@@ -51,16 +55,78 @@ def prepare(options: argparse.Namespace, folder: pathlib.Path, name: str) -> Non
     run(options.old, "prep", folder, "scene", {"dataset": "dataset"}, {"lr_width": width, "scale": scale, "test_views": 12})
 
 
-def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int) -> str:
+class Result(NamedTuple):
+    """What a training of a build brought and cost."""
+
+    scene: str
+    build: str
+    seed: int
+    rays: int
+    psnr: float
+    ssim: float
+    training: float
+    rendering: float
+    memory: int
+
+    def line(self) -> str:
+        figures = f"{self.psnr:.3f} | {self.ssim:.4f} | {self.training:.1f} s | {self.rendering:.1f} s | {self.memory} MiB"
+        return f"| {self.scene} | {self.build} | {self.seed} | {self.rays / 1e6:g} M | {figures} | {os.getloadavg()[0]:.1f} |"
+
+
+def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int, factor: float) -> Result:
     _, _, scale, rays = SCENES[name]
-    params = {"field": {"grid": {"rays": int(rays * options.rays)}}, "supersample": scale, "seed": seed}
-    tree, at = getattr(options, build), f"{build}-{seed}"
+    rays = int(rays * factor)
+    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed}
+    tree, at = getattr(options, build), f"{build}-{seed}-{rays}"
     training, memory = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
     rendering, most = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
     run(options.old, "eval", folder, f"{at}/eval", {"views": f"{at}/views", "truth": "scene/truth"}, {})
     mean = json.loads((folder / at / "eval/metrics.json").read_text())["mean"]
-    figures = f"{mean['psnr']:.3f} | {mean['ssim']:.4f} | {training:.1f} s | {rendering:.1f} s | {max(memory, most)} MiB"
-    return f"| {name} | {build} | {seed} | {figures} | {os.getloadavg()[0]:.1f} |"
+    return Result(name, build, seed, rays, mean["psnr"], mean["ssim"], training, rendering, max(memory, most))
+
+
+WIDTH, HEIGHT, LEFT, TOP, BETWEEN = 420, 300, 52, 30, 30
+COLOURS = {"old": "#8a8a8a", "new": "#c2410c"}
+
+
+def picture(results: list[Result]) -> str:
+    """PSNR against training time as SVG: a panel a scene, a curve a build, seeds averaged."""
+    scenes = list(dict.fromkeys(result.scene for result in results))
+    panels = "".join(panel(scene, [r for r in results if r.scene == scene], i * (WIDTH + BETWEEN)) for i, scene in enumerate(scenes))
+    width = len(scenes) * (WIDTH + BETWEEN) - BETWEEN
+    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {HEIGHT}" font-family="sans-serif" font-size="12">'
+            f'<rect width="{width}" height="{HEIGHT}" fill="#fff"/>{panels}</svg>\n')
+
+
+def panel(scene: str, results: list[Result], left: int) -> str:
+    """One scene's curves, `left` units from the left."""
+    curves = {build: [] for build in COLOURS}
+    for build, rays in dict.fromkeys((r.build, r.rays) for r in results):
+        seeds = [r for r in results if (r.build, r.rays) == (build, rays)]
+        curves[build].append((statistics.mean(r.training for r in seeds), statistics.mean(r.psnr for r in seeds)))
+    points = [point for curve in curves.values() for point in curve]
+    longest = max(seconds for seconds, _ in points) * 1.05
+    low, high = (pick(psnr for _, psnr in points) for pick in (min, max))
+    low, high = low - 0.1 * (high - low) - 0.02, high + 0.1 * (high - low) + 0.02
+
+    def place(seconds: float, psnr: float) -> tuple[float, float]:
+        return (left + LEFT + seconds / longest * (WIDTH - LEFT - 10), HEIGHT - 40 - (psnr - low) / (high - low) * (HEIGHT - 40 - TOP))
+
+    parts = [f'<text x="{left + LEFT}" y="18" font-weight="bold">{scene}: PSNR in dB</text>']
+    for share in (0, 0.5, 1):
+        x, y = place(longest * share, low + (high - low) * share)
+        parts.append(f'<line x1="{left + LEFT}" x2="{left + WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>')
+        parts.append(f'<text x="{left + LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{low + (high - low) * share:.1f}</text>')
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 22}" text-anchor="middle">{longest * share:.0f}</text>')
+    parts.append(f'<text x="{left + (LEFT + WIDTH) / 2}" y="{HEIGHT - 6}" text-anchor="middle">seconds of training</text>')
+    for build, curve in curves.items():
+        places = [place(*point) for point in sorted(curve)]
+        line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
+        parts.append(f'<polyline points="{line}" fill="none" stroke="{COLOURS[build]}" stroke-width="2"/>')
+        parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{COLOURS[build]}"/>' for x, y in places]
+        x, y = places[-1]
+        parts.append(f'<text x="{x:.1f}" y="{y - 8:.1f}" text-anchor="end" fill="{COLOURS[build]}">{build}</text>')
+    return "".join(parts)
 
 
 def main() -> None:
@@ -69,16 +135,20 @@ def main() -> None:
     parser.add_argument("new", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="scenes (default ../shared/data)")
     parser.add_argument("--only", nargs="*", choices=SCENES, default=list(SCENES), help="which scenes (default all)")
-    parser.add_argument("--rays", type=float, default=1.0, help="factor of the rays")
+    parser.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors of the rays")
+    parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
     options = parser.parse_args()
-    print("| scene | build | seed | PSNR | SSIM | training | rendering | peak memory | load |\n" + "| --- " * 9 + "|")
+    print("| scene | build | seed | rays | PSNR | SSIM | training | rendering | peak memory | load |\n" + "| --- " * 10 + "|")
+    results = []
     for name in options.only:
         with tempfile.TemporaryDirectory() as folder:
             prepare(options, pathlib.Path(folder), name)
-            for seed in range(1, options.seeds + 1):
-                for build in ("old", "new"):
-                    print(measure(options, pathlib.Path(folder), name, build, seed), flush=True)
+            for seed, factor, build in itertools.product(range(1, options.seeds + 1), options.rays, ("old", "new")):
+                results.append(measure(options, pathlib.Path(folder), name, build, seed, factor))
+                print(results[-1].line(), flush=True)
+    if options.picture:
+        options.picture.write_text(picture(results))
 
 
 if __name__ == "__main__":

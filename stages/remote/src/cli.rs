@@ -1,11 +1,13 @@
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use anyhow::Context as _;
 use artifact::{Failure, Store, report_line};
-use clap::{Parser, Subcommand};
+use clap::{CommandFactory as _, Parser, Subcommand};
 
 use crate::export::export;
 use crate::import::import;
@@ -15,12 +17,14 @@ use crate::remote::{Access, Remote};
 use crate::selection::Selection;
 use crate::transfer::AT_ONCE;
 
+const NAME: &str = "nerf-sr-remote";
+
 /// Shares a store of nerf-sr between machines: finished actions and their artifacts.
 ///
 /// REMOTE is a folder, or s3://bucket/prefix with credentials, region and endpoint from the usual
 /// AWS_… variables.
 #[derive(Parser)]
-#[command(name = "nerf-sr-remote", version)]
+#[command(name = NAME, version)]
 struct Cli {
     #[command(subcommand)]
     verb: Verb,
@@ -66,16 +70,27 @@ enum Verb {
         /// The file
         file: PathBuf,
     },
+    /// Print shell completions
+    Completions {
+        /// For which shell
+        shell: clap_complete::Shell,
+    },
+    /// Write man pages of all verbs into a folder; `make install` calls this
+    #[command(hide = true)]
+    Man {
+        /// The folder
+        folder: PathBuf,
+    },
 }
 
 /// The program: exit code 0 when all is copied, 1 when it failed, 2 for a wrong command line, 3 for
 /// what was refused, 130 when it was interrupted.
 pub fn main() -> ExitCode {
-    artifact::install_panic_hook("nerf-sr-remote");
+    artifact::install_panic_hook(NAME);
     match run(Cli::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            report_line!("nerf-sr-remote: {}", artifact::one_line(&error));
+            report_line!("{NAME}: {}", artifact::one_line(&error));
             ExitCode::from(artifact::exit_code(&error))
         }
     }
@@ -97,6 +112,16 @@ fn run(cli: Cli) -> anyhow::Result<()> {
             export(&existing(&cli.store)?, &what, &file, records_only, &stop)
         }
         Verb::Import { file } => import(&Store::open(&cli.store)?, &file, &stop),
+        Verb::Completions { shell } => {
+            let mut script = Vec::new();
+            clap_complete::generate(shell, &mut Cli::command(), NAME, &mut script);
+            // Whoever asked for it may have gone.
+            std::io::stdout().write_all(&script).ok();
+            Ok(())
+        }
+        Verb::Man { folder } => std::fs::create_dir_all(&folder)
+            .and_then(|()| clap_mangen::generate_to(Cli::command(), &folder))
+            .with_context(|| format!("cannot write man pages into {}", folder.display())),
     }
 }
 
@@ -139,7 +164,7 @@ async fn stopped(stop: &AtomicBool) {
 mod tests {
     #[test]
     fn the_command_line_is_sound() {
-        use clap::CommandFactory as _;
-        super::Cli::command().debug_assert();
+        use super::*;
+        Cli::command().debug_assert();
     }
 }

@@ -5,9 +5,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::manifest::relative_path;
-use crate::parameters::Schema;
-use crate::rules::Rule;
+use crate::manifest::{PathError, relative_path};
+use crate::parameters::{Schema, SchemaError};
+use crate::rules::{Rule, RuleError};
 
 /// What `STAGE describe` prints: all that the runner knows of a stage.
 #[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
@@ -43,21 +43,42 @@ pub struct Description {
     pub rules: Vec<Rule>,
 }
 
+/// A description that contradicts itself: what is wrong with it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescriptionError {
+    /// Its parameter schema.
+    #[error("its parameter schema is {0}")]
+    Schema(#[from] SchemaError),
+    /// It doesn't say its name.
+    #[error("it has no name")]
+    Unnamed,
+    /// A folder of its output.
+    #[error("its output: {0}")]
+    Output(#[from] PathError),
+    /// A rule.
+    #[error("its rule {number}: {problem}")]
+    Rule {
+        /// Which, counted from 1.
+        number: usize,
+        /// What is wrong.
+        problem: RuleError,
+    },
+}
+
 impl Description {
     /// Says what is wrong with a description that has the right form: what it names must be there,
     /// and its folders inside the output.
-    pub fn check(&self) -> Result<(), String> {
-        let schema = Schema::new(&self.name, &self.parameters)
-            .map_err(|e| format!("its parameter schema is {e}"))?;
+    pub fn check(&self) -> Result<(), DescriptionError> {
+        let schema = Schema::new(&self.name, &self.parameters)?;
         if self.name.is_empty() {
-            return Err("it has no name".to_owned());
+            return Err(DescriptionError::Unnamed);
         }
         for folder in self.output.subtrees.keys().chain(&self.output.resolved) {
-            relative_path(folder).map_err(|e| format!("its output: {e}"))?;
+            relative_path(folder)?;
         }
         for (index, rule) in self.rules.iter().enumerate() {
             rule.check(&schema.names(), &self.inputs)
-                .map_err(|e| format!("its rule {}: {e}", index + 1))?;
+                .map_err(|problem| DescriptionError::Rule { number: index + 1, problem })?;
         }
         Ok(())
     }

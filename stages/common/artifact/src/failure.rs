@@ -51,18 +51,18 @@ pub fn one_line(error: &anyhow::Error) -> String {
 /// Turns any error into a [`Failure`] of a kind.
 pub trait FailureExt<T> {
     /// The input can't be used: exit code 3. `context` says where.
-    fn bad_input(self, context: impl Display) -> anyhow::Result<T>;
+    fn bad_input(self, context: impl Display) -> Result<T, Failure>;
     /// The parameters are wrong: exit code 2. `context` says which.
-    fn usage(self, context: impl Display) -> anyhow::Result<T>;
+    fn usage(self, context: impl Display) -> Result<T, Failure>;
 }
 
 impl<T, E: Into<anyhow::Error>> FailureExt<T> for Result<T, E> {
-    fn bad_input(self, context: impl Display) -> anyhow::Result<T> {
-        self.map_err(|e| Failure::BadInput(format!("{context}: {}", one_line(&e.into()))).into())
+    fn bad_input(self, context: impl Display) -> Result<T, Failure> {
+        self.map_err(|e| Failure::BadInput(format!("{context}: {}", one_line(&e.into()))))
     }
 
-    fn usage(self, context: impl Display) -> anyhow::Result<T> {
-        self.map_err(|e| Failure::Usage(format!("{context}: {}", one_line(&e.into()))).into())
+    fn usage(self, context: impl Display) -> Result<T, Failure> {
+        self.map_err(|e| Failure::Usage(format!("{context}: {}", one_line(&e.into()))))
     }
 }
 
@@ -77,7 +77,7 @@ mod tests {
         assert_eq!(one_line(&error), r"frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file");
         let bad = Err::<(), _>(error).bad_input("input scene").unwrap_err();
         assert_eq!(
-            one_line(&bad),
+            one_line(&bad.into()),
             r"input scene: frame 3 of many: r_\u{1b}]0;PWN\u{7}.png: No such file"
         );
     }

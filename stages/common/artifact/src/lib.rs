@@ -65,6 +65,7 @@ mod signals;
 mod stage;
 mod store;
 mod tagged;
+mod validator;
 mod values;
 mod warnings;
 
@@ -72,24 +73,24 @@ pub use amounts::{amount, counted, sized};
 pub use arrivals::Arrival;
 pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
-pub use describe::{Description, Input, Output};
-pub use device::check_device;
+pub use describe::{Description, DescriptionError, Input, Output};
+pub use device::{DeviceError, check_device};
 pub use documented::{GROUPS, ParameterSection, ParameterText, by_group};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
 pub use fsio::{write_atomically, write_json};
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
 pub use manifest::{
-    Damage, FileEntry, MANIFEST_FILE, Manifest, hash_files, list_files, relative_path,
+    Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, hash_files, list_files, relative_path,
 };
 pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
 pub use nearest::{known_names, nearest};
 pub use panics::install_panic_hook;
-pub use parameters::{ParameterProblem, Schema};
+pub use parameters::{ParameterProblem, Schema, SchemaError};
 pub use printable::printable;
 pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
 pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
-pub use rules::{GivenInputs, Rule};
-pub use run_record::{FailedPoint, RunInput, RunNode, RunRecord};
+pub use rules::{GivenInputs, Rule, RuleError};
+pub use run_record::{FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};

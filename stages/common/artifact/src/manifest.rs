@@ -106,7 +106,7 @@ impl Manifest {
             return Err(invalid(format!("schema {} where {SCHEMA} is known", manifest.schema)));
         }
         for file in &manifest.files {
-            relative_path(&file.path).map_err(invalid)?;
+            relative_path(&file.path).map_err(|e| invalid(e.to_string()))?;
         }
         if !manifest.files.is_sorted_by(|a, b| a.path < b.path) {
             return Err(invalid("files are not sorted by path".to_owned()));
@@ -219,13 +219,18 @@ fn hash_file(path: &Path) -> io::Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
+/// A path that leaves its folder, or names nothing.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0:?} is not a path inside the folder")]
+pub struct PathError(String);
+
 /// A path from a file that may be hostile: relative, `/`-separated, never upwards.
-pub fn relative_path(text: &str) -> Result<PathBuf, String> {
+pub fn relative_path(text: &str) -> Result<PathBuf, PathError> {
     let path = Path::new(text);
     let plain =
         path.components().all(|part| matches!(part, Component::Normal(_) | Component::CurDir));
     if text.is_empty() || !plain || text.contains('\0') {
-        return Err(format!("{text:?} is not a path inside the folder"));
+        return Err(PathError(text.to_owned()));
     }
     Ok(path.components().filter(|part| matches!(part, Component::Normal(_))).collect())
 }

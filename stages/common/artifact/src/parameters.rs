@@ -3,6 +3,7 @@ use serde_json::{Map, Value, json};
 use crate::nearest::{known_names, nearest};
 use crate::renames::{Named, renamed};
 use crate::tagged::Tag;
+use crate::validator::{Misfit, Validator};
 use crate::values::Reader;
 
 /// A stage's parameter schema, compiled: defaults and checks come from the types, in the runner and
@@ -23,7 +24,7 @@ pub struct Schema {
 #[derive(Debug)]
 struct Form {
     schema: Value,
-    validator: jsonschema::Validator,
+    validator: Validator,
 }
 
 /// A parameter that doesn't fit, in words for a person.
@@ -36,10 +37,15 @@ pub struct ParameterProblem {
     pub problem: String,
 }
 
+/// A parameter schema that can't be used: what is wrong with it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct SchemaError(pub(crate) String);
+
 impl Schema {
-    /// Compiles the schema that a program describes; the error says what is wrong with it.
-    pub fn new(program: &str, schema: &Value) -> Result<Self, String> {
-        let tag = Tag::find(schema)?;
+    /// Compiles the schema that a program describes.
+    pub fn new(program: &str, schema: &Value) -> Result<Self, SchemaError> {
+        let tag = Tag::find(schema).map_err(SchemaError)?;
         let forms = match &tag {
             None => vec![Form::new(schema.clone())?],
             Some(tag) => tag.forms(schema).into_iter().map(Form::new).collect::<Result<_, _>>()?,
@@ -141,11 +147,11 @@ pub(crate) const DEFAULT_KEYWORD: &str = "x-default";
 const BY_SCENE: &str = "by scene";
 
 impl Form {
-    fn new(schema: Value) -> Result<Self, String> {
+    fn new(schema: Value) -> Result<Self, SchemaError> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
         let validator =
-            jsonschema::validator_for(&bounded).map_err(|e| format!("not a JSON Schema: {e}"))?;
+            Validator::new(&bounded).map_err(|e| SchemaError(format!("not a JSON Schema: {e}")))?;
         Ok(Self { schema, validator })
     }
 
@@ -179,19 +185,18 @@ impl Form {
     }
 
     fn problems(&self, resolved: &Value) -> Vec<ParameterProblem> {
-        let problem = |error: jsonschema::ValidationError<'_>| {
-            let path = error.instance_path().to_string();
-            let name = path.trim_start_matches('/').to_owned();
+        let problem = |misfit: Misfit| {
+            let name = misfit.path.trim_start_matches('/').to_owned();
             let problem = match self.choices(&name) {
-                Some(choices) => not_one_of(error.instance(), &choices),
-                None => error.to_string(),
+                Some(choices) => not_one_of(&misfit.value, &choices),
+                None => misfit.problem,
             };
             ParameterProblem {
                 name: if name.is_empty() { "(all)".to_owned() } else { name },
                 problem,
             }
         };
-        self.validator.iter_errors(resolved).map(problem).collect()
+        self.validator.misfits(resolved).into_iter().map(problem).collect()
     }
 
     /// The words a parameter may be, where it is a choice: the validator itself only says that no

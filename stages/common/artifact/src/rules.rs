@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::describe::{Description, Input};
+use crate::validator::Validator;
 
 /// What parameters and inputs must be together, beyond what each may be alone. The runner checks it
 /// in the plan, the stage when it starts.
@@ -28,6 +29,25 @@ pub struct Rule {
 /// The inputs that are given, each with the parameters of the stage that it comes from, where those
 /// are known.
 pub type GivenInputs = BTreeMap<String, Option<Value>>;
+
+/// What is wrong with a rule.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum RuleError {
+    /// It names an input that the stage doesn't have.
+    #[error("there is no input {0:?}")]
+    Input(String),
+    /// It names a parameter that the stage doesn't have.
+    #[error("there is no parameter {0:?}")]
+    Parameter(String),
+    /// What a value must fit.
+    #[error("{name}: not a JSON Schema: {reason}")]
+    Schema {
+        /// The value's name.
+        name: String,
+        /// What is wrong.
+        reason: String,
+    },
+}
 
 impl Rule {
     /// A rule that always applies and asks for nothing yet.
@@ -66,9 +86,9 @@ impl Rule {
         &self,
         parameters: &[&str],
         inputs: &BTreeMap<String, Input>,
-    ) -> Result<(), String> {
+    ) -> Result<(), RuleError> {
         if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
-            return Err(format!("there is no input {input:?}"));
+            return Err(RuleError::Input(input.clone()));
         }
         for (name, schema) in self.when.iter().chain(&self.must) {
             let is_known = match name.split_once('.') {
@@ -76,10 +96,10 @@ impl Rule {
                 None => parameters.contains(&name.as_str()),
             };
             if !is_known {
-                return Err(format!("there is no parameter {name:?}"));
+                return Err(RuleError::Parameter(name.clone()));
             }
-            jsonschema::validator_for(schema)
-                .map_err(|e| format!("{name}: not a JSON Schema: {e}"))?;
+            Validator::new(schema)
+                .map_err(|reason| RuleError::Schema { name: name.clone(), reason })?;
         }
         Ok(())
     }
@@ -92,7 +112,7 @@ impl Rule {
                 }
                 None => parameters.get(name),
             };
-            Some(jsonschema::validator_for(schema).ok()?.is_valid(value?))
+            Some(Validator::new(schema).ok()?.is_valid(value?))
         };
         let applies = self.when.iter().all(|condition| fits(condition) == Some(true));
         let is_given = self.needs.iter().all(|input| inputs.contains_key(input));
@@ -196,7 +216,7 @@ mod tests {
                 "not a path inside the folder",
             ),
         ] {
-            let problem = broken.check().unwrap_err();
+            let problem = broken.check().unwrap_err().to_string();
             assert!(problem.contains(words), "{problem}");
         }
     }

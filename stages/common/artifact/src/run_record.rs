@@ -1,22 +1,53 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::process::Command;
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 /// `run.json`: what a sink is told of a run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct RunRecord {
     /// The folder in which pages are written; it may have yet to be made.
     #[serde(default)]
     pub home: PathBuf,
+    /// The command line of the run that had the sink called.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub command: Vec<String>,
+    /// The data sets that it is about, sorted: folders outside the store, and blocks that make data
+    /// sets.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub data_sets: Vec<String>,
     /// Every node that what is shown was made of; parents come before their children.
     pub nodes: Vec<RunNode>,
     /// What should be shown and isn't there, where the sink shows what there is.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub failed: Vec<FailedPoint>,
+    /// The nodes on the way to these that aren't done; parents come before their children.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unfinished: Vec<UnfinishedNode>,
+}
+
+/// A node that failed, or that waits for one that did.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct UnfinishedNode {
+    /// Name of the stage's block.
+    pub stage: String,
+    /// The sweep's point.
+    pub point: String,
+    /// Kind of the artifact that it would make.
+    pub kind: String,
+    /// All parameters.
+    pub parameters: Map<String, Value>,
+    /// The nodes that it needs: places in [`RunRecord::nodes`], and after these in
+    /// [`RunRecord::unfinished`].
+    pub needs: Vec<usize>,
+    /// What it said when it failed; nothing where it didn't run.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub message: Option<String>,
 }
 
 /// A node that failed, that waits for one that did, or that was left out.
@@ -49,6 +80,12 @@ pub struct RunNode {
     /// Whether the sink shows it; else something that is shown was made of it.
     #[serde(default)]
     pub is_shown: bool,
+    /// Name of the stage's program.
+    #[serde(default)]
+    pub program: String,
+    /// Whether the run found it in the cache; nothing where that isn't known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub is_cached: Option<bool>,
     /// Kind of its artifact.
     pub kind: String,
     /// The action's key.
@@ -96,20 +133,48 @@ pub struct RunInput {
     pub folder: Option<PathBuf>,
 }
 
+/// A node that needs one that doesn't come before it.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("run.json: {stage}{} needs a node that doesn't come before it", named(.input.as_deref()))]
+pub struct RunRecordError {
+    stage: String,
+    /// By which input; none of a node that isn't done.
+    input: Option<String>,
+}
+
+fn named(input: Option<&str>) -> String {
+    input.map_or_else(String::new, |input| format!(", input {input},"))
+}
+
 impl RunRecord {
     /// Says what is wrong with a list whose inputs don't name earlier nodes.
-    pub fn check(&self) -> Result<(), String> {
+    pub fn check(&self) -> Result<(), RunRecordError> {
         for (index, node) in self.nodes.iter().enumerate() {
             if let Some((name, _)) =
                 node.inputs.iter().find(|(_, input)| input.node.is_some_and(|n| n >= index))
             {
-                return Err(format!(
-                    "{}: input {name} names a node that doesn't come before it",
-                    node.stage
-                ));
+                return Err(RunRecordError {
+                    stage: node.stage.clone(),
+                    input: Some(name.clone()),
+                });
+            }
+        }
+        for (index, node) in self.unfinished.iter().enumerate() {
+            if node.needs.iter().any(|&needed| needed >= self.nodes.len() + index) {
+                return Err(RunRecordError { stage: node.stage.clone(), input: None });
             }
         }
         Ok(())
+    }
+
+    /// The commit of the tree in which pages are written, `-dirty` where it differs; nothing where
+    /// the tree isn't under git.
+    pub fn commit(&self) -> Option<String> {
+        let folder = self.home.ancestors().find(|folder| folder.is_dir())?;
+        let describe = ["describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"];
+        let git = Command::new("git").arg("-C").arg(folder).args(describe).output().ok()?;
+        let said = String::from_utf8_lossy(&git.stdout).trim().to_owned();
+        Some(said).filter(|said| git.status.success() && !said.is_empty())
     }
 
     /// The folder that an input names.

@@ -156,13 +156,15 @@ pub struct GivenInput {
 impl GivenInput {
     /// A folder under an input's name. With a manifest in it or above it (a subtree), its files are
     /// checked first.
-    pub fn open(name: &str, folder: &Path) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] where there is no such folder, or its files aren't the manifest's.
+    pub fn open(name: &str, folder: &Path) -> Result<Self, Failure> {
         if !folder.exists() {
             return Err(Failure::BadInput(format!(
                 "input {name}: {}: no such folder",
                 folder.display()
-            ))
-            .into());
+            )));
         }
         let absolute =
             folder.canonicalize().bad_input(format!("input {name}: {}", folder.display()))?;
@@ -184,6 +186,11 @@ impl GivenInput {
         Ok(Self { name: name.to_owned(), folder: folder.to_path_buf(), identity })
     }
 
+    /// The input's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder
@@ -195,7 +202,10 @@ impl GivenInput {
     }
 
     /// A JSON file of the input.
-    pub fn read_json<T: DeserializeOwned>(&self, file: &str) -> anyhow::Result<T> {
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] with input, file and field.
+    pub fn read_json<T: DeserializeOwned>(&self, file: &str) -> Result<T, Failure> {
         let path = self.path(file);
         let place = format!("input {}: {}", self.name, path.display());
         let bytes = fs::read(&path).bad_input(&place)?;
@@ -206,9 +216,12 @@ impl GivenInput {
 
 impl Context {
     /// An input that must be there.
-    pub fn input(&self, name: &str) -> anyhow::Result<&GivenInput> {
+    ///
+    /// # Errors
+    /// [`Failure::Usage`] where it isn't given.
+    pub fn input(&self, name: &str) -> Result<&GivenInput, Failure> {
         self.optional_input(name).ok_or_else(|| {
-            Failure::Usage(format!("input {name} is missing; give --input {name}=DIR")).into()
+            Failure::Usage(format!("input {name} is missing; give --input {name}=DIR"))
         })
     }
 

@@ -308,10 +308,11 @@ mod tests {
         assert!(
             Schema::new("x", &twice)
                 .unwrap_err()
+                .to_string()
                 .contains("layers is a parameter beside field and inside its mlp")
         );
         let mut two = described();
         two["properties"]["other"] = two["properties"]["field"].clone();
-        assert!(Schema::new("x", &two).unwrap_err().contains("both select a variant"));
+        assert!(Schema::new("x", &two).unwrap_err().to_string().contains("both select a variant"));
     }
 }

@@ -1,9 +1,13 @@
 //! Build-time hash of what a stage is made of: the code part of an action's key.
 //!
 //! A stage's `build.rs` calls [`emit`]; its `main.rs` reads `env!("STAGE_FINGERPRINT")`. The hash
-//! covers the sources of the stage's crate and of the workspace crates it uses, the part of
-//! `Cargo.lock` they reach, compiler, target, profile and features. It never covers the binary's
-//! bytes or an absolute path, so that moving or rebuilding a checkout reruns nothing.
+//! covers the sources of the stage's crate and of the workspace crates it may use, the part of
+//! `Cargo.lock` they reach, compiler, target and profile. It never covers the binary's bytes or an
+//! absolute path, so that moving or rebuilding a checkout reruns nothing.
+//!
+//! Nor does it cover Cargo features. A feature (`torch`) only adds what a stage can do: without it,
+//! a stage fails where it would be needed, and fails without a result. So whatever is made without
+//! the feature has one key, built with it or not. Crates that only a feature brings always count.
 //!
 //! ```no_run
 //! // build.rs
@@ -19,7 +23,8 @@ use toml::{Table, Value};
 /// Environment of a build script that changes the machine code.
 const BUILD_ENV: [&str; 5] = ["TARGET", "PROFILE", "OPT_LEVEL", "DEBUG", "CARGO_ENCODED_RUSTFLAGS"];
 
-/// Sets `STAGE_FINGERPRINT` for the crate being built.
+/// Sets `STAGE_FINGERPRINT` for the crate being built, and has its program look for libraries beside
+/// itself: there `make install` puts libtorch.
 ///
 /// # Panics
 /// When called outside a Cargo build script or when a manifest can't be read: the build must not go
@@ -47,15 +52,11 @@ pub fn emit() {
         println!("cargo:rerun-if-env-changed={name}");
         hash.part(name, env::var(name).unwrap_or_default().as_bytes());
     }
-    let features: BTreeSet<String> =
-        env::vars().map(|(k, _)| k).filter(|k| k.starts_with("CARGO_FEATURE_")).collect();
-    for feature in features {
-        hash.part("feature", feature.as_bytes());
-    }
 
     for dir in add_sources(&mut hash, &root, &crate_dir) {
         println!("cargo:rerun-if-changed={}", dir.display());
     }
+    println!("cargo:rustc-link-arg-bins=-Wl,-rpath,$ORIGIN");
     println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
 }
 
@@ -189,11 +190,13 @@ fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
 mod tests {
     use super::*;
 
-    /// A workspace of three crates: `stage` uses `shared` and the package `used`; nothing uses `other`.
-    const FILES: [(&str, &str); 9] = [
+    /// A workspace of four crates: `stage` uses `shared` and the package `used`, and `extra` with a
+    /// feature alone; nothing uses `other`.
+    const FILES: [(&str, &str); 11] = [
         (
             "Cargo.toml",
-            "[workspace.dependencies]\nshared = {path = \"shared\"}\nused = \"1\"\n\
+            "[workspace.dependencies]\nshared = {path = \"shared\"}\nextra = {path = \"extra\"}\n\
+             used = \"1\"\n\
              [profile.release]\nlto = true\n",
         ),
         (
@@ -206,8 +209,9 @@ mod tests {
         ),
         (
             "stage/Cargo.toml",
-            "[package]\nname = \"stage\"\n[dependencies]\nshared = {workspace = true}\n\
-             [dev-dependencies]\nstray = \"1\"\n",
+            "[package]\nname = \"stage\"\n[features]\nmore = [\"dep:extra\"]\n\
+             [dependencies]\nshared = {workspace = true}\n\
+             extra = {workspace = true, optional = true}\n[dev-dependencies]\nstray = \"1\"\n",
         ),
         ("stage/src/main.rs", "fn main() {}"),
         ("stage/tests/it.rs", "// a test"),
@@ -216,6 +220,8 @@ mod tests {
             "[package]\nname = \"shared\"\n[dependencies]\nused = {workspace = true}\n",
         ),
         ("shared/src/lib.rs", "// shared"),
+        ("extra/Cargo.toml", "[package]\nname = \"extra\"\n"),
+        ("extra/src/lib.rs", "// extra"),
         ("other/Cargo.toml", "[package]\nname = \"other\"\n"),
         ("other/src/lib.rs", "// other"),
     ];
@@ -237,7 +243,7 @@ mod tests {
         }
         let mut hash = Hash::default();
         let folders = add_sources(&mut hash, root.path(), &root.path().join("stage"));
-        assert_eq!(folders, ["shared", "stage"].map(|name| root.path().join(name)));
+        assert_eq!(folders, ["extra", "shared", "stage"].map(|name| root.path().join(name)));
         hash.0.finalize().to_hex().to_string()
     }
 
@@ -248,6 +254,7 @@ mod tests {
         for edit in [
             ("stage/src/main.rs", "main() {}", "main() { }"),
             ("shared/src/lib.rs", "shared", "shared better"),
+            ("extra/src/lib.rs", "extra", "extra, which a feature brings"),
             ("shared/Cargo.toml", "workspace = true", "workspace = true, features = []"),
             ("Cargo.lock", "checksum = \"aa\"", "checksum = \"ab\""),
             ("Cargo.lock", "checksum = \"bb\"", "checksum = \"bc\""),

@@ -8,11 +8,10 @@ use artifact::{Named, known_names, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;
-use crate::experiment;
 use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
-use crate::plan::{PlanError, Request};
 use crate::renames::known_blocks;
+use crate::request::{PlanError, Request};
 use crate::stages::{Programs, StageProgram};
 
 /// Settings that go together, or several such that are swept.
@@ -145,9 +144,14 @@ pub(crate) struct Scope<'a> {
 impl Scope<'_> {
     /// The axes in the order in which they were given, the last one where several set the same; and
     /// what to say of it.
-    pub(crate) fn axes(&self, request: &Request) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
+    ///
+    /// `experiment` are those of the pipeline's file.
+    pub(crate) fn axes(
+        &self,
+        request: &Request,
+        mut experiment: Vec<Axis>,
+    ) -> Result<(Vec<Axis>, Vec<String>), PlanError> {
         let (mut axes, mut notes): (Vec<Axis>, Vec<String>) = (Vec::new(), Vec::new());
-        let mut experiment = experiment::axes(self, request)?;
         let parameters = request.parameters.iter().map(|text| (Kind::Parameter, text));
         let inputs = request.inputs.iter().map(|text| (Kind::Input, text));
         for (kind, text) in parameters.chain(inputs) {

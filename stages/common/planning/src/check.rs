@@ -8,7 +8,8 @@ use artifact::{Description, Input, Named, known_names, renamed};
 use serde_json::Map;
 
 use crate::file::StageBlock;
-use crate::pipeline::{Part, Pipeline, PipelineError, Source};
+use crate::part::{Part, PipelineError, Source};
+use crate::pipeline::Pipeline;
 use crate::renames::{known_blocks, known_subtrees};
 use crate::stages::{Programs, StageProgram};
 

@@ -11,8 +11,10 @@ use crate::axes::{Axis, Kind, Setting};
 use crate::check::closure;
 use crate::experiment::Selection;
 use crate::left_out::{Files, check_shown, shown};
-use crate::pipeline::{Part, Pipeline, Source};
-use crate::plan::{Node, NodeInput, Origin, Plan, PlanError, Sink};
+use crate::node::{Node, NodeInput, Origin, Plan, Sink};
+use crate::part::{Part, Source};
+use crate::pipeline::Pipeline;
+use crate::request::PlanError;
 use crate::stages::{Programs, StageProgram};
 
 /// More nodes than anybody means.

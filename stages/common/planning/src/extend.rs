@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::file::File;
-use crate::pipeline::{Pipeline, PipelineError};
+use crate::part::PipelineError;
+use crate::pipeline::Pipeline;
 
 /// Most files in a chain of which each extends the next.
 const DEEPEST: usize = 8;
@@ -14,7 +15,10 @@ impl Pipeline {
     pub fn read(path: &Path) -> Result<Self, PipelineError> {
         let bytes = std::fs::read(path).map_err(|e| PipelineError {
             place: path.display().to_string(),
-            problem: format!("{e}; run in the folder of pipeline.yaml or name it with --pipeline"),
+            problem: format!(
+                "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one with \
+                `nerf-sr init DIR`"
+            ),
         })?;
         Self::parse(&bytes, path)
     }

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use tempfile::TempDir;
 
 use super::*;
-use crate::pipeline::Part;
+use crate::part::Part;
 use crate::{renames, targets};
 
 /// A folder with files.
@@ -268,13 +268,15 @@ fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
     assert_eq!(
         names,
         [
+            "export",
             "hr-finetune",
             "paper-refine",
             "reference-refine",
             "refined",
             "registered",
             "sisr-fuse",
-            "video"
+            "video",
+            "viewer"
         ]
     );
     let (all, blocks) = targets::find(&pipeline, &names).unwrap();

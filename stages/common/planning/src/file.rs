@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 use slurm::Resources;
 
 use crate::experiment::Experiment;
-use crate::pipeline::{Part, PipelineError};
+use crate::part::{Part, PipelineError};
 use crate::renames;
 
 /// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.

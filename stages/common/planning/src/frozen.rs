@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use slurm::Resources;
 
-use crate::plan::{Devices, Node, NodeInput, Origin, Plan, Sink};
+use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
 use crate::stages::StageProgram;
 
 /// A plan without what can be made again from the rest.

@@ -7,7 +7,7 @@ use artifact::{KEY_VERSION, KEY_VERSION_PART, Record};
 use serde_json::{Map, Value, json};
 
 use crate::changes::{Change, changes};
-use crate::plan::Node;
+use crate::node::Node;
 
 /// Everything that may change a node's result, by name. Not in it: threads, paths, verbosity, host,
 /// the block's name.

@@ -8,9 +8,10 @@ use serde_json::Value;
 
 use crate::check::needs;
 use crate::experiment::Selection;
-use crate::pipeline::{Pipeline, Source};
-use crate::plan::PlanError;
+use crate::part::Source;
+use crate::pipeline::Pipeline;
 use crate::renames::known_blocks;
+use crate::request::PlanError;
 
 /// The stages that a sink shows, of those that its block names.
 pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) -> Vec<&'a str> {

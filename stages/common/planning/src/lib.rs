@@ -24,14 +24,18 @@ mod changes;
 mod check;
 mod expand;
 mod experiment;
+mod experiment_axes;
 mod extend;
 mod file;
 mod frozen;
 mod key;
 mod left_out;
+mod node;
+mod part;
 mod pipeline;
 mod plan;
 mod renames;
+mod request;
 mod sources;
 mod stages;
 mod targets;
@@ -41,11 +45,11 @@ pub use experiment::{Experiment, Selection, Variant};
 pub use file::{PipelineFile, StageBlock};
 pub use frozen::{Frozen, FrozenError};
 pub use key::{explain, nearest, nearest_changes, parts};
-pub use pipeline::{Part, Pipeline, PipelineError};
-pub use plan::{
-    Devices, Node, NodeInput, Origin, Plan, PlanError, Request, Sink, State, input_hashes,
-    source_hash,
-};
+pub use node::{Devices, Node, NodeInput, Origin, Plan, Sink, State};
+pub use part::{Part, PipelineError};
+pub use pipeline::Pipeline;
+pub use plan::{input_hashes, source_hash};
 pub use renames::known_blocks;
+pub use request::{PlanError, Request};
 pub use stages::{Asking, Programs, StageProgram, executable};
 pub use targets::find;

@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::*;
+use crate::node::Devices;
 
 const PIPELINE: &str = "default: [report]
 stages:

@@ -18,7 +18,8 @@ use serde_json::{Map, Value};
 use stage_call::{Answers, Interrupted, ask_all};
 
 use crate::file::StageBlock;
-use crate::pipeline::{Part, Pipeline, PipelineError};
+use crate::part::{Part, PipelineError};
+use crate::pipeline::Pipeline;
 
 /// A stage's executable and what it says of itself.
 #[derive(Debug)]
@@ -37,7 +38,8 @@ impl StageProgram {
         description
             .check()
             .map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
-        let schema = Schema::new(&description.name, &description.parameters)?;
+        let schema =
+            Schema::new(&description.name, &description.parameters).map_err(|e| e.to_string())?;
         Ok(Self { path: path.to_path_buf(), description, schema })
     }
 
@@ -246,15 +248,13 @@ fn identify(path: &Path, name: &str) -> Result<Identity, String> {
         Err(e) if name.contains('/') => {
             Err(format!("{}: {e}; set `run:` to the stage's executable", path.display()))
         }
-        Err(e) => {
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             let meant =
                 neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
-            let build = format!(
-                "build it with `cargo build --release -p {name}` (`make build` builds all), or \
-                set `run:` to it"
-            );
-            Err(format!("{}: {e}; {meant}{build}", path.display()))
+            let problem = format!("{} isn't built", path.display());
+            Err(format!("{problem}; {meant}run `make build`, or set `run:` to another program"))
         }
+        Err(e) => Err(format!("{}: {e}", path.display())),
     }
 }
 

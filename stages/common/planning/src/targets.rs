@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use crate::pipeline::{Part, Pipeline, SHELVES};
-use crate::plan::PlanError;
+use crate::part::Part;
+use crate::pipeline::{Pipeline, SHELVES};
 use crate::renames::known_blocks;
+use crate::request::PlanError;
 
 /// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the
 /// target NAME: its block of that name, or its default. A block of such a file is a target, too.

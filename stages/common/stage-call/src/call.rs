@@ -94,6 +94,8 @@ pub trait Watcher: Sync {
     fn progress(&self, event: &Event);
     /// A line that it said on stderr.
     fn said(&self, line: &str);
+    /// It is still at work; called often.
+    fn alive(&self) {}
 }
 
 impl Call<'_> {
@@ -169,7 +171,7 @@ impl Call<'_> {
         let (end, stated, tail) = std::thread::scope(|scope| {
             let events = scope.spawn(|| ear.hear_events(stdout));
             let words = scope.spawn(|| ear.hear_words(stderr));
-            let end = wait(&mut child, stop);
+            let end = wait(&mut child, stop, watcher);
             (end, events.join().ok().flatten(), words.join().unwrap_or_default())
         });
         let ResUse { status, rusage } = end.map_err(fail)?;
@@ -276,7 +278,7 @@ impl Ear<'_> {
 
 /// Waits for the end of a stage, and ends what it has left running: that would hold its pipes open
 /// and write unseen.
-fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ResUse> {
+fn wait(child: &mut Child, stop: &AtomicBool, watcher: &dyn Watcher) -> std::io::Result<ResUse> {
     let pid = i32::try_from(child.id())
         .ok()
         .and_then(Pid::from_raw)
@@ -295,6 +297,7 @@ fn wait(child: &mut Child, stop: &AtomicBool) -> std::io::Result<ResUse> {
             kill_process(pid, Signal::TERM).ok();
             asked = true;
         }
+        watcher.alive();
         std::thread::sleep(Duration::from_millis(10));
     }
     // Mostly there is nothing left of its group.

@@ -8,6 +8,13 @@ use artifact::{Event, Pace, printable, report_text};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 
 use crate::call::Watcher;
+use crate::clock::seconds;
+
+/// Lines of a stage come at least so often, so that nobody takes it for dead: whoever waits ten
+/// seconds sees one.
+const SILENCE: Duration = Duration::from_secs(8);
+/// A bar moves so often, if only its spinner.
+const TICK: Duration = Duration::from_millis(500);
 
 /// Bars on a terminal, lines elsewhere.
 pub struct Display {
@@ -38,13 +45,15 @@ impl Display {
     /// Shows a stage from now on.
     pub fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {
-            let style = ProgressStyle::with_template("{prefix} [{bar:30}] {percent:>3}% {msg}")
-                .expect("the template is constant");
-            bars.add(
+            let template = "{spinner} {prefix} [{bar:30}] {percent:>3}% {msg}";
+            let style = ProgressStyle::with_template(template).expect("the template is constant");
+            let bar = bars.add(
                 ProgressBar::new(1)
                     .with_style(style.progress_chars("=> "))
                     .with_prefix(printable(label).into_owned()),
-            )
+            );
+            bar.enable_steady_tick(TICK);
+            bar
         });
         if bar.is_none() {
             self.line(&format!("{label}: running"));
@@ -53,9 +62,11 @@ impl Display {
             display: self,
             label: label.to_owned(),
             bar,
+            started: Instant::now(),
             shown: Mutex::new(LastShown {
                 when: Instant::now(),
                 label: String::new(),
+                text: None,
                 pace: Pace::default(),
             }),
         }
@@ -67,6 +78,7 @@ pub struct StageView<'a> {
     display: &'a Display,
     label: String,
     bar: Option<ProgressBar>,
+    started: Instant,
     shown: Mutex<LastShown>,
 }
 
@@ -74,6 +86,8 @@ pub struct StageView<'a> {
 struct LastShown {
     when: Instant,
     label: String,
+    /// How far it is, in words, if it has told.
+    text: Option<String>,
     pace: Pace,
 }
 
@@ -98,14 +112,22 @@ impl Watcher for StageView<'_> {
             bar.set_length(*total);
             bar.set_position(*done);
             bar.set_message(format!("{label} {note} · {left} left"));
-        } else if shown.when.elapsed() > Duration::from_secs(15) {
-            shown.when = Instant::now();
-            self.display.line(&format!(
-                "{}: {label} {}% {note} · {left} left",
-                self.label,
-                done * 100 / total.max(&1)
-            ));
+        } else {
+            let percent = done * 100 / total.max(&1);
+            shown.text = Some(format!("{label} {percent}% {note} · {left} left"));
         }
+    }
+
+    /// Says where the stage is, where nothing has been said for long.
+    fn alive(&self) {
+        let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        if self.bar.is_some() || shown.when.elapsed() < SILENCE {
+            return;
+        }
+        shown.when = Instant::now();
+        let running = || format!("running for {}", seconds(self.started.elapsed().as_secs_f64()));
+        let text = shown.text.clone().unwrap_or_else(running);
+        self.display.line(&format!("{}: {text}", self.label));
     }
 
     fn said(&self, line: &str) {

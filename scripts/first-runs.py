@@ -1,0 +1,91 @@
+#!/usr/bin/env python3
+"""Measures `make demo` from nothing, for some commits, one after the other: first-runs.py COMMIT… [--rounds N] [--work DIR] [--out FILE]
+
+Each run has a clean clone without `target` and `.libtorch`; what cargo and pip have cached in the home folder stays. A row of JSON
+says how long it took to the page, the processor time of all its processes, the longest silence, whether libtorch was fetched, the
+demo's scores, and sgemm's rate before and after (with NumPy).
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import re
+import select
+import shutil
+import subprocess
+import sys
+import time
+
+
+def sgemm() -> float | None:
+    """GFLOP/s of a product of matrices of 1024 columns, the best of ten; None without NumPy."""
+    try:
+        import numpy
+    except ImportError:
+        return None
+    n, best = 1024, 0.0
+    a = numpy.random.default_rng(1).random((n, n), dtype=numpy.float32)
+    for _ in range(10):
+        begin = time.perf_counter()
+        a @ a
+        best = max(best, 2 * n**3 / (time.perf_counter() - begin) / 1e9)
+    return round(best, 1)
+
+
+def listen(process: subprocess.Popen) -> tuple[str, float]:
+    """Reads what a process says until it ends; its words, and the longest time in which it said nothing."""
+    words, silence, last = b"", 0.0, time.monotonic()
+    while True:
+        select.select([process.stdout], [], [])
+        piece = os.read(process.stdout.fileno(), 1 << 16)
+        now = time.monotonic()
+        silence, last = max(silence, now - last), now
+        if not piece:
+            return words.decode(errors="replace"), silence
+        words += piece
+
+
+def measure(repository: pathlib.Path, commit: str, work: pathlib.Path) -> dict:
+    """Runs `make demo` in a clean clone of a commit."""
+    clone = work / "clone"
+    shutil.rmtree(clone, ignore_errors=True)
+    subprocess.run(["git", "clone", "--quiet", repository, clone], check=True)
+    subprocess.run(["git", "-C", clone, "checkout", "--quiet", commit], check=True)
+    environment = {name: value for name, value in os.environ.items() if name not in ("LIBTORCH", "LD_LIBRARY_PATH", "NERF_SR_STORE")}
+    before, load, begin = sgemm(), os.getloadavg()[0], time.monotonic()
+    process = subprocess.Popen(["make", "demo"], cwd=clone, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    words, silence = listen(process)
+    _, status, usage = os.wait4(process.pid, 0)
+    seconds = time.monotonic() - begin
+    (work / f"{commit}.log").write_text(words)
+    page = clone / "out/report/index.html"
+    if status or not page.exists():
+        sys.exit(f"{commit}: make demo failed; {work / f'{commit}.log'} has what it said")
+    scores = re.search(r"^eval: (.*)$", words, re.MULTILINE)
+    return {
+        "commit": commit, "seconds": round(seconds), "processor_seconds": round(usage.ru_utime + usage.ru_stime),
+        "longest_silence": round(silence, 1), "libtorch": (clone / ".libtorch").exists(), "scores": scores and scores[1],
+        "sgemm_before": before, "sgemm_after": sgemm(), "load_before": round(load, 1), "load_after": round(os.getloadavg()[0], 1),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("commits", nargs="+")
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--work", type=pathlib.Path, default=pathlib.Path("out/first-runs"))
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/first-runs.json"))
+    arguments = parser.parse_args()
+    repository = pathlib.Path(__file__).resolve().parent.parent
+    arguments.work.mkdir(parents=True, exist_ok=True)
+    rows = []
+    for _ in range(arguments.rounds):
+        for commit in arguments.commits:
+            rows.append(measure(repository, commit, arguments.work.resolve()))
+            print(json.dumps(rows[-1]), flush=True)
+            arguments.out.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

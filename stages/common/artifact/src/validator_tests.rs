@@ -1,0 +1,150 @@
+use super::*;
+use serde_json::json;
+
+/// Each schema with a value that fits, and one that doesn't and what is said of it.
+#[test]
+fn values_fit_or_not() {
+    for (schema, fits, fails, problem) in [
+        (json!({"type": "integer"}), json!(2.0), json!(2.5), "2.5 is not of type \"integer\""),
+        (
+            json!({"type": ["integer", "null"]}),
+            Value::Null,
+            json!("a"),
+            "\"a\" is not of types \"integer\", \"null\"",
+        ),
+        (json!({"type": "number"}), json!(1), json!(true), "true is not of type \"number\""),
+        (json!({"type": "object"}), json!({}), json!([]), "[] is not of type \"object\""),
+        (json!({"const": 2}), json!(2.0), json!(3), "2 was expected"),
+        (json!({"const": {"a": [1]}}), json!({"a": [1.0]}), json!({"a": []}), "was expected"),
+        (json!({"enum": ["a", 1]}), json!(1), json!("b"), "\"b\" is not one of \"a\", 1"),
+        (json!({"minimum": 1}), json!(1.0), json!(0), "0 is less than the minimum of 1"),
+        (json!({"maximum": 0.5}), json!(0.5), json!(1), "1 is greater than the maximum of 0.5"),
+        (
+            json!({"maximum": u64::MAX}),
+            json!(u64::MAX),
+            json!(18_446_744_073_709_551_616.0),
+            "greater than the maximum of 18446744073709551615",
+        ),
+        (json!({"minimum": i64::MIN}), json!(i64::MIN), json!(-1e30), "less than the minimum"),
+        (json!({"exclusiveMinimum": 0}), json!(1e-9), json!(0), "less than or equal to"),
+        (json!({"exclusiveMaximum": 1}), json!(0), json!(1.0), "greater than or equal to"),
+        (json!({"multipleOf": 1}), json!(2.0), json!(2.7), "2.7 is not a multiple of 1"),
+        (json!({"multipleOf": 0.1}), json!(0.3), json!(0.35), "not a multiple of 0.1"),
+        (json!({"minLength": 2}), json!("äö"), json!("ä"), "has less than 2 characters"),
+        (json!({"maxLength": 2}), json!("äö"), json!("abc"), "has more than 2 characters"),
+        (json!({"minItems": 1}), json!([0]), json!([]), "[] has less than 1 items"),
+        (json!({"maxItems": 1}), json!([0]), json!([0, 1]), "has more than 1 items"),
+        (json!({"items": {"type": "null"}}), json!([null]), json!([null, 1]), "1 is not of type"),
+        (
+            json!({"prefixItems": [{"type": "null"}], "items": {"type": "string"}}),
+            json!([null, "a"]),
+            json!([null, null]),
+            "null is not of type \"string\"",
+        ),
+        (json!({"required": ["a"]}), json!({"a": 1}), json!({}), "\"a\" is missing"),
+        (
+            json!({"properties": {"a": {}}, "additionalProperties": false}),
+            json!({"a": 1}),
+            json!({"b": 1}),
+            "\"b\" is not expected",
+        ),
+        (
+            json!({"additionalProperties": {"type": "null"}}),
+            json!({"a": null}),
+            json!({"a": 1}),
+            "1 is not of type",
+        ),
+        (
+            json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}),
+            Value::Null,
+            json!(2),
+            "2 fits none of the alternatives",
+        ),
+        (
+            json!({"oneOf": [{"type": "null"}, {"const": 1}]}),
+            json!(1),
+            json!(2),
+            "2 fits none of the alternatives",
+        ),
+        (
+            json!({"oneOf": [{"minimum": 1}, {"minimum": 2}]}),
+            json!(1),
+            json!(2),
+            "2 fits several alternatives",
+        ),
+        (
+            json!({"allOf": [{"minimum": 1}, {"maximum": 2}]}),
+            json!(2),
+            json!(3),
+            "greater than the maximum",
+        ),
+        (json!({"not": {"const": "a"}}), json!("b"), json!("a"), "\"a\" isn't allowed"),
+        (
+            json!({"$ref": "#/$defs/A", "$defs": {"A": {"type": "null"}}}),
+            Value::Null,
+            json!(1),
+            "1 is not of type \"null\"",
+        ),
+        (json!({"not": false, "x-own": 1, "format": "uri"}), json!(1), json!(1), ""),
+        (json!({"properties": {"a": false}}), json!({}), json!({"a": 1}), "1 isn't allowed"),
+        // Keywords of other types don't apply.
+        (
+            json!({"minimum": 3, "minLength": 3, "not": {"const": 4}}),
+            json!([]),
+            json!(4),
+            "4 isn't",
+        ),
+    ] {
+        let validator = Validator::new(&schema).unwrap();
+        assert!(validator.is_valid(&fits), "{schema} {fits}");
+        let problems: Vec<String> =
+            validator.misfits(&fails).into_iter().map(|misfit| misfit.problem).collect();
+        assert!(
+            problem.is_empty() || (problems.len() == 1 && problems[0].contains(problem)),
+            "{schema} {fails}: {problems:?}"
+        );
+    }
+}
+
+#[test]
+fn a_misfit_says_where_it_is() {
+    let schema = json!({"properties": {"a": {"items": {"type": "null"}}}});
+    let misfits = Validator::new(&schema).unwrap().misfits(&json!({"a": [null, 2]}));
+    let [Misfit { path, value, .. }] = &misfits[..] else { panic!("{misfits:?}") };
+    assert_eq!((path.as_str(), value), ("/a/1", &json!(2)));
+}
+
+/// What isn't understood is refused, wherever it stands: no value may pass unchecked.
+#[test]
+fn schemas_that_cannot_be_used() {
+    for (schema, words) in [
+        (json!(1), "neither an object nor true or false"),
+        (json!({"type": "nonsense"}), "type: \"nonsense\" can't stand there"),
+        (json!({"type": 1}), "type: 1"),
+        (json!({"enum": 1}), "enum: 1"),
+        (json!({"minimum": "1"}), "minimum: \"1\""),
+        (json!({"multipleOf": 0}), "multipleOf: 0"),
+        (json!({"maxItems": -1}), "maxItems: -1"),
+        (json!({"$ref": "#/$defs/A"}), "$ref: \"#/$defs/A\""),
+        (json!({"$ref": "other.json"}), "$ref: \"other.json\""),
+        (json!({"anyOf": {}}), "anyOf: {}"),
+        (json!({"properties": []}), "properties: []"),
+        (json!({"properties": {"a": {"pattern": "a+"}}}), "keyword pattern isn't supported"),
+        (json!({"$defs": {"A": {"items": {"if": {}}}}}), "keyword if isn't supported"),
+        (json!({"items": {"not": 3}}), "3 is neither"),
+    ] {
+        let problem = Validator::new(&schema).unwrap_err();
+        assert!(problem.contains(words), "{schema}: {problem}");
+    }
+}
+
+/// A schema may use itself for parts of a value, but not for the value itself.
+#[test]
+fn schemas_that_lead_back_to_themselves() {
+    let tree = json!({"type": "array", "items": {"$ref": "#"}});
+    let tree = Validator::new(&tree).unwrap();
+    assert!(tree.is_valid(&json!([[], [[]]])) && !tree.is_valid(&json!([[], [1]])));
+    for schema in [json!({"$ref": "#"}), json!({"anyOf": [{"$ref": "#"}]})] {
+        assert!(!Validator::new(&schema).unwrap().is_valid(&json!(1)), "{schema}");
+    }
+}

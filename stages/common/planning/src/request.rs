@@ -1,0 +1,40 @@
+use stage_call::Interrupted;
+
+use crate::experiment::Selection;
+use crate::part::PipelineError;
+
+/// What is asked for on the command line.
+#[derive(Clone, Debug, Default)]
+pub struct Request {
+    /// Stages to make; empty: the file's default.
+    pub targets: Vec<String>,
+    /// `name=value[,value…]`, the name with or without its stage.
+    pub parameters: Vec<String>,
+    /// `input=DIR[,DIR…]`, likewise.
+    pub inputs: Vec<String>,
+    /// What of an experiment is wanted.
+    pub choice: Selection,
+}
+
+/// Why there is no plan.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// The file is wrong.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    /// The command line is wrong.
+    #[error("{0}")]
+    Usage(String),
+    /// A source folder is wrong.
+    #[error("{0}")]
+    Source(String),
+    /// A signal came while stages were asked what they are.
+    #[error("interrupted")]
+    Interrupted,
+}
+
+impl From<Interrupted> for PlanError {
+    fn from(_: Interrupted) -> Self {
+        Self::Interrupted
+    }
+}

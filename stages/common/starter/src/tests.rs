@@ -1,0 +1,59 @@
+use dataset::Split;
+use scene::Intrinsics;
+
+use super::*;
+
+fn set(format: Format, sizes: &[(u32, u32)]) -> Dataset {
+    let frames = sizes.iter().map(|&(width, height)| Frame {
+        name: String::new(),
+        image: PathBuf::new(),
+        turned: false,
+        mask: None,
+        depth: None,
+        taken_with: Intrinsics::from_angle_x(width, height, 0.7),
+        pinhole: None,
+        camera_to_world: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
+        depths: None,
+    });
+    Dataset { format, frames: frames.collect(), split: None, notes: Vec::new() }
+}
+
+/// Large photographs are shrunk; the narrowest decides, since no image is enlarged.
+#[test]
+fn images_keep_their_size_where_a_cpu_can_do_with_it() {
+    for (format, sizes, line) in [
+        (Format::Colmap, vec![(640, 480)], "lr_source: photographs"),
+        (Format::Transforms, vec![(800, 600), (4000, 3000)], "lr_source: photographs"),
+        (Format::Llff, vec![(640, 480)], "lr_source: downscaled"),
+        (Format::Blender, vec![(801, 801)], "lr_width: 400"),
+        (Format::Colmap, vec![(4000, 3000), (3000, 4000)], "lr_width: 400"),
+    ] {
+        let images = images(&set(format, &sizes));
+        assert!(images.trim_start().starts_with(line), "{format} {sizes:?}: {images}");
+    }
+}
+
+#[test]
+fn what_was_found_is_said() {
+    let several = set(Format::Colmap, &[(640, 480), (480, 640)]);
+    assert_eq!(found(&several), "COLMAP (sparse): 2 photographs of several sizes");
+    let one = set(Format::Llff, &[(640, 480)]);
+    assert_eq!(found(&one), "LLFF (poses_bounds.npy): 1 photograph of 640×480");
+    let tested = Split { train: vec![0], test: vec![1] };
+    for (split, words) in [(None, "every eighth view"), (Some(tested), "own test views")] {
+        let text = text(&Dataset { split, ..several.clone() }, "found", "./data");
+        assert!(text.contains(words) && !text.contains(['{', '}']), "{text}");
+    }
+}
+
+/// All of `pipelines/` comes along.
+#[test]
+fn no_target_is_missing() {
+    let shelf = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../pipelines");
+    let mut names: Vec<String> = fs::read_dir(shelf)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    names.sort();
+    assert_eq!(names, TARGETS.map(|(name, _)| name));
+}

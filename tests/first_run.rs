@@ -1,0 +1,274 @@
+//! From nothing to views: `nerf-sr init`, a build without libtorch, and installed programs.
+
+#![allow(missing_docs, reason = "a test")]
+mod common;
+#[path = "common/forms.rs"]
+mod forms;
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::SystemTime;
+
+use common::{Finished, Project, bin, root};
+use forms::{WIDTH, as_colmap, as_llff, as_transforms};
+
+/// A folder without a pipeline.
+fn empty() -> Project {
+    let project = Project::new("");
+    std::fs::remove_file(project.path("pipeline.yaml")).unwrap();
+    project
+}
+
+/// What makes a training short; nothing else of a written pipeline is changed.
+const SHORT: [&str; 12] = [
+    "-p",
+    "train-ss.rays=4000",
+    "-p",
+    "n_levels=2",
+    "-p",
+    "max_resolution=32",
+    "-p",
+    "log2_hashmap_size=10",
+    "-p",
+    "march_steps=64",
+    "-p",
+    "train-ss.hidden_dim=16",
+];
+
+#[test]
+fn what_init_writes_runs_as_it_is() {
+    let project = empty();
+    as_transforms(&project);
+    as_colmap(&project);
+    as_llff(&project);
+    for (folder, found, photographs) in [
+        ("data", "Blender's form (transforms_train.json): 21 photographs", "downscaled"),
+        ("transforms", "transforms.json (instant-ngp, nerfstudio): 20 photographs", "photographs"),
+        ("colmap", "COLMAP (sparse): 20 photographs", "photographs"),
+        ("llff", "LLFF (poses_bounds.npy): 20 photographs", "downscaled"),
+    ] {
+        let pipeline = format!("of-{folder}/pipeline.yaml");
+        std::fs::create_dir(project.path(&format!("of-{folder}"))).unwrap();
+        let said = project.ok(&["--pipeline", &pipeline, "init", folder]);
+        assert!(said.contains(&format!("found: {found} of {WIDTH}×{WIDTH}\n")), "{said}");
+        let text = std::fs::read_to_string(project.path(&pipeline)).unwrap();
+        assert!(text.contains(&format!("lr_source: {photographs}")), "{text}");
+        let run = [&["--pipeline", pipeline.as_str(), "run"][..], &SHORT].concat();
+        let said = project.ok(&run);
+        assert!(said.contains("eval: ") && said.contains("index.html"), "{said}");
+        for target in ["refined", "video", "registered", "reference-refine", "hr-finetune"] {
+            project.ok(&["--pipeline", &pipeline, "plan", target]);
+        }
+    }
+}
+
+/// Commented parameters are right, too: whoever takes a `#` away gets a pipeline that works.
+#[test]
+fn what_init_leaves_commented_out_is_right() {
+    let project = empty();
+    as_colmap(&project);
+    project.ok(&["init", "colmap"]);
+    let text = std::fs::read_to_string(project.path("pipeline.yaml")).unwrap();
+    let commented = "      # ";
+    let parameters = text.lines().filter_map(|line| line.strip_prefix(commented)).count();
+    assert!(parameters >= 4, "{text}");
+    std::fs::create_dir(project.path("weights")).unwrap();
+    project.write("weights/x", "");
+    project.write("pipeline.yaml", &text.replace(commented, "      "));
+    project.ok(&["plan"]);
+}
+
+#[test]
+fn init_overwrites_nothing() {
+    let project = empty();
+    as_colmap(&project);
+    project.write("pipelines/video.yaml", "mine");
+    project.run(&["init", "colmap"]).fails(2, &["pipelines/video.yaml is there already"]);
+    assert!(!project.path("pipeline.yaml").exists(), "all or nothing");
+    std::fs::remove_file(project.path("pipelines/video.yaml")).unwrap();
+    std::os::unix::fs::symlink("nowhere", project.path("pipeline.yaml")).unwrap();
+    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml is there already"]);
+    std::fs::remove_file(project.path("pipeline.yaml")).unwrap();
+    project.ok(&["init", "colmap"]);
+    let before = std::fs::read(project.path("pipeline.yaml")).unwrap();
+    project.run(&["init", "colmap"]).fails(2, &["pipeline.yaml is there already and stays"]);
+    assert_eq!(std::fs::read(project.path("pipeline.yaml")).unwrap(), before);
+}
+
+#[test]
+fn folders_that_init_refuses() {
+    let project = empty();
+    as_colmap(&project);
+    std::fs::create_dir(project.path("nothing")).unwrap();
+    for folder in ["loose", "cameraless/images"] {
+        std::fs::create_dir_all(project.path(folder)).unwrap();
+        std::fs::copy(
+            project.path("colmap/images/r_0.png"),
+            project.path(&format!("{folder}/a b.PNG")),
+        )
+        .unwrap();
+    }
+    project.run(&["init", "nothing"]).fails(3, &["nothing: no data set; expected"]);
+    project.run(&["init", "nowhere"]).fails(3, &["nowhere: no data set; expected"]);
+    project
+        .run(&["init", "loose"])
+        .fails(3, &["loose: 1 image, but no cameras", "move them to 'loose/images'", "colmap"]);
+    project
+        .run(&["init", "cameraless"])
+        .fails(3, &["cameraless: 1 image, but no cameras", "--image_path 'cameraless/images'"]);
+    let inside = project.command(&["init", "."]).current_dir(project.path("colmap")).output();
+    Finished::of(inside.unwrap()).fails(2, &["can't lie among the data"]);
+    project.run(&["plan"]).fails(2, &["pipeline.yaml: No such file", "`nerf-sr init DIR`"]);
+    assert!(!project.path("pipelines").exists() && !project.path("colmap/.nerf-sr").exists());
+}
+
+/// Whatever a folder is called, the pipeline finds it: beside the pipeline, below it or elsewhere.
+#[test]
+fn folders_with_odd_names() {
+    let project = empty();
+    as_colmap(&project);
+    for name in ["my photos", "Bäume: \"#1\"", "{rays}{dataset}", "-p", "it's", "yes/no"] {
+        let (home, data) = (project.path("home"), project.path(&format!("home/{name}")));
+        std::fs::create_dir_all(data.parent().unwrap()).unwrap();
+        std::fs::rename(project.path("colmap"), &data).unwrap();
+        for (at, folder) in
+            [(home.clone(), format!("./{name}")), (home.join("x"), format!("../{name}"))]
+        {
+            std::fs::create_dir_all(&at).unwrap();
+            for verb in [&["init", folder.as_str()][..], &["plan"]] {
+                let output = project.command(verb).current_dir(&at).output().unwrap();
+                let finished = Finished::of(output);
+                assert_eq!(finished.code, 0, "{name}: {}", finished.stderr);
+            }
+        }
+        std::fs::rename(&data, project.path("colmap")).unwrap();
+        std::fs::remove_dir_all(&home).unwrap();
+    }
+}
+
+/// Whoever waits sees within ten seconds that a stage lives, even where it says nothing itself.
+#[test]
+fn a_silent_stage_shows_that_it_lives() {
+    let project = Project::new("default: [quiet]\nstages:\n  quiet: {run: ./quiet}\n");
+    let describes = r#"{"name": "quiet", "version": "1", "code": "1", "summary": "Waits.",
+        "parameters": {"type": "object"}, "inputs": {}, "output": {"kind": "text"}}"#;
+    let works = "sleep 9; while [ $1 != --output ]; do shift; done; mkdir $2; echo x > $2/x";
+    let script =
+        format!("#!/bin/sh\nif [ $1 = describe ]; then echo '{describes}'; else {works}; fi\n");
+    project.program("quiet", &script);
+    let finished = project.run(&["run"]);
+    assert_eq!(finished.code, 0, "{}", finished.stderr);
+    assert!(finished.stderr.contains("quiet: running for 8"), "{}", finished.stderr);
+}
+
+/// Programs built without libtorch that are as new as the sources: `make demo` leaves them.
+fn without_libtorch() -> Option<PathBuf> {
+    let folder = root().join("target/without-libtorch");
+    let built = modified(&folder.join("eval"));
+    let sources = ["Cargo.lock", "Cargo.toml", ".cargo/config.toml"].map(|file| root().join(file));
+    let walked = walkdir::WalkDir::new(root().join("stages")).into_iter().flatten();
+    let files = walked.map(walkdir::DirEntry::into_path).filter(|path| path.is_file());
+    if files.chain(sources).all(|file| modified(&file) < built) {
+        return Some(folder);
+    }
+    eprintln!(
+        "skipped: no build without libtorch that is as new as the sources; `make demo` in an empty target makes one"
+    );
+    None
+}
+
+fn modified(file: &Path) -> Option<SystemTime> {
+    file.metadata().ok()?.modified().ok()
+}
+
+/// What a stage made without libtorch has the same key where it is built with it, and the same
+/// bytes: after `make demo`, `make build` leaves the demo cached.
+#[test]
+fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
+    let Some(programs) = without_libtorch() else { return };
+    let project = Project::fast();
+    let small = |arguments: &[&str]| {
+        let mut command = Command::new(programs.join("nerf-sr"));
+        command.args(arguments).current_dir(project.path(".")).env_remove("NERF_SR_STORE");
+        Finished::of(command.output().unwrap())
+    };
+    let made = small(&["run"]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    assert!(project.ok(&["run"]).contains("all 5 stages are cached"));
+    let names = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
+    let outputs = |store: &[&str]| names.map(|stage| project.output_of(stage, store));
+    project.ok(&["--store", "other", "run"]);
+    assert_eq!(outputs(&[]), outputs(&["--store", "other"]));
+    // What needs libtorch is refused, with the command that builds it.
+    project.write("weights/x", "");
+    for arguments in [
+        &["run", "-i", "weights=weights"][..],
+        &["run", "-p", "train-ss.field=mlp"],
+        &["run", "--device", "cuda:0"],
+    ] {
+        small(arguments).fails(2, &["libtorch", "run `make build`"]);
+    }
+    project.replace("default: [report]", "default: [refine]");
+    project.replace("  eval:\n", "  refine:\n    inputs: {views: render-depth}\n  eval:\n");
+    small(&["run"])
+        .fails(2, &["pipeline.yaml:", "stage refine: ", "refine isn't built; run `make build`"]);
+    assert_eq!(small(&["run", "eval"]).code, 0, "no matter to what doesn't use it");
+}
+
+/// Installed programs run from any folder, with nothing of the environment.
+#[test]
+fn installed_programs_run_from_any_folder() {
+    let project = Project::fast();
+    let prefix = project.path("usr");
+    let given = std::env::var_os("LIBTORCH").map(PathBuf::from);
+    let libtorch = given.unwrap_or_else(|| root().join(".libtorch"));
+    if !libtorch.join("lib").is_dir() {
+        eprintln!("skipped: {} is no libtorch of `make setup`", libtorch.display());
+        return;
+    }
+    let install = Command::new(root().join("scripts/install.sh"))
+        .arg(&prefix)
+        .arg(libtorch)
+        .env("BUILT", bin("nerf-sr").parent().unwrap())
+        .output()
+        .unwrap();
+    let install = Finished::of(install);
+    assert_eq!(install.code, 0, "{}", install.stderr);
+    let bare = |program: &str, arguments: &[&str]| {
+        let mut command = Command::new(prefix.join(program));
+        command.env_clear().args(arguments).current_dir(project.path("."));
+        Finished::of(command.output().unwrap())
+    };
+    let ran = bare("bin/nerf-sr", &["run"]);
+    assert_eq!(ran.code, 0, "{}", ran.stderr);
+    assert!(project.ok(&["run"]).contains("all 5 stages are cached"), "one key, wherever it lies");
+    // A program that can't do without libtorch.
+    let described = bare("lib/nerf-sr/refine", &["describe"]);
+    assert_eq!(described.code, 0, "{}", described.stderr);
+    let is_there = |file: &str| assert!(prefix.join("share").join(file).is_file(), "{file}");
+    let remote = bin("nerf-sr").with_file_name("nerf-sr-remote").exists();
+    for name in ["nerf-sr"].into_iter().chain(remote.then_some("nerf-sr-remote")) {
+        assert_eq!(bare(&format!("bin/{name}"), &["--version"]).code, 0);
+        is_there(&format!("bash-completion/completions/{name}"));
+        is_there(&format!("zsh/site-functions/_{name}"));
+        is_there(&format!("fish/vendor_completions.d/{name}.fish"));
+        is_there(&format!("man/man1/{name}.1"));
+    }
+    is_there("man/man1/nerf-sr-run.1");
+    checked(&["bash", "-n"], &prefix.join("share/bash-completion/completions/nerf-sr"));
+    checked(
+        &["groff", "-Kutf8", "-man", "-Tutf8", "-ww", "-z"],
+        &prefix.join("share/man/man1/nerf-sr-run.1"),
+    );
+}
+
+/// Has a tool check a file, where the tool is there; it finds nothing.
+fn checked(tool: &[&str], file: &Path) {
+    match Command::new(tool[0]).args(&tool[1..]).arg(file).output() {
+        Ok(output) => {
+            let words = String::from_utf8_lossy(&output.stderr);
+            assert!(output.status.success() && words.is_empty(), "{}: {words}", file.display());
+        }
+        Err(_) => eprintln!("skipped: no {} to check {}", tool[0], file.display()),
+    }
+}
