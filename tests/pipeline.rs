@@ -167,13 +167,14 @@ fn the_page_is_written_and_then_up_to_date() {
         "supersample=2",
         "data:image/png;base64,",
         "weights not given",
-        "depth (warm is near)",
-        "ground truth, 48 px",
+        "Depth maps",
+        "\"label\":\"Ground truth\",\"group\":\"Observations\"",
     ] {
         assert!(page.contains(words), "the page lacks {words:?}");
     }
-    // Self-contained: nothing is fetched from anywhere.
-    assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("<script"));
+    // Nothing is fetched from anywhere: the one address is SVG's name.
+    assert!(page.contains("default-src 'none'") && !page.contains("https://"));
+    assert_eq!(page.matches("http://").count(), page.matches("http://www.w3.org/2000/svg").count());
     let again = project.ok(&["run", "-p", "supersample=1,2"]);
     assert!(again.contains("up to date") && again.contains("nothing to run"), "{again}");
 }

@@ -32,6 +32,7 @@ fn every_verb_finds_a_target_of_its_own_file() {
         (&["why", "video", "video"], &["path-views"]),
         (&["status", "refined"], &["downscaled-views"]),
         (&["graph", "video"], &["camera-path"]),
+        (&["plan", "viewer"], &["train-ss", "viewer"]),
         (&["log", "camera-path", "video"], &["has not run yet"]),
         (&["gc", "refined", "--dry-run"], &["would stay"]),
         (&["describe", "train-refine"], &["train-refine"]),

@@ -160,10 +160,8 @@ fn a_missing_program_is_missed_where_it_is_needed() {
         let finished = run(arguments);
         assert_eq!(finished.code, 0, "{arguments:?}: {}", finished.stderr);
     }
-    run(&["plan"]).fails(
-        2,
-        &["pipeline.yaml:9: stage train-ss", "No such file", "cargo build --release -p train-ss"],
-    );
+    run(&["plan"])
+        .fails(2, &["pipeline.yaml:9: stage train-ss: ", "train-ss isn't built; run `make build`"]);
     run(&["plan", "prep", "-p", "rays=1"])
         .fails(2, &["no stage has such a parameter", "couldn't be asked"]);
     project.replace("  demo-scene:\n", "  demo-secne:\n");

@@ -26,10 +26,12 @@ fn descriptions() -> Vec<Description> {
         table::Table::describe("", ""),
         camera_path::CameraPath::describe("", ""),
         video::Video::describe("", ""),
+        viewer::Viewer::describe("", ""),
         register::Register::describe("", ""),
         train_refine::TrainRefine::describe("", ""),
         refine::Refine::describe("", ""),
         upsample::Upsample::describe("", ""),
+        export::Export::describe("", ""),
     ]
 }
 
@@ -48,6 +50,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("refiner", of::<refinement::RefinerFile>()),
         ("metrics", of::<eval::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),
+        ("export", of::<export::ExportSummary>()),
         ("degradation", of::<pixels::Degradation>()),
     ];
     let parameters =

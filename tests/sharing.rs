@@ -213,7 +213,7 @@ fn a_full_disk_leaves_the_old_page() {
     let out = project.path("out");
     std::fs::create_dir(&out).unwrap();
     let mounted =
-        Command::new("mount").args(["-t", "tmpfs", "-o", "size=200k", "tmpfs"]).arg(&out).output();
+        Command::new("mount").args(["-t", "tmpfs", "-o", "size=600k", "tmpfs"]).arg(&out).output();
     if !mounted.is_ok_and(|m| m.status.success()) {
         eprintln!("skipped: a tmpfs can't be mounted here (it needs root)");
         return;

@@ -9,7 +9,9 @@ use std::f64::consts::TAU;
 use artifact::{Context, Failure, Input, Output, Stage};
 use glam::{DMat3, DQuat, DVec3};
 use pixels::{DEGRADATION_FILE, Degradation};
-use scene::{Bounds, Camera, Space, VIEWS_FILE, View, Views, common_direction};
+use scene::{
+    Bounds, Camera, Pose, Space, VIEWS_FILE, View, Views, common_direction, looking_at, pose_of,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -32,7 +34,7 @@ pub struct Params {
     pub radius: f64,
     /// Poses of `kind: list`: for each frame a `camera_to_world` of three rows of four numbers, as
     /// in `views.json`.
-    pub poses: Vec<[[f64; 4]; 3]>,
+    pub poses: Vec<Pose>,
     /// Width of the frames; the height follows the first camera's aspect. Default: the width of the
     /// scene's HR images.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by scene"))]
@@ -101,7 +103,7 @@ impl Stage for CameraPath {
                 Failure::Usage("parameter poses: kind list needs at least one".to_owned()).into()
             );
         }
-        let view = |(i, pose): (usize, [[f64; 4]; 3])| {
+        let view = |(i, pose): (usize, Pose)| {
             let camera =
                 Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
             View::camera_only(camera.resized(width, height))
@@ -132,12 +134,7 @@ fn default_kind(cameras: &[Camera], params: &Params) -> Kind {
 }
 
 /// The poses of a path: `camera_to_world` of each frame.
-pub fn poses(
-    kind: Kind,
-    params: &Params,
-    cameras: &[Camera],
-    bounds: &Bounds,
-) -> Vec<[[f64; 4]; 3]> {
+pub fn poses(kind: Kind, params: &Params, cameras: &[Camera], bounds: &Bounds) -> Vec<Pose> {
     let shares = (0..params.frames).map(|i| f64::from(i) / f64::from(params.frames));
     match kind {
         Kind::Spiral => spiral(cameras, bounds, params, shares),
@@ -151,24 +148,12 @@ fn mean(cameras: &[Camera], of: impl Fn(&Camera) -> DVec3) -> DVec3 {
     cameras.iter().map(of).sum::<DVec3>() / cameras.len().max(1) as f64
 }
 
-fn pose(axes: DMat3, centre: DVec3) -> [[f64; 4]; 3] {
-    [0, 1, 2].map(|k| [axes.x_axis[k], axes.y_axis[k], axes.z_axis[k], centre[k]])
-}
-
-/// A camera at a place that looks at a point. Where it would look straight up or down, another axis
-/// is taken for its right.
-fn looking(from: DVec3, at: DVec3, up: DVec3) -> [[f64; 4]; 3] {
-    let back = (from - at).normalize_or(DVec3::Z);
-    let right = up.cross(back).try_normalize().unwrap_or_else(|| back.any_orthonormal_vector());
-    pose(DMat3::from_cols(right, back.cross(right), back), from)
-}
-
 fn spiral(
     cameras: &[Camera],
     bounds: &Bounds,
     params: &Params,
     shares: impl Iterator<Item = f64>,
-) -> Vec<[[f64; 4]; 3]> {
+) -> Vec<Pose> {
     let (centre, forward) =
         (mean(cameras, Camera::centre), mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z));
     let right = forward.cross(mean(cameras, |c| c.rotation().y_axis)).normalize_or(DVec3::X);
@@ -193,7 +178,7 @@ fn spiral(
             let offset = aside * angle.cos() * right
                 + above * angle.sin() * up
                 + ahead * (0.5 * angle).sin() * forward;
-            looking(centre + offset, focus, up)
+            looking_at(centre + offset, focus, up)
         })
         .collect()
 }
@@ -203,7 +188,7 @@ fn orbit(
     bounds: &Bounds,
     params: &Params,
     shares: impl Iterator<Item = f64>,
-) -> Vec<[[f64; 4]; 3]> {
+) -> Vec<Pose> {
     let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
     let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let level = |c: &Camera| {
@@ -219,13 +204,13 @@ fn orbit(
     shares
         .map(|share| {
             let turn = DQuat::from_axis_angle(up, TAU * params.turns * share);
-            looking(middle + params.radius * (turn * first * around + height * up), middle, up)
+            looking_at(middle + params.radius * (turn * first * around + height * up), middle, up)
         })
         .collect()
 }
 
 /// Between two cameras of the round: centres by Catmull and Rom's spline, turns by the shorter arc.
-fn between(cameras: &[Camera], share: f64) -> [[f64; 4]; 3] {
+fn between(cameras: &[Camera], share: f64) -> Pose {
     let count = cameras.len();
     let at = share * count as f64;
     let (i, t) = (at as usize % count, at.fract());
@@ -238,7 +223,7 @@ fn between(cameras: &[Camera], share: f64) -> [[f64; 4]; 3] {
             + (3.0 * (b - c) + d - a) * t * t * t);
     let (from, to) =
         (DQuat::from_mat3(&camera(0).rotation()), DQuat::from_mat3(&camera(1).rotation()));
-    pose(DMat3::from_quat(from.slerp(to, t).normalize()), centre)
+    pose_of(DMat3::from_quat(from.slerp(to, t).normalize()), centre)
 }
 
 #[cfg(test)]
@@ -250,7 +235,7 @@ mod tests {
         let one = |(i, &place): (usize, &DVec3)| Camera {
             name: i.to_string(),
             intrinsics: Intrinsics::from_angle_x(40, 30, 0.7),
-            camera_to_world: looking(place, at(place), DVec3::Z),
+            camera_to_world: looking_at(place, at(place), DVec3::Z),
         };
         places.iter().enumerate().map(one).collect()
     }
@@ -278,8 +263,8 @@ mod tests {
     const BOX: Bounds =
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
 
-    fn whole(poses: &[[[f64; 4]; 3]]) -> Vec<Camera> {
-        let one = |pose: &[[f64; 4]; 3]| Camera {
+    fn whole(poses: &[Pose]) -> Vec<Camera> {
+        let one = |pose: &Pose| Camera {
             name: "c".into(),
             intrinsics: Intrinsics::from_angle_x(40, 30, 0.7),
             camera_to_world: *pose,

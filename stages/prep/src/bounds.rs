@@ -1,5 +1,5 @@
 use glam::{DMat3, DVec3};
-use scene::{Bounds, Camera, Frustum, Space, common_direction};
+use scene::{Bounds, Camera, Frustum, Space, common_direction, pose_of};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -99,9 +99,8 @@ fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
     let up = mean(&|c| c.rotation().y_axis);
     let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
     let (up, centre) = (right.cross(forward), mean(&Camera::centre));
-    let row = |i: usize| [right[i], up[i], -forward[i], centre[i]];
     let mut frustum = Frustum {
-        camera_to_world: [row(0), row(1), row(2)],
+        camera_to_world: pose_of(DMat3::from_cols(right, up, -forward), centre),
         min: [f64::INFINITY; 2],
         max: [f64::NEG_INFINITY; 2],
         near: f64::INFINITY,
@@ -262,14 +261,10 @@ mod tests {
     use scene::Intrinsics;
 
     fn looking_at(from: DVec3, target: DVec3) -> Camera {
-        let back = (from - target).normalize();
-        let right = DVec3::Z.cross(back).normalize();
-        let up = back.cross(right);
-        let row = |k: usize| [right[k], up[k], back[k], from[k]];
         Camera {
             name: "c".into(),
             intrinsics: Intrinsics::from_angle_x(100, 100, 0.69),
-            camera_to_world: [row(0), row(1), row(2)],
+            camera_to_world: scene::looking_at(from, target, DVec3::Z),
         }
     }
 

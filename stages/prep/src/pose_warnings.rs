@@ -131,15 +131,14 @@ fn off_centre(all: &[Named]) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use glam::DMat3;
-    use scene::Intrinsics;
+    use scene::{Intrinsics, pose_of};
 
     use super::*;
 
     fn camera(name: &str, turn: f64, centre: [f64; 3]) -> Camera {
         let r = DMat3::from_rotation_z(turn);
-        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
         let intrinsics = Intrinsics::from_angle_x(32, 24, 0.69);
-        Camera { name: name.into(), intrinsics, camera_to_world: [row(0), row(1), row(2)] }
+        Camera { name: name.into(), intrinsics, camera_to_world: pose_of(r, centre.into()) }
     }
 
     /// Around something, at any scale and anywhere.

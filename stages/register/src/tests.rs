@@ -43,11 +43,7 @@ fn photograph() -> Image {
     let k = camera(0.0).intrinsics;
     let rays = (0..k.width * k.height).map(|i| {
         let ray = camera(0.0).ray(f64::from(i % k.width) + 0.5, f64::from(i / k.width) + 0.5);
-        Ray {
-            origin: ray.origin.as_vec3().to_array(),
-            direction: ray.direction.as_vec3().to_array(),
-            background: [1.0; 3],
-        }
+        Ray::new(&ray, [1.0; 3])
     });
     let pixels = Wall { whole: 0, shift: 0.0 }.render(&rays.collect::<Vec<_>>()).unwrap();
     Image::new(48, 48, 3, pixels.iter().flat_map(|pixel| pixel.colour).collect())

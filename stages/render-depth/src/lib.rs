@@ -223,6 +223,7 @@ impl RenderJob<'_> {
     fn cast(&self, pixels: &[[usize; 2]], n: usize) -> anyhow::Result<Vec<ViewPixel>> {
         let background = [self.background.shown(); 3];
         let within = |k: usize| (k as f64 + 0.5) / n as f64;
+        let camera_rays = self.camera.rays();
         let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
             .iter()
             .flat_map(|[x, y]| {
@@ -230,10 +231,8 @@ impl RenderJob<'_> {
                     .map(move |sub| (*x as f64 + within(sub % n), *y as f64 + within(sub / n)))
             })
             .map(|(u, v)| {
-                let ray = self.camera.ray(u, v);
-                let (origin, direction) =
-                    (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
-                (Ray { origin, direction, background }, self.camera.depth_per_distance(&ray) as f32)
+                let ray = camera_rays.ray(u, v);
+                (Ray::new(&ray, background), self.camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();

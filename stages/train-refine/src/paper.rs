@@ -1,9 +1,11 @@
-use artifact::{Context, FailureExt as _, GivenInput};
+use artifact::{Context, Failure, FailureExt as _, GivenInput};
 use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss};
-use pixels::psnr_of;
+use pixels::{Image, psnr_of};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 
-use crate::{PaperParams, examples, say, train};
+use crate::examples::Examples;
+use crate::steps::train;
+use crate::{PaperParams, say};
 
 /// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in
 /// Caffe's scaling.
@@ -11,7 +13,8 @@ const VGG: [&str; 2] = ["vgg19.safetensors", "vgg19_conv1to3_oihw.safetensors"];
 
 /// Trains the published network. It learns from all views there are, as published: from one.
 pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow::Result<()> {
-    let (mut known, left_out) = examples(context.input("views")?, context.input("truth")?, None)?;
+    let Examples { training: mut known, left_out } =
+        Examples::read(context.input("views")?, context.input("truth")?, None)?;
     if known.len() > 1 {
         known.extend(left_out);
     }
@@ -37,17 +40,12 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     train(context, options.steps, &mut trainer, &known, |error| format!("L1 {error:.4}"))?;
     trainer.network().write(&context.output_path(WEIGHTS_FILE)?)?;
     let (mut rendered, mut refined) = (0.0, 0.0);
-    let mean = |errors: &mut dyn Iterator<Item = f32>, count: usize| {
-        psnr_of(errors.map(|e| f64::from(e).powi(2)).sum::<f64>() / count as f64)
-    };
+    let share = 1.0 / known.len() as f64;
     for view in &known {
         let drawn =
             trainer.network().refine(&view.rendered, &[view], options.references, OVERLAP)?;
-        let (truth, own) =
-            (&view.truth.data, view.rendered.view.data.chunks_exact(4).flat_map(|p| &p[..3]));
-        rendered += mean(&mut own.zip(truth).map(|(a, b)| a - b), truth.len()) / known.len() as f64;
-        refined += mean(&mut drawn.data.iter().zip(truth).map(|(a, b)| a - b), truth.len())
-            / known.len() as f64;
+        rendered += share * psnr(&view.rendered.colours(), &view.truth);
+        refined += share * psnr(&drawn, &view.truth);
     }
     let network = Network::Paper { width, patches: params.patches };
     let file = RefinerFile {
@@ -62,8 +60,14 @@ pub(crate) fn run(context: &Context, params: &PaperParams, seed: u64) -> anyhow:
     say(context, "the references that it learnt from", &file)
 }
 
-fn perceptual(input: &GivenInput) -> anyhow::Result<PerceptualLoss> {
+fn perceptual(input: &GivenInput) -> Result<PerceptualLoss, Failure> {
     let file = VGG.iter().map(|name| input.path(name)).find(|path| path.is_file());
     let file = file.unwrap_or_else(|| input.path(VGG[0]));
     PerceptualLoss::read(&file).bad_input("input weights")
+}
+
+/// PSNR of two images of one size, in dB.
+fn psnr(image: &Image, truth: &Image) -> f64 {
+    let squares = image.data.iter().zip(&truth.data).map(|(a, b)| f64::from(a - b).powi(2));
+    psnr_of(squares.sum::<f64>() / truth.data.len() as f64)
 }

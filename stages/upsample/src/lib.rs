@@ -234,19 +234,17 @@ fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), String> {
 }
 
 /// The network's tensors, from a file of that name in the input.
-fn open(input: &GivenInput, file: &str) -> anyhow::Result<Weights> {
+fn open(input: &GivenInput, file: &str) -> Result<Weights, Failure> {
     if std::path::Path::new(file).file_name().is_none_or(|name| name != file) {
         return Err(Failure::Usage(format!(
             "file: {file:?} is no name of a file in input weights"
-        ))
-        .into());
+        )));
     }
     let path = input.path(file);
     if !path.is_file() {
         return Err(Failure::BadInput(format!(
             "input weights: no file {file} in it; {MAKE_WEIGHTS}"
-        ))
-        .into());
+        )));
     }
     Weights::read(&path).bad_input("input weights")
 }

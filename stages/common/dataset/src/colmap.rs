@@ -61,37 +61,11 @@ fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
 
 /// Reads the model with most images, the first of several, and the images that it names.
 pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, DatasetError> {
-    let mut chosen: Option<(&PathBuf, Model)> = None;
-    let mut sizes = Vec::new();
-    for path in models {
-        let model = Model::read(path)?;
-        sizes.push(format!(
-            "{} has {}",
-            path.strip_prefix(folder).unwrap_or(path).display(),
-            model.images.len()
-        ));
-        if chosen.as_ref().is_none_or(|(_, best)| model.images.len() > best.images.len()) {
-            chosen = Some((path, model));
-        }
-    }
-    let (path, mut model) =
-        chosen.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
-    let list =
-        path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
+    let (path, mut model, mut notes) = largest_model(folder, models)?;
     // By name: the order in which COLMAP happened to register them means nothing.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
-    let mut notes = vec![format!(
-        "COLMAP: {} of {}",
-        counted(model.images.len(), "photograph"),
-        path.strip_prefix(folder).unwrap_or(path).display()
-    )];
-    if models.len() > 1 {
-        notes.push(format!(
-            "of {} models the one with most images is taken: {}",
-            models.len(),
-            sizes.join(", ")
-        ));
-    }
+    let list =
+        path.join(if path.join("images.bin").is_file() { "images.bin" } else { "images.txt" });
     let root =
         if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
     let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
@@ -102,7 +76,7 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
             file: image.name.clone(),
             reason,
         };
-        let file = relative_path(&image.name).map_err(of_frame)?;
+        let file = relative_path(&image.name).map_err(|e| of_frame(e.to_string()))?;
         match find(&root.join(&file), "an image") {
             Found::File => {}
             Found::Nothing(_) => {
@@ -138,6 +112,36 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
         frame.name = name;
     }
     Ok(Dataset { format: Format::Colmap, frames, split: None, notes })
+}
+
+/// The first model with most images: its folder, itself, and notes on the choice.
+fn largest_model<'a>(
+    folder: &Path,
+    models: &'a [PathBuf],
+) -> Result<(&'a Path, Model, Vec<String>), DatasetError> {
+    let mut largest: Option<(&Path, Model)> = None;
+    let mut sizes = Vec::new();
+    for path in models {
+        let model = Model::read(path)?;
+        let name = path.strip_prefix(folder).unwrap_or(path).display();
+        sizes.push(format!("{name} has {}", model.images.len()));
+        if largest.as_ref().is_none_or(|(_, best)| model.images.len() > best.images.len()) {
+            largest = Some((path, model));
+        }
+    }
+    let (path, model) =
+        largest.ok_or_else(|| DatasetError::Unknown { path: folder.to_path_buf() })?;
+    let photographs = counted(model.images.len(), "photograph");
+    let name = path.strip_prefix(folder).unwrap_or(path).display();
+    let mut notes = vec![format!("COLMAP: {photographs} of {name}")];
+    if models.len() > 1 {
+        notes.push(format!(
+            "of {} models the one with most images is taken: {}",
+            models.len(),
+            sizes.join(", ")
+        ));
+    }
+    Ok((path, model, notes))
 }
 
 /// A file of a folder, if it is there.

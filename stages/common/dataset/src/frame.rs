@@ -2,7 +2,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
-use scene::{Camera, CameraError, Distortion, Intrinsics};
+use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
 
 use crate::DatasetError;
 use crate::found::shown;
@@ -26,7 +26,7 @@ pub struct Frame {
     pub pinhole: Option<Intrinsics>,
     /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
     /// space.
-    pub camera_to_world: [[f64; 4]; 3],
+    pub camera_to_world: Pose,
     /// Depth of the nearest and of the farthest point that it is known to see, along its axis,
     /// where the data says so.
     pub depths: Option<[f64; 2]>,
@@ -60,16 +60,12 @@ impl Frame {
     }
 }
 
-/// Camera axes as columns and the centre, row by row.
-pub(crate) fn pose([right, up, back]: [DVec3; 3], centre: DVec3) -> [[f64; 4]; 3] {
-    [0, 1, 2].map(|k| [right[k], up[k], back[k], centre[k]])
-}
-
 /// The pose of a world-to-camera motion x' = R·x + t with axes right, down, forward (COLMAP,
 /// OpenCV).
-pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> [[f64; 4]; 3] {
+pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> Pose {
     let back = rotation.transpose();
-    pose([back.x_axis, -back.y_axis, -back.z_axis], -(back * translation))
+    let axes = DMat3::from_cols(back.x_axis, -back.y_axis, -back.z_axis);
+    pose_of(axes, -(back * translation))
 }
 
 /// Names for images, by their paths inside the data set: the files' names alone where those differ,

@@ -2,11 +2,11 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use artifact::counted;
-use glam::DVec3;
-use scene::{Distortion, Intrinsics};
+use glam::{DMat3, DVec3};
+use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::found::{Found, find};
-use crate::frame::{names, pose};
+use crate::frame::names;
 use crate::photograph::{Stored, fitted, is_image_name, look};
 use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
@@ -96,7 +96,7 @@ fn frame(
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
         return Err(format!("its bounds are {near} and {far}; 0 < near < far is expected"));
     }
-    let camera_to_world = pose([right, -down, back], centre);
+    let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
     Ok(Frame {
         name,
         image,

@@ -181,7 +181,7 @@ fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
 
 /// The image's path inside the folder. NeRF's files leave `.png` out.
 fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
-    let mut file = relative_path(text)?;
+    let mut file = relative_path(text).map_err(|e| e.to_string())?;
     let known = ["png", "jpg", "jpeg", "exr"];
     let has_one = file
         .extension()
@@ -213,7 +213,7 @@ fn read_frame(
     let image = folder.join(file);
     let beside = |text: &Option<String>| -> Result<Option<PathBuf>, String> {
         let Some(text) = text else { return Ok(None) };
-        let path = folder.join(relative_path(text)?);
+        let path = folder.join(relative_path(text).map_err(|e| e.to_string())?);
         match find(&path, "an image") {
             Found::File => Ok(Some(path)),
             Found::Nothing(reason) | Found::Other(reason) => {

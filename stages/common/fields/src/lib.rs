@@ -9,18 +9,17 @@
 //! let input = GivenInput::open("field", "field".as_ref())?;
 //! let members = fields::Members::read(&input, "cpu")?;
 //! println!("{} fields over {:?}", members.fields.len(), members.file.background);
-//! # Ok::<(), anyhow::Error>(())
+//! # Ok::<(), artifact::Failure>(())
 //! ```
 use std::path::PathBuf;
 
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
 
-/// Variables of the environment that change what fields render.
-pub const ENVIRONMENT: &[&str] = &[
-    #[cfg(feature = "torch")]
-    nets::TF32_VARIABLE,
-];
+/// Variables of the environment that change what fields render, whether this was built with libtorch
+/// or not. libtorch's own lets CUDA's products use TensorFloat-32, with ten bits behind the point; it
+/// is off unless it is 1.
+pub const ENVIRONMENT: &[&str] = &["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE"];
 
 /// The fields of an artifact.
 pub struct Members {
@@ -32,7 +31,11 @@ pub struct Members {
 
 impl Members {
     /// Reads all of an input, whichever field it is, onto `cpu` or `cuda:N`.
-    pub fn read(input: &GivenInput, device: &str) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] where the input can't be read, [`Failure::Usage`] where the device
+    /// can't be used.
+    pub fn read(input: &GivenInput, device: &str) -> Result<Self, Failure> {
         let file: FieldFile = input.read_json(FIELD_FILE)?;
         file.check().map_err(|reason| {
             Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
@@ -93,7 +96,7 @@ fn read_all(
     file: &FieldFile,
     input: &GivenInput,
     device: &str,
-) -> anyhow::Result<Vec<Box<dyn RayField>>> {
+) -> Result<Vec<Box<dyn RayField>>, Failure> {
     let paths = (0..file.members).map(|i| input.path(&FieldFile::member(i)));
     match file.field {
         FieldModel::Grid(architecture) => {
@@ -112,34 +115,34 @@ fn read_all(
         }
         #[cfg(not(feature = "torch"))]
         FieldModel::Mlp(_) => {
-            let message = "field: mlp needs libtorch, and this was built without it; build with \
-                --features torch";
-            Err(Failure::Usage(message.to_owned()).into())
+            let message =
+                "field: mlp needs libtorch, and this was built without it; run `make build`";
+            Err(Failure::Usage(message.to_owned()))
         }
     }
 }
 
 /// A grid: on the CPU as it is, elsewhere through libtorch.
 #[cfg(feature = "torch")]
-fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
+fn grid_on(device: &str, field: Field) -> Result<Box<dyn RayField>, Failure> {
     if device == "cpu" {
         return Ok(Box::new(field));
     }
     let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
     nets::deterministic();
-    Ok(Box::new(torch_field::TorchGrid::new(&field, device)?))
+    let on_device = torch_field::TorchGrid::new(&field, device).usage("--device")?;
+    Ok(Box::new(on_device))
 }
 
 #[cfg(not(feature = "torch"))]
-fn grid_on(device: &str, field: Field) -> anyhow::Result<Box<dyn RayField>> {
+fn grid_on(device: &str, field: Field) -> Result<Box<dyn RayField>, Failure> {
     if device == "cpu" {
         return Ok(Box::new(field));
     }
     let message = format!(
-        "--device {device}: it needs libtorch, and this was built without it; build with \
-        --features torch"
+        "--device {device}: it needs libtorch, and this was built without it; run `make build`"
     );
-    Err(Failure::Usage(message).into())
+    Err(Failure::Usage(message))
 }
 
 #[cfg(test)]

@@ -29,11 +29,7 @@ fn rays(camera: &Camera) -> Vec<Ray> {
     let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
     let ray = |i: u32| {
         let ray = camera.ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
-        Ray {
-            origin: ray.origin.as_vec3().to_array(),
-            direction: ray.direction.as_vec3().to_array(),
-            background: [1.0; 3],
-        }
+        Ray::new(&ray, [1.0; 3])
     };
     (0..width * height).map(ray).collect()
 }

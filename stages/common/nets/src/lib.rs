@@ -36,10 +36,6 @@ pub fn deterministic() {
     tch::set_num_threads(1);
 }
 
-/// Environment variable that lets CUDA's products use TensorFloat-32, with ten bits behind the
-/// point: libtorch's own, off unless it is 1.
-pub const TF32_VARIABLE: &str = "TORCH_ALLOW_TF32_CUBLAS_OVERRIDE";
-
 /// A device that can't be used.
 #[derive(Debug, thiserror::Error)]
 #[error("--device {name}: {reason}")]

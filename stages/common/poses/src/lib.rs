@@ -41,7 +41,7 @@ use glam::{DMat3, DQuat, DVec3};
 use nalgebra::{Matrix6, Vector6};
 use pixels::{Filter, Image, Resampling};
 use radiance::{Ray, RayField, RenderError};
-use scene::Camera;
+use scene::{Camera, pose_of};
 
 pub use photometric::{Shot, photometric_error};
 
@@ -279,8 +279,7 @@ impl Equations {
 /// The ray through a position in the image, exact and as fields take it.
 fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::CameraRay, Ray) {
     let ray = camera.ray(x, y);
-    let (origin, direction) = (ray.origin.as_vec3().to_array(), ray.direction.as_vec3().to_array());
-    (ray, Ray { origin, direction, background: [background; 3] })
+    (ray, Ray::new(&ray, [background; 3]))
 }
 
 fn huber(error: f64) -> f64 {
@@ -329,9 +328,8 @@ fn rotation(camera: &Camera) -> DQuat {
 
 /// The camera with another pose.
 fn placed(camera: &Camera, rotation: DQuat, centre: DVec3) -> Camera {
-    let r = DMat3::from_quat(rotation.normalize());
-    let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
-    Camera { camera_to_world: [row(0), row(1), row(2)], ..camera.clone() }
+    let axes = DMat3::from_quat(rotation.normalize());
+    Camera { camera_to_world: pose_of(axes, centre), ..camera.clone() }
 }
 
 /// A camera before and after.

@@ -71,11 +71,7 @@ fn photograph(camera: &Camera) -> Image {
             let (pixel, sub) = (i / 9, i % 9);
             let at = |whole: usize, part: usize| whole as f64 + (part as f64 + 0.5) / 3.0;
             let ray = camera.ray(at(pixel % width, sub % 3), at(pixel / width, sub / 3));
-            Ray {
-                origin: ray.origin.as_vec3().to_array(),
-                direction: ray.direction.as_vec3().to_array(),
-                background: [1.0; 3],
-            }
+            Ray::new(&ray, [1.0; 3])
         })
         .collect();
     let subs = BallAndWall.render(&rays).unwrap();

@@ -1,7 +1,7 @@
-use crate::refiner::INPUTS;
+use crate::channels::INPUTS;
 use crate::sums::Sums;
 use crate::view::{KnownView, Rendered};
-use crate::warped_reference::WarpedReference;
+use crate::warped_pixel::WarpedPixel;
 
 /// Pixels that a reference is moved at most.
 const FARTHEST: f64 = 2.0;
@@ -10,11 +10,11 @@ const FARTHEST: f64 = 2.0;
 /// is rendered: one step of Lucas and Kanade (1981) from where geometry puts it, held back by the
 /// detail that rendering lacks, whose squares stand for how little a difference says of a place.
 pub(crate) fn align(
-    warped: &[WarpedReference],
+    warped: &[WarpedPixel],
     rendered: &Rendered,
     reference: &KnownView,
     first_row: usize,
-) -> Vec<WarpedReference> {
+) -> Vec<WarpedPixel> {
     let view = &rendered.view;
     let width = view.width;
     let pixel =
@@ -28,7 +28,7 @@ pub(crate) fn align(
             per(pixel(x, bottom)[c], pixel(x, top)[c], bottom - top),
         )
     };
-    let terms = |(i, own): (usize, &WarpedReference)| {
+    let terms = |(i, own): (usize, &WarpedPixel)| {
         let mut terms = [0.0; 6];
         for c in (0..3).filter(|_| own.confidence > 0.0) {
             let (x, y) = slope(i % width, first_row + i / width, c);
@@ -39,7 +39,7 @@ pub(crate) fn align(
         terms
     };
     let sums = Sums::new(width, &warped.iter().enumerate().map(terms).collect::<Vec<_>>());
-    let moved = |(i, own): (usize, &WarpedReference)| {
+    let moved = |(i, own): (usize, &WarpedPixel)| {
         if own.confidence <= 0.0 {
             return *own;
         }
@@ -64,7 +64,7 @@ pub(crate) fn align(
         let place = std::array::from_fn(|k| {
             own.place[k] + (share * (dx * across[k] + dy * down[k])) as f32
         });
-        WarpedReference::new(reference, place, own.visibility, pixel(x, first_row + y))
+        WarpedPixel::new(reference, place, own.visibility, pixel(x, first_row + y))
     };
     warped.iter().enumerate().map(moved).collect()
 }
@@ -72,12 +72,8 @@ pub(crate) fn align(
 /// How far what a reference shows moves in it from one pixel to the next: the shorter of the steps
 /// from the one before and to the one after, for the other may lead over an edge; 0 where neither
 /// is shown.
-fn step(
-    before: Option<&WarpedReference>,
-    own: &WarpedReference,
-    after: Option<&WarpedReference>,
-) -> [f64; 2] {
-    let between = |from: &WarpedReference, to: &WarpedReference| {
+fn step(before: Option<&WarpedPixel>, own: &WarpedPixel, after: Option<&WarpedPixel>) -> [f64; 2] {
+    let between = |from: &WarpedPixel, to: &WarpedPixel| {
         let is_shown = from.confidence > 0.0 && to.confidence > 0.0;
         is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
     };

@@ -1,4 +1,4 @@
-use artifact::{FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Image, Resampling};
 use scene::{Camera, Photograph, Views};
 
@@ -17,7 +17,7 @@ const REACH: usize = 12;
 
 impl<'a> LrObservations<'a> {
     /// Those of a scene's training views, with the kernel that made them.
-    pub fn read(input: &'a GivenInput) -> anyhow::Result<Self> {
+    pub fn read(input: &'a GivenInput) -> Result<Self, Failure> {
         let degradation: Degradation = input.read_json(DEGRADATION_FILE)?;
         Ok(Self { input, views: Views::read(input)?, filter: degradation.kernel.filter() })
     }
@@ -29,7 +29,7 @@ impl<'a> LrObservations<'a> {
 
     /// The LR photograph that was taken by a view's own camera, over the background, where there is
     /// one: of that name and pose, and smaller.
-    pub fn of(&self, camera: &Camera) -> anyhow::Result<Option<Photograph>> {
+    pub fn of(&self, camera: &Camera) -> Result<Option<Photograph>, Failure> {
         let Some(view) = self.views.taken_by(camera) else { return Ok(None) };
         let photograph =
             view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
@@ -41,7 +41,7 @@ impl<'a> LrObservations<'a> {
     }
 
     /// A rendered view that is consistent with its own LR observation, where there is one.
-    pub fn make_consistent(&self, rendered: Rendered) -> anyhow::Result<Rendered> {
+    pub fn make_consistent(&self, rendered: Rendered) -> Result<Rendered, Failure> {
         let Some(photograph) = self.of(&rendered.camera)? else { return Ok(rendered) };
         let colours = self.project(&rendered.colours(), &photograph);
         Ok(rendered.with_colours(&colours))

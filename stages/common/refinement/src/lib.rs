@@ -36,19 +36,23 @@
 //! ```
 
 mod align;
+mod channels;
 mod consistency;
 mod folded;
+mod guidance;
 mod refiner;
 mod sums;
 mod trainer;
 mod view;
+mod warped_pixel;
 mod warped_reference;
 
 pub use consistency::LrObservations;
+pub use guidance::Guidance;
 pub use refiner::{Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, WEIGHTS_FILE};
 pub use trainer::{RefinerScores, RefinerTrainer, RefinerTraining, Training};
 pub use view::{KnownView, Rendered};
-pub use warped_reference::{ConditionedView, Guidance, Use, with_references};
+pub use warped_reference::{ConditionedView, Use, with_references};
 
 /// A refiner that can't be read, written, used or trained.
 #[derive(Debug, thiserror::Error)]

@@ -8,8 +8,9 @@ use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
 
 use crate::RefinementError;
+use crate::channels::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
 use crate::folded::{FOLD, Square, Turn, samples};
-use crate::warped_reference::Guidance;
+use crate::guidance::Guidance;
 
 /// Size of a network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -83,12 +84,6 @@ pub struct Refiner {
     parameters: Vec<Tensor>,
 }
 
-/// Channels of a rendered view: colour and opacity.
-pub(crate) const INPUTS: usize = 4;
-/// The same with the difference to references, their confidence, and what their own views lack.
-pub(crate) const REFERENCE_INPUTS: usize = 11;
-/// Channels of an image.
-pub(crate) const OUTPUTS: usize = 3;
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large
 /// enough that little is seen twice.
 const TILE: usize = 128;

@@ -8,10 +8,12 @@ use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::RefinementError;
+use crate::channels::{OUTPUTS, REFERENCE_INPUTS};
 use crate::folded::{FOLD, Square, Turn};
-use crate::refiner::{OUTPUTS, REFERENCE_INPUTS, Refiner};
+use crate::guidance::Guidance;
+use crate::refiner::Refiner;
 use crate::view::KnownView;
-use crate::warped_reference::{Guidance, Use, with_references};
+use crate::warped_reference::{Use, with_references};
 
 /// A training, step by step, that can be interrupted.
 pub trait Training {
@@ -145,23 +147,10 @@ impl RefinerTrainer {
         references: &[KnownView],
     ) -> Result<RefinerScores, RefinementError> {
         let mut uses = Use::default();
-        let view = |(i, example): (usize, &KnownView)| -> Image {
-            let Some(guidance) = self.refiner.architecture().guidance else {
-                return example.rendered.view.clone();
-            };
-            let mut rng = CounterRng::new(self.options.seed, SCORES, i as u64);
-            let drawn =
-                (0..self.options.references).map(|_| rng.below(references.len() as u64) as usize);
-            let conditioned = with_references(
-                &example.rendered,
-                &drawn.map(|k| &references[k]).collect::<Vec<_>>(),
-                guidance,
-            );
-            conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
-            conditioned.view
-        };
-        let views: Vec<Image> = examples.iter().enumerate().map(view).collect();
-        let confidence = (uses.seen > 0).then(|| uses.confidence_share());
+        let views: Vec<Image> = (0u64..)
+            .zip(examples)
+            .map(|(number, example)| self.conditioned(number, example, references, &mut uses))
+            .collect();
         let (mut rendered, mut inner_product, mut power) = (0.0, 0.0, 0.0);
         for (view, KnownView { truth, .. }) in views.iter().zip(examples) {
             let refined = self.refiner.refine(view)?;
@@ -188,8 +177,50 @@ impl RefinerTrainer {
             rendered_psnr: rendered / count,
             refined_psnr: refined / count,
             strength,
-            confidence,
+            confidence: (uses.seen > 0).then(|| uses.confidence_share()),
         })
+    }
+
+    /// A left-out example as the network takes it, with references drawn by its number.
+    fn conditioned(
+        &self,
+        number: u64,
+        example: &KnownView,
+        references: &[KnownView],
+        uses: &mut Use,
+    ) -> Image {
+        let Some(guidance) = self.refiner.architecture().guidance else {
+            return example.rendered.view.clone();
+        };
+        let mut rng = CounterRng::new(self.options.seed, SCORES, number);
+        let drawn: Vec<&KnownView> = (0..self.options.references)
+            .map(|_| &references[rng.below(references.len() as u64) as usize])
+            .collect();
+        let conditioned = with_references(&example.rendered, &drawn, guidance);
+        conditioned.uses.iter().for_each(|of_use| uses.add(of_use));
+        conditioned.view
+    }
+
+    /// Draws references for examples anew, where the network takes some and a round begins.
+    fn condition(&mut self, examples: &[KnownView]) {
+        let round = self.steps() / ROUND;
+        if let Some(guidance) = self.refiner.architecture().guidance
+            && self.pool.as_ref().is_none_or(|pool| pool.round != round)
+        {
+            self.pool = Some(Pool::new(round, &self.options, guidance, examples));
+        }
+    }
+
+    /// What squares are drawn from: examples with their references, or as they are.
+    fn subjects<'a>(&'a self, examples: &'a [KnownView]) -> Vec<Subject<'a>> {
+        let Some(pool) = &self.pool else {
+            return examples
+                .iter()
+                .map(|example| Subject { view: &example.rendered.view, truth: &example.truth })
+                .collect();
+        };
+        let conditioned = pool.views.iter();
+        conditioned.map(|(i, view)| Subject { view, truth: &examples[*i].truth }).collect()
     }
 }
 
@@ -200,43 +231,21 @@ impl Training for RefinerTrainer {
 
     fn step(&mut self, examples: &[KnownView]) -> Result<Option<f64>, RefinementError> {
         let RefinerTraining { steps, batch, rate, .. } = self.options;
-        if self.steps() >= steps {
+        let (step, options) = (self.steps(), self.options);
+        if step >= steps {
             return Ok(None);
         }
         let shards: Vec<(Refiner, Range<usize>)> = (0..SHARDS)
             .map(|i| (self.refiner.share(), batch * i / SHARDS..batch * (i + 1) / SHARDS))
             .collect();
-        let (step, options) = (self.steps(), self.options);
-        let round = step / ROUND;
-        if let Some(guidance) = self.refiner.architecture().guidance
-            && self.pool.as_ref().is_none_or(|pool| pool.round != round)
-        {
-            self.pool = Some(Pool::new(round, &options, guidance, examples));
-        }
-        let subjects: Vec<Subject<'_>> = match &self.pool {
-            Some(pool) => pool
-                .views
-                .iter()
-                .map(|(i, view)| Subject { view, truth: &examples[*i].truth })
-                .collect(),
-            None => examples
-                .iter()
-                .map(|example| Subject { view: &example.rendered.view, truth: &example.truth })
-                .collect(),
-        };
+        self.condition(examples);
+        let subjects = self.subjects(examples);
         let parts: Vec<(f64, Vec<Tensor>)> = shards
             .into_par_iter()
             .filter(|(_, range)| !range.is_empty())
             .map(|(refiner, range)| shard(&refiner, &options, step, range, &subjects))
             .collect::<Result<_, _>>()?;
-        let loss = parts.iter().map(|(loss, _)| loss).sum::<f64>();
-        let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
-        let mut gradients = parts.next().unwrap_or_default();
-        for part in parts {
-            no_grad(|| {
-                gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop))
-            })?;
-        }
+        let (loss, gradients) = sum_in_order(parts)?;
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
         }
@@ -254,6 +263,19 @@ impl Training for RefinerTrainer {
         (self.adam, []) = Adam::resume(path, &self.refiner.named())?;
         Ok(())
     }
+}
+
+/// The sum of shards' losses and gradients, in their order.
+fn sum_in_order(parts: Vec<(f64, Vec<Tensor>)>) -> Result<(f64, Vec<Tensor>), TchError> {
+    let loss = parts.iter().map(|(loss, _)| loss).sum();
+    let mut parts = parts.into_iter().map(|(_, gradients)| gradients);
+    let mut gradients = parts.next().unwrap_or_default();
+    for part in parts {
+        no_grad(|| {
+            gradients.iter_mut().zip(&part).try_for_each(|(sum, g)| sum.f_add_(g).map(drop))
+        })?;
+    }
+    Ok((loss, gradients))
 }
 
 /// Loss and gradients of some of a step's squares.

@@ -1,5 +1,6 @@
-use pixels::{Exposure, ExrImage, Image};
-use scene::{Camera, Photograph, Surface};
+use artifact::{Failure, FailureExt as _, GivenInput};
+use pixels::{Exposure, ExrImage, Image, read_exr};
+use scene::{Camera, Photograph, Surface, View};
 
 use crate::RefinementError;
 
@@ -40,6 +41,24 @@ impl Rendered {
             .flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
         let view = Image::new(image.width, image.height, 4, pixels.collect());
         Ok(Self { opacity: premultiplied.channel(3), depth: depth.to_vec(), view, camera })
+    }
+
+    /// A view of an input over a grey level, and its file's channels. None where it has no image.
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`], with input and view, where its image can't be read or isn't a
+    /// rendered view's.
+    pub fn read(
+        input: &GivenInput,
+        view: &View,
+        background: f32,
+    ) -> Result<Option<(Self, ExrImage)>, Failure> {
+        let Some(file) = &view.image else { return Ok(None) };
+        let place = format!("input {}", input.name());
+        let image =
+            read_exr(&input.path(file)).bad_input(format!("{place}: view {}", view.camera.name))?;
+        let rendered = Self::new(view.camera.clone(), &image, background).bad_input(place)?;
+        Ok(Some((rendered, image)))
     }
 
     /// Its colours alone.

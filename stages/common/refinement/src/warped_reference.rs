@@ -5,31 +5,14 @@ use std::ops::Range;
 
 use pixels::Image;
 use rayon::prelude::*;
-use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::align::align;
-use crate::refiner::{INPUTS, REFERENCE_INPUTS};
+use crate::channels::{INPUTS, REFERENCE_INPUTS};
+use crate::guidance::Guidance;
 use crate::sums::{AROUND, Sums};
 use crate::view::{KnownView, Rendered};
-
-/// How references are looked at.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Guidance {
-    /// Whether a reference shows only what it sees by its own depth; without it also what something
-    /// stands before.
-    pub occlusion: bool,
-    /// Whether what a reference shows is moved, by up to two pixels, to fit what is rendered.
-    pub alignment: bool,
-}
-
-impl Default for Guidance {
-    /// By its own depth, and where geometry puts it.
-    fn default() -> Self {
-        Self { occlusion: true, alignment: false }
-    }
-}
+use crate::warped_pixel::WarpedPixel;
 
 /// What references know of some rows of a view: how the colour they show there differs from the
 /// rendered one; the confidence in them, from 0 (none of them sees it) to 1 (one sees it from the
@@ -86,43 +69,6 @@ pub struct ConditionedView {
 const DIFFERENT: f32 = 0.1;
 const JUMP: f32 = 1.0;
 
-/// What one reference shows of a pixel.
-#[derive(Clone, Copy, Default)]
-pub(crate) struct WarpedReference {
-    /// Difference to what is rendered.
-    pub(crate) difference: [f32; 3],
-    /// Difference to what is rendered for the reference.
-    pub(crate) lacking: [f32; 3],
-    /// Where in the reference, in pixels.
-    pub(crate) place: [f32; 2],
-    /// By angle and size; 0 where it shows nothing.
-    pub(crate) visibility: f32,
-    /// The same, less where it looks otherwise than what is rendered.
-    pub(crate) confidence: f32,
-}
-
-impl WarpedReference {
-    /// What a reference shows at a place of it, for a pixel as rendered.
-    pub(crate) fn new(
-        reference: &KnownView,
-        place: [f32; 2],
-        visibility: f32,
-        pixel: &[f32],
-    ) -> Self {
-        let (colour, theirs) =
-            (reference.truth.colour_at(place), reference.rendered.view.colour_at(place));
-        let difference = std::array::from_fn(|c| colour[c] - pixel[c]);
-        let lacking = std::array::from_fn(|c| colour[c] - theirs[c]);
-        // An image with a hole in it shows nothing there.
-        let is_shown = difference.iter().chain(&lacking).all(|d: &f32| d.is_finite());
-        if is_shown {
-            Self { difference, lacking, place, visibility, confidence: visibility }
-        } else {
-            Self::default()
-        }
-    }
-}
-
 impl ReferenceFeatures {
     /// What references know of rows.
     fn new(
@@ -139,7 +85,7 @@ impl ReferenceFeatures {
             let mut of_use = Use::default();
             for (
                 (sum, lacks, weights, best),
-                WarpedReference { difference, lacking, visibility, confidence, .. },
+                WarpedPixel { difference, lacking, visibility, confidence, .. },
             ) in sums.iter_mut().zip(warped)
             {
                 of_use.add(&Use {
@@ -173,7 +119,7 @@ fn warp(
     reference: &KnownView,
     rows: &Range<usize>,
     guidance: Guidance,
-) -> Vec<WarpedReference> {
+) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     // What is looked at around a pixel was itself moved by what lies around it.
     let around = if guidance.alignment { 2 * AROUND } else { AROUND };
@@ -185,16 +131,16 @@ fn warp(
         } else {
             surface.visibility_through(column, row, theirs.camera)
         };
-        let Some(visibility) = visibility else { return WarpedReference::default() };
+        let Some(visibility) = visibility else { return WarpedPixel::default() };
         let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
-        WarpedReference::new(
+        WarpedPixel::new(
             reference,
             visibility.place,
             well,
             &rendered.view.data[(row * width + column) * INPUTS..],
         )
     };
-    let mut warped: Vec<WarpedReference> = near
+    let mut warped: Vec<WarpedPixel> = near
         .clone()
         .flat_map(|row| (0..width).map(move |column| (column, row)))
         .map(|(c, r)| show(c, r))
@@ -202,7 +148,7 @@ fn warp(
     if guidance.alignment {
         warped = align(&warped, rendered, reference, near.start);
     }
-    let terms = |pixel: &WarpedReference| {
+    let terms = |pixel: &WarpedPixel| {
         let [r, g, b] = pixel.difference.map(f64::from);
         if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
     };
@@ -212,29 +158,45 @@ fn warp(
         [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
     };
     let mut all = Vec::with_capacity(width * rows.len());
-    for row in rows.clone() {
-        let y = row - near.start;
+    let neighbours = Neighbours { warped: &warped, width };
+    for y in rows.start - near.start..rows.end - near.start {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
                 let apart = mean(x, y) / DIFFERENT;
-                let neighbour = |dx: isize, dy: isize| {
-                    let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
-                    let other = (x < width && y < near.len()).then(|| warped[y * width + x])?;
-                    (other.confidence > 0.0).then_some(other.place)
-                };
-                let jump = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
-                    let (Some(a), Some(b)) = (a, b) else { return 0.0 };
-                    (0..2).map(|i| (a[i] + b[i] - 2.0 * own.place[i]).powi(2)).sum::<f32>()
-                };
-                let jumped = jump(neighbour(-1, 0), neighbour(1, 0))
-                    + jump(neighbour(0, -1), neighbour(0, 1));
+                let jumped = neighbours.jumped(x, y);
                 own.confidence *= (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (JUMP * JUMP));
             }
             all.push(own);
         }
     }
     all
+}
+
+/// Where neighbouring pixels were found in a reference.
+struct Neighbours<'a> {
+    warped: &'a [WarpedPixel],
+    width: usize,
+}
+
+impl Neighbours<'_> {
+    fn place(&self, x: usize, y: usize, dx: isize, dy: isize) -> Option<[f32; 2]> {
+        let (x, y) = (x.checked_add_signed(dx)?, y.checked_add_signed(dy)?);
+        let other = (x < self.width).then(|| self.warped.get(y * self.width + x))??;
+        (other.confidence > 0.0).then_some(other.place)
+    }
+
+    /// How far a pixel was found from the middle of its neighbours, squared: to both sides, and
+    /// above and below.
+    fn jumped(&self, x: usize, y: usize) -> f32 {
+        let own = self.warped[y * self.width + x].place;
+        let apart = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
+            let (Some(a), Some(b)) = (a, b) else { return 0.0 };
+            (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
+        };
+        apart(self.place(x, y, -1, 0), self.place(x, y, 1, 0))
+            + apart(self.place(x, y, 0, -1), self.place(x, y, 0, 1))
+    }
 }
 
 /// A view with what references know of it, as a reference-based refiner takes it: with its

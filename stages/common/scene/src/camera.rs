@@ -2,7 +2,7 @@ use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::Distortion;
+use crate::{Distortion, Pose};
 
 /// A camera's inside, in pixels: a pinhole, and how its lens isn't one.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -61,7 +61,7 @@ pub struct Camera {
     pub intrinsics: Intrinsics,
     /// `[R | t]`, row by row: camera axes (x right, y up, looking along -z) and centre in world
     /// space.
-    pub camera_to_world: [[f64; 4]; 3],
+    pub camera_to_world: Pose,
 }
 
 /// A half-line with a direction of unit length.
@@ -77,6 +77,27 @@ impl CameraRay {
     /// The point at distance `t`.
     pub fn at(&self, t: f64) -> DVec3 {
         self.origin + t * self.direction
+    }
+}
+
+/// The rays of a camera.
+#[derive(Clone, Copy, Debug)]
+pub struct CameraRays {
+    intrinsics: Intrinsics,
+    origin: DVec3,
+    /// Of the pinhole: direction of image position (0, 0), and what one pixel to the right or down
+    /// adds; not of unit length.
+    corner: DVec3,
+    right: DVec3,
+    down: DVec3,
+}
+
+impl CameraRays {
+    /// The ray through image position (x, y), in pixels from the top left corner.
+    pub fn ray(&self, x: f64, y: f64) -> CameraRay {
+        let [u, v] = self.intrinsics.undistort([x, y]);
+        let direction = self.corner + u * self.right + v * self.down;
+        CameraRay { origin: self.origin, direction: direction / direction.length() }
     }
 }
 
@@ -171,13 +192,22 @@ impl Camera {
         -self.rotation().z_axis.normalize()
     }
 
+    /// Its rays, for many places of its image.
+    pub fn rays(&self) -> CameraRays {
+        let (k, r) = (self.intrinsics, self.rotation());
+        CameraRays {
+            intrinsics: k,
+            origin: self.centre(),
+            corner: r * DVec3::new(-k.cx / k.fx, k.cy / k.fy, -1.0),
+            right: r.x_axis / k.fx,
+            down: -r.y_axis / k.fy,
+        }
+    }
+
     /// The ray through image position (x, y), in pixels from the top left corner; (i + 0.5, j +
     /// 0.5) is a pixel's centre.
     pub fn ray(&self, x: f64, y: f64) -> CameraRay {
-        let k = &self.intrinsics;
-        let [x, y] = k.undistort([x, y]);
-        let direction = DVec3::new((x - k.cx) / k.fx, -(y - k.cy) / k.fy, -1.0);
-        CameraRay { origin: self.centre(), direction: (self.rotation() * direction).normalize() }
+        self.rays().ray(x, y)
     }
 
     /// Where a world point is seen: (x, y, depth). `None` on or behind the camera's plane, and
@@ -267,7 +297,6 @@ mod tests {
 
     fn camera(axis: DVec3, angle: f64, centre: DVec3) -> Camera {
         let r = DMat3::from_axis_angle(axis.normalize(), angle);
-        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
         Camera {
             name: "c".into(),
             intrinsics: Intrinsics {
@@ -279,7 +308,7 @@ mod tests {
                 cy: 12.5,
                 distortion: Distortion::default(),
             },
-            camera_to_world: [row(0), row(1), row(2)],
+            camera_to_world: crate::pose_of(r, centre),
         }
     }
 

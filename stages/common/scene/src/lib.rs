@@ -29,12 +29,14 @@
 
 mod camera;
 mod lens;
+mod pose;
 mod space;
 mod views;
 mod warp;
 
-pub use camera::{Camera, CameraError, CameraRay, Intrinsics, common_direction};
+pub use camera::{Camera, CameraError, CameraRay, CameraRays, Intrinsics, common_direction};
 pub use lens::Distortion;
+pub use pose::{Pose, looking_at, pose_of};
 pub use space::{Frustum, Space};
 pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Surface, Visibility};

@@ -2,6 +2,8 @@ use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::{Bounds, Pose};
+
 /// How a field sees the world: what it keeps in its unit cube.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "lowercase", deny_unknown_fields)]
@@ -25,7 +27,7 @@ pub enum Space {
 #[serde(deny_unknown_fields)]
 pub struct Frustum {
     /// Axes and centre of the virtual camera, as of any camera.
-    pub camera_to_world: [[f64; 4]; 3],
+    pub camera_to_world: Pose,
     /// Smallest slopes, X/Z (x to the right) and Y/Z (y up).
     pub min: [f64; 2],
     /// Largest slopes.
@@ -70,5 +72,30 @@ impl Frustum {
         let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
         let depth = (1.0 / self.near - 1.0 / p.z) / (1.0 / self.near - 1.0 / self.far);
         DVec3::new((p.x / p.z - self.min[0]) / side, (p.y / p.z - self.min[1]) / side, depth)
+    }
+
+    /// The world point at a place in the unit cube.
+    pub fn to_world(&self, place: DVec3) -> DVec3 {
+        let side = (self.max[0] - self.min[0]).max(self.max[1] - self.min[1]);
+        let depth = 1.0 / (1.0 / self.near - place.z * (1.0 / self.near - 1.0 / self.far));
+        let [x, y] = [0, 1].map(|i| (place[i] * side + self.min[i]) * depth);
+        self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
+    }
+}
+
+impl Bounds {
+    /// A world point's place in the unit cube that a field keeps.
+    pub fn to_cube(&self, point: DVec3) -> DVec3 {
+        match &self.space {
+            Space::Box => (point - DVec3::from(self.min)) / self.longest_side(),
+            Space::Ndc(frustum) => frustum.to_cube(frustum.to_camera(point)),
+            Space::Contraction => {
+                let centre = 0.5 * (DVec3::from(self.min) + DVec3::from(self.max));
+                let u = (point - centre) / (0.5 * self.longest_side());
+                let length = u.length();
+                let inside = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
+                0.25 * inside * u + 0.5
+            }
+        }
     }
 }

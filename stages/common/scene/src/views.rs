@@ -1,6 +1,7 @@
 use std::collections::BTreeSet;
+use std::path::Path;
 
-use artifact::relative_path;
+use artifact::{Failure, FailureExt as _, GivenInput, relative_path};
 use pixels::{Image, Mask, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -53,10 +54,7 @@ impl View {
     }
 
     /// Its image, premultiplied RGBA, and which of its pixels count; none where it has no image.
-    pub fn read_photograph(
-        &self,
-        input: &artifact::GivenInput,
-    ) -> Result<Option<Photograph>, PixelError> {
+    pub fn read_photograph(&self, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.image else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
         let mask = self.read_mask(input, (image.width, image.height))?;
@@ -64,7 +62,7 @@ impl View {
     }
 
     /// The same at low resolution; a pixel of it counts where all that lies under it does.
-    pub fn read_lr(&self, input: &artifact::GivenInput) -> Result<Option<Photograph>, PixelError> {
+    pub fn read_lr(&self, input: &GivenInput) -> Result<Option<Photograph>, PixelError> {
         let Some(file) = &self.low_resolution else { return Ok(None) };
         let image = read_premultiplied(&input.path(file))?;
         let mask = self.mask.as_ref().map(|file| read_png(&input.path(file))).transpose()?;
@@ -75,7 +73,7 @@ impl View {
     /// Which pixels of its image, of that size, count; none where all do.
     pub fn read_mask(
         &self,
-        input: &artifact::GivenInput,
+        input: &GivenInput,
         size: (usize, usize),
     ) -> Result<Option<Mask>, PixelError> {
         self.mask.as_ref().map(|file| Mask::read(&input.path(file), size)).transpose()
@@ -249,16 +247,20 @@ impl Views {
     }
 
     /// Reads and checks the `views.json` of an input.
-    pub fn read(input: &artifact::GivenInput) -> anyhow::Result<Self> {
-        use artifact::FailureExt as _;
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] with input, file and view.
+    pub fn read(input: &GivenInput) -> Result<Self, Failure> {
         let views: Self = input.read_json(VIEWS_FILE)?;
         views.check().bad_input(input.folder().display())?;
         Ok(views)
     }
 
     /// Reads and checks the `views.json` of a folder that a run's record names.
-    pub fn of_folder(folder: &std::path::Path) -> anyhow::Result<Self> {
-        use artifact::FailureExt as _;
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] with file and view.
+    pub fn of_folder(folder: &Path) -> Result<Self, Failure> {
         let path = folder.join(VIEWS_FILE);
         let bytes = std::fs::read(&path).bad_input(path.display())?;
         let views: Self = serde_json::from_slice(&bytes).bad_input(path.display())?;
@@ -299,7 +301,7 @@ impl Views {
 /// Refuses paths that leave the folder, or that would do something to a terminal where they are
 /// printed.
 fn check_path(path: &str) -> Result<(), ViewsError> {
-    relative_path(path).map_err(ViewsError::Path)?;
+    relative_path(path).map_err(|e| ViewsError::Path(e.to_string()))?;
     if path.contains(char::is_control) {
         Err(ViewsError::Path(format!("{path:?} has control characters")))
     } else {

@@ -127,11 +127,10 @@ mod tests {
 
     fn camera(centre: DVec3, turn: f64) -> Camera {
         let r = DMat3::from_axis_angle(DVec3::Y, turn);
-        let row = |i: usize| [r.x_axis[i], r.y_axis[i], r.z_axis[i], centre[i]];
         Camera {
             name: "c".into(),
             intrinsics: Intrinsics::from_angle_x(64, 48, 0.9),
-            camera_to_world: [row(0), row(1), row(2)],
+            camera_to_world: crate::pose_of(r, centre),
         }
     }
 

@@ -1,0 +1,59 @@
+use artifact::{Context, Failure};
+use pixels::psnr_of;
+use refinement::{
+    Guidance, Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
+    RefinerTraining, WEIGHTS_FILE,
+};
+
+use crate::examples::{Examples, lr_observations};
+use crate::steps::train;
+use crate::{CompactParams, say};
+
+/// Trains our network by internal learning.
+pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {
+    if net.patch_size % 2 == 1 {
+        return Err(Failure::Usage(format!(
+            "parameter patch_size: {} is odd; an even number is expected",
+            net.patch_size
+        ))
+        .into());
+    }
+    let own = lr_observations(context)?;
+    let examples = Examples::read(context.input("views")?, context.input("truth")?, own.as_ref())?;
+    if net.references_per_view > 0 && examples.training.len() < 2 {
+        return Err(Failure::BadInput(
+            "input views: one view has no others for references".to_owned(),
+        )
+        .into());
+    }
+    let architecture = RefinerArchitecture {
+        channels: net.features,
+        blocks: net.blocks,
+        guidance: (net.references_per_view > 0)
+            .then_some(Guidance { occlusion: net.occlusion, alignment: net.alignment }),
+    };
+    let options = RefinerTraining {
+        steps: net.steps,
+        batch: net.batch as usize,
+        square: net.patch_size as usize,
+        references: net.references_per_view as usize,
+        rate: net.rate,
+        seed,
+    };
+    let mut trainer = RefinerTrainer::new(Refiner::new(architecture, seed)?, options)?;
+    train(context, options.steps, &mut trainer, &examples.training, |error| {
+        format!("{:.2} dB", psnr_of(error))
+    })?;
+    let scores = trainer.score(&examples.left_out, &examples.training)?;
+    trainer.refiner().write(&context.output_path(WEIGHTS_FILE)?)?;
+    let file = RefinerFile {
+        network: Network::Compact(architecture),
+        strength: scores.strength,
+        rendered_psnr: scores.rendered_psnr,
+        refined_psnr: scores.refined_psnr,
+        trusted: scores.confidence,
+        agreeing: own.is_some(),
+    };
+    context.write_json(REFINER_FILE, &file)?;
+    say(context, "views it hasn't seen", &file)
+}

@@ -1,0 +1,111 @@
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Parameters of `train-refine`.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct Params {
+    /// Kind of network: ours, or the paper's, which takes weeks on a CPU.
+    #[schemars(extend("x-group" = "network"))]
+    pub net: Net,
+    /// Seed of all random numbers.
+    #[schemars(extend("x-group" = "sampling"))]
+    pub seed: u64,
+}
+
+/// The networks, each with its own parameters.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Net {
+    /// Ours: small, trained by internal learning, with or without references.
+    Compact(CompactParams),
+    /// NeRF-SR's: 30 million weights, trained on patches of HR references.
+    Paper(PaperParams),
+}
+
+impl Default for Net {
+    fn default() -> Self {
+        Self::Compact(CompactParams::default())
+    }
+}
+
+/// Parameters of our network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct CompactParams {
+    /// Steps of training.
+    #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
+    pub steps: u64,
+    /// Patches in a step.
+    #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
+    pub batch: u32,
+    /// Pixels along a patch's side; an even number.
+    #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
+    pub patch_size: u32,
+    /// Highest learning rate.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
+    pub rate: f64,
+    /// Features of the hidden layers.
+    #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
+    pub features: u32,
+    /// Residual blocks, of two layers each.
+    #[schemars(range(min = 0, max = 64), extend("x-group" = "network"))]
+    pub blocks: u32,
+    /// References that each view gets while the network learns: as many as it will have when views
+    /// are refined. 0 trains a network without references.
+    #[schemars(range(min = 0, max = 64), extend("x-group" = "data"))]
+    pub references_per_view: u32,
+    /// A reference shows only points that it sees by its own depth. Without this, it also shows
+    /// points that something hides; for comparisons.
+    #[schemars(extend("x-group" = "data"))]
+    pub occlusion: bool,
+    /// Moves warped references by up to two pixels to fit the render; for comparisons.
+    #[schemars(extend("x-group" = "data"))]
+    pub alignment: bool,
+}
+
+impl Default for CompactParams {
+    fn default() -> Self {
+        Self {
+            steps: 4_000,
+            batch: 8,
+            patch_size: 64,
+            rate: 1e-3,
+            features: 32,
+            blocks: 4,
+            references_per_view: 0,
+            occlusion: true,
+            alignment: false,
+        }
+    }
+}
+
+/// Parameters of the paper's network, with the published settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(default, deny_unknown_fields)]
+pub struct PaperParams {
+    /// Steps of training.
+    #[schemars(range(min = 1), extend("x-group" = "optimiser"))]
+    pub steps: u64,
+    /// Patches in a step.
+    #[schemars(range(min = 1, max = 4096), extend("x-group" = "sampling"))]
+    pub batch: u32,
+    /// Pixels along a patch's side; a multiple of 8.
+    #[schemars(range(min = 8, max = 1024), extend("x-group" = "sampling"))]
+    pub patch_size: u32,
+    /// Highest learning rate.
+    #[schemars(range(min = 0.0, max = 1.0), extend("x-group" = "optimiser"))]
+    pub rate: f64,
+    /// Features of the first layer.
+    #[schemars(range(min = 1, max = 512), extend("x-group" = "network"))]
+    pub features: u32,
+    /// Reference patches that a patch gets.
+    #[schemars(range(min = 1, max = 64), extend("x-group" = "data"))]
+    pub patches: u32,
+}
+
+impl Default for PaperParams {
+    fn default() -> Self {
+        Self { steps: 46_875, batch: 32, patch_size: 64, rate: 5e-4, features: 128, patches: 8 }
+    }
+}
