@@ -131,9 +131,10 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     assert!(mean["low_resolution"]["psnr"].as_f64().unwrap() > 19.0, "{mean}");
     let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
     assert!(
-        page.contains("render, 64 px")
+        page.contains("\"width\":64,")
             && page.contains("PSNR at LR")
-            && !page.contains("ground truth"),
+            && page.contains("\"kind\":\"low-resolution\"")
+            && !page.contains("\"kind\":\"ground-truth\""),
         "no such page"
     );
 }
