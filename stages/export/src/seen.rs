@@ -90,13 +90,11 @@ impl SeenView {
         pixels: Range<usize>,
     ) -> anyhow::Result<()> {
         let width = self.intrinsics.width as usize;
+        let (camera_rays, background) = (camera.rays(), [background.shown(); 3]);
         let (rays, to_z): (Vec<Ray>, Vec<f32>) = pixels
             .map(|i| {
-                let ray = camera.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
-                let [origin, direction] =
-                    [ray.origin, ray.direction].map(|v| v.as_vec3().to_array());
-                let background = [background.shown(); 3];
-                (Ray { origin, direction, background }, camera.depth_per_distance(&ray) as f32)
+                let ray = camera_rays.ray((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
+                (Ray::new(&ray, background), camera.depth_per_distance(&ray) as f32)
             })
             .unzip();
         let rendered = field.render(&rays).map_err(fields::rendering_failure)?;

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use artifact::{Context, Failure, GivenInput};
-use radiance::{FIELD_FILE, FieldFile};
+use radiance::FieldFile;
 
 /// A field to go on from.
 pub(crate) struct InitField<'a> {
@@ -13,10 +13,7 @@ pub(crate) struct InitField<'a> {
 impl<'a> InitField<'a> {
     /// Reads what it says of itself, which must be what is to be trained.
     pub(crate) fn read(input: &'a GivenInput, wanted: &FieldFile) -> anyhow::Result<Self> {
-        let file: FieldFile = input.read_json(FIELD_FILE)?;
-        file.check().map_err(|reason| {
-            Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
-        })?;
+        let file = fields::read_file(input)?;
         let differs = [
             ("lies elsewhere; train both from one prep", file.bounds != wanted.bounds),
             (

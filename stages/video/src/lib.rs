@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, RunNode, RunRecord, Stage};
+use artifact::{Context, Failure, Input, Output, RunNode, RunRecord, Stage, folders_of};
 use pixels::{
     Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png,
 };
@@ -63,27 +63,12 @@ impl Stage for Video {
                 Failure::BadInput("run.json: nothing in it rendered views".to_owned()).into()
             );
         }
-        for (i, node) in rendered.iter().enumerate() {
-            let prefix = if rendered.len() == 1 {
-                String::new()
-            } else {
-                format!("{}-{}/", i + 1, folder_name(node))
-            };
+        for (node, prefix) in rendered.iter().zip(folders_of(&rendered)) {
             film(context, params, &node.folder, &prefix)
                 .with_context(|| format!("{} {}", node.stage, node.point))?;
         }
         Ok(())
     }
-}
-
-/// What tells a sweep's film from the others: its values, as far as a folder can have them in its
-/// name.
-fn folder_name(node: &RunNode) -> String {
-    let text = if node.point.is_empty() { &node.stage } else { &node.point };
-    text.replace(", ", "-")
-        .chars()
-        .map(|c| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' })
-        .collect()
 }
 
 /// Frames, and the film where that can be made.

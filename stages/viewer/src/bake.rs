@@ -8,7 +8,6 @@ use scene::{Bounds, Camera};
 
 use crate::bricks::{Bricks, SIDE, VOXELS};
 use crate::source::Source;
-use crate::space::to_world;
 use crate::view::{NUMBERS, fit};
 use crate::visibility::seen_by;
 
@@ -194,7 +193,7 @@ impl<S: Source> Colours<'_, S> {
 
     /// Directions from some of the cameras that see a place to it, unit length in the world.
     fn directions(&self, place: [f32; 3], seen: u64) -> Vec<[f32; 3]> {
-        let point = to_world(self.bounds, DVec3::from(place.map(f64::from)));
+        let point = in_box(self.bounds, DVec3::from(place.map(f64::from)));
         let seeing: Vec<&Camera> = self
             .cameras
             .iter()
@@ -230,6 +229,11 @@ fn shade<S: Source>(
         share * samples.iter().zip(&weights).map(|(s, w)| w * colour(s)).sum::<f32>()
     });
     (colour, view)
+}
+
+/// The world point at a place of the unit cube of a box.
+pub(crate) fn in_box(bounds: &Bounds, place: DVec3) -> DVec3 {
+    DVec3::from(bounds.min) + bounds.longest_side() * place
 }
 
 #[cfg(test)]

@@ -12,7 +12,8 @@
 //! * `overview`: where the view starts, and around what it turns.
 //!
 //! Places are those of the field's unit cube ([`scene::Space`]), and the shader maps its rays there
-//! as the field does. Only boxes are shown: fields of the other spaces are too hazy to be baked so.
+//! as the field does for a box. The other spaces are refused: their fields are too hazy to be baked
+//! so.
 
 mod atlas;
 mod bake;
@@ -20,7 +21,6 @@ mod bricks;
 mod overview;
 mod page;
 mod source;
-mod space;
 mod view;
 mod visibility;
 
@@ -29,10 +29,11 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{
     Context, Failure, FailureExt as _, GivenInput, Input, Output, RunNode, RunRecord, Stage,
+    folders_of,
 };
 use base64::Engine as _;
 use pixels::{Filter, encode_png, resize_pillow};
-use radiance::{FIELD_FILE, Field, FieldFile, FieldModel};
+use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -84,34 +85,19 @@ impl Stage for Viewer {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let run: RunRecord = context.input("run")?.read_json("run.json")?;
-        run.check().map_err(|e| Failure::BadInput(format!("run.json: {e}")))?;
+        run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let fields: Vec<&RunNode> =
             run.nodes.iter().filter(|n| n.is_shown && n.kind == "field").collect();
         if fields.is_empty() {
             let message = "run.json: nothing that it shows is a field; give `run: train-ss`";
             return Err(Failure::BadInput(message.to_owned()).into());
         }
-        for (i, node) in fields.iter().enumerate() {
-            let prefix = if fields.len() == 1 {
-                String::new()
-            } else {
-                format!("{}-{}/", i + 1, folder_name(node))
-            };
+        for (node, prefix) in fields.iter().zip(folders_of(&fields)) {
             show(context, params, &run, node, &prefix)
                 .with_context(|| format!("{} {}", node.stage, node.point).trim_end().to_owned())?;
         }
         Ok(())
     }
-}
-
-/// What tells a sweep's page from the others: its values, as far as a folder can have them in its
-/// name.
-fn folder_name(node: &RunNode) -> String {
-    let text = if node.point.is_empty() { &node.stage } else { &node.point };
-    text.replace(", ", "-")
-        .chars()
-        .map(|c| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' })
-        .collect()
 }
 
 /// Writes the page of one field.
@@ -142,7 +128,8 @@ fn show(
         bricks: atlas.bricks,
         components: atlas.components.for_shader(),
         background: file.background.shown(),
-        bounds: page_bounds(file.bounds),
+        // A box's faces alone limit rays: people come nearer than cameras did, and go farther away.
+        bounds: Bounds { near: 0.0, far: 1e30, ..file.bounds },
         centre: centre.to_array(),
         size,
         up: up.to_array(),
@@ -168,22 +155,10 @@ fn check_space(bounds: &Bounds) -> Result<(), Failure> {
     )))
 }
 
-/// What limits the page's rays: of a box its faces alone, since people come nearer than cameras did
-/// and go farther away.
-fn page_bounds(bounds: Bounds) -> Bounds {
-    match bounds.space {
-        Space::Box => Bounds { near: 0.0, far: 1e30, ..bounds },
-        Space::Ndc(_) | Space::Contraction => bounds,
-    }
-}
-
 /// All fields of an artifact.
 fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
     let input = GivenInput::open("field", folder)?;
-    let file: FieldFile = input.read_json(FIELD_FILE)?;
-    file.check().map_err(|reason| {
-        Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
-    })?;
+    let file = fields::read_file(&input)?;
     let FieldModel::Grid(architecture) = file.field else {
         let message = "the paper's field can't be baked; train with `field: grid` to view it";
         return Err(Failure::BadInput(message.to_owned()).into());

@@ -2,18 +2,17 @@
 
 use glam::{DMat3, DVec3};
 use nalgebra::{Matrix3, SymmetricEigen};
-use scene::{Bounds, Camera, Space, common_direction};
+use scene::{Bounds, Camera, common_direction};
 
-use crate::bake::Volume;
-use crate::space::to_world;
+use crate::bake::{Volume, in_box};
 
 /// Sine of the angle above the horizon from which things look best.
 const FROM_ABOVE: f64 = 0.4;
 
-/// Middle and extent of a scene, in scene units: the box of a contraction, else where voxels lie.
+/// Middle and extent of a scene, in scene units: where voxels lie, or the box without any.
 pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
     let of_box = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    if bounds.space == Space::Contraction || volume.voxels.is_empty() {
+    if volume.voxels.is_empty() {
         return (of_box, bounds.longest_side());
     }
     let resolution = volume.resolution as f64;
@@ -22,7 +21,7 @@ pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
         .iter()
         .map(|v| {
             let place = DVec3::from(v.place.map(|c| (f64::from(c) + 0.5) / resolution));
-            to_world(bounds, place)
+            in_box(bounds, place)
         })
         .collect();
     let at = |mut values: Vec<f64>, share: f64| {

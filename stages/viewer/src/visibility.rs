@@ -3,7 +3,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use radiance::{Ray, RayMap, clip};
+use radiance::{Ray, clip};
 use rayon::prelude::*;
 use scene::{Bounds, Camera};
 
@@ -39,15 +39,11 @@ pub(crate) fn seen_by(
     let seen: Vec<AtomicU64> = opacity.iter().map(|_| AtomicU64::new(0)).collect();
     let distances = bricks.distances();
     for (bit, camera) in cameras.iter().enumerate() {
-        let k = camera.intrinsics;
+        let (k, rays) = (camera.intrinsics, camera.rays());
         (0..k.height).into_par_iter().for_each(|row| {
             for column in 0..k.width {
-                let ray = camera.ray(f64::from(column) + 0.5, f64::from(row) + 0.5);
-                let ray = Ray {
-                    origin: ray.origin.as_vec3().to_array(),
-                    direction: ray.direction.as_vec3().to_array(),
-                    background: [0.0; 3],
-                };
+                let ray = rays.ray(f64::from(column) + 0.5, f64::from(row) + 0.5);
+                let ray = Ray::new(&ray, [0.0; 3]);
                 let march = March { bricks, distances: &distances, opacity };
                 march.look(bounds, &ray, |voxel| {
                     // Bits are only ever added, so their order doesn't matter.
@@ -71,11 +67,7 @@ impl March<'_> {
     fn look(&self, bounds: &Bounds, ray: &Ray, mut sees: impl FnMut(usize)) {
         let ray = clip(bounds, ray);
         let step = 1.0 / self.bricks.resolution as f32;
-        let per_brick = match ray.map {
-            RayMap::Straight { .. } => SIDE as f32 * step,
-            // Through a contraction a place moves up to twice as fast as t.
-            RayMap::Contracted { .. } => 0.5 * SIDE as f32 * step,
-        };
+        let per_brick = SIDE as f32 * step;
         let (mut t, mut through) = (ray.enter + 0.5 * step, 1.0f32);
         while t < ray.leave && through > SEEN {
             let place = ray.position(t).map(|x| x * self.bricks.resolution as f32 - 0.5);

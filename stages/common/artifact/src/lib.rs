@@ -90,7 +90,9 @@ pub use printable::printable;
 pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
 pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
 pub use rules::{GivenInputs, Rule, RuleError};
-pub use run_record::{FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode};
+pub use run_record::{
+    FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, folders_of,
+};
 pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};

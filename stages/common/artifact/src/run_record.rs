@@ -146,6 +146,20 @@ fn named(input: Option<&str>) -> String {
     input.map_or_else(String::new, |input| format!(", input {input},"))
 }
 
+/// Folders for what a sink makes of each of some nodes, with `/` at the end: none for a single one,
+/// else numbered and named by the sweep's values, as far as a folder can have them in its name.
+pub fn folders_of(nodes: &[&RunNode]) -> Vec<String> {
+    if nodes.len() == 1 {
+        return vec![String::new()];
+    }
+    let name = |node: &RunNode| -> String {
+        let text = if node.point.is_empty() { &node.stage } else { &node.point };
+        let plain = |c: char| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' };
+        text.replace(", ", "-").chars().map(plain).collect()
+    };
+    (1..).zip(nodes).map(|(number, node)| format!("{number}-{}/", name(node))).collect()
+}
+
 impl RunRecord {
     /// Says what is wrong with a list whose inputs don't name earlier nodes.
     pub fn check(&self) -> Result<(), RunRecordError> {
@@ -200,5 +214,28 @@ impl RunRecord {
             }
         }
         (0..self.nodes.len()).filter(|&i| wanted[i]).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sweeps_folders_are_numbered_and_named() {
+        let node = |point: &str| -> RunNode {
+            serde_json::from_value(serde_json::json!({
+                "stage": "train-ss", "point": point, "kind": "field", "key": "", "output": "",
+                "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 0.0,
+                "threads": 1,
+            }))
+            .unwrap()
+        };
+        let nodes = [node("rays=3, scale=2"), node("data=a/../b"), node("")];
+        assert_eq!(
+            folders_of(&nodes.each_ref()),
+            ["1-rays=3-scale=2/", "2-data=a_.._b/", "3-train-ss/"]
+        );
+        assert_eq!(folders_of(&[&nodes[0]]), [""]);
     }
 }

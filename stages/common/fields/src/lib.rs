@@ -36,13 +36,20 @@ impl Members {
     /// [`Failure::BadInput`] where the input can't be read, [`Failure::Usage`] where the device
     /// can't be used.
     pub fn read(input: &GivenInput, device: &str) -> Result<Self, Failure> {
-        let file: FieldFile = input.read_json(FIELD_FILE)?;
-        file.check().map_err(|reason| {
-            Failure::BadInput(format!("{}: {reason}", input.path(FIELD_FILE).display()))
-        })?;
+        let file = read_file(input)?;
         let fields = read_all(&file, input, device)?;
         Ok(Self { file, fields })
     }
+}
+
+/// Reads and checks what an input says of its fields.
+///
+/// # Errors
+/// [`Failure::BadInput`] with file and number.
+pub fn read_file(input: &GivenInput) -> Result<FieldFile, Failure> {
+    let file: FieldFile = input.read_json(FIELD_FILE)?;
+    file.check().bad_input(input.path(FIELD_FILE).display())?;
+    Ok(file)
 }
 
 /// The mean of what all members see. The distance that half of the light stops at is the middle one

@@ -16,15 +16,9 @@ uniform vec3 atlas_size;    // of both textures, in texels
 uniform float resolution;   // voxels along the cube's side
 uniform vec3 components[36];  // four times nine spherical harmonics' red, green and blue
 
-// The field's space: how the world is mapped to its unit cube.
-const int BOX = 0, NDC = 1, CONTRACTION = 2;
-uniform int space;
+// The box that the unit cube holds, scaled by its longest side.
 uniform vec3 box_min, box_max;
-uniform vec2 range;               // distances between which there is anything
-uniform mat3 frustum_rotation;    // world to the virtual camera of NDC, whose depth is positive
-uniform vec3 frustum_centre;
-uniform vec4 frustum_slopes;      // smallest x and y, largest x and y
-uniform vec2 frustum_depths;
+uniform vec2 range;  // distances between which there is anything
 
 // The camera: OpenGL's axes; pixels from the top left corner.
 uniform mat3 rotation;
@@ -48,15 +42,11 @@ const int MOST_STEPS = 4096;
 
 int reads = 0;
 
-// A ray in the cube, by a parameter t: see RayMap in stages/common/radiance/src/ray.rs.
+// A ray in the cube, by a parameter t: its distance over the box's longest side.
 struct CubeRay {
   vec3 origin, direction;
-  float enter, leave;
-  // Distance: start + scale * t / (1 - bend * t), or start + scale * sinh(4t) where it is contracted.
-  float start, scale, bend;
+  float enter, leave, side;
 };
-
-const CubeRay MISS = CubeRay(vec3(0), vec3(0), 0.0, 0.0, 0.0, 1.0, 0.0);
 
 // Limits [enter, leave] to where offset + slope * x >= 0.
 void clip_to(float offset, float slope, inout vec2 part) {
@@ -65,7 +55,7 @@ void clip_to(float offset, float slope, inout vec2 part) {
   else if (offset < 0.0) part = vec2(1.0, 0.0);
 }
 
-CubeRay through_box(vec3 from, vec3 along) {
+CubeRay into_cube(vec3 from, vec3 along) {
   float side = max(max(box_max.x - box_min.x, box_max.y - box_min.y), box_max.z - box_min.z);
   vec3 origin = (from - box_min) / side, extent = (box_max - box_min) / side;
   vec2 part = range / side;
@@ -73,75 +63,14 @@ CubeRay through_box(vec3 from, vec3 along) {
     clip_to(origin[i], along[i], part);
     clip_to(extent[i] - origin[i], -along[i], part);
   }
-  return CubeRay(origin, along, part.x, part.y, 0.0, side, 0.0);
+  return CubeRay(origin, along, part.x, part.y, side);
 }
 
-vec3 frustum_to_cube(vec3 p) {
-  vec2 low = frustum_slopes.xy, wide = frustum_slopes.zw - low;
-  float front = 1.0 / frustum_depths.x, back = 1.0 / frustum_depths.y;
-  return vec3((p.xy / p.z - low) / max(wide.x, wide.y), (front - 1.0 / p.z) / (front - back));
-}
-
-CubeRay through_frustum(vec3 from, vec3 along) {
-  vec3 o = frustum_rotation * (from - frustum_centre), d = frustum_rotation * along;
-  vec2 part = vec2(range.x, FAR);
-  clip_to(o.z - frustum_depths.x, d.z, part);
-  clip_to(frustum_depths.y - o.z, -d.z, part);
-  for (int i = 0; i < 2; i++) {
-    float low = frustum_slopes[i], high = frustum_slopes[i + 2];
-    clip_to(o[i] - low * o.z, d[i] - low * d.z, part);
-    clip_to(high * o.z - o[i], high * d.z - d[i], part);
-  }
-  if (part.x >= part.y || part.y >= FAR) return MISS;
-  vec3 first = o + part.x * d, last = o + part.y * d;
-  vec3 start = frustum_to_cube(first), way = frustum_to_cube(last) - start;
-  float len = length(way);
-  float c = len * last.z / (part.y - part.x);
-  return CubeRay(start, way / len, 0.0, len, part.x, first.z / c, d.z / c);
-}
-
-float asinh4(float x) { return 0.25 * sign(x) * log(abs(x) + sqrt(x * x + 1.0)); }
-
-CubeRay through_contraction(vec3 from, vec3 along) {
-  vec3 sides = box_max - box_min;
-  float radius = 0.5 * max(max(sides.x, sides.y), sides.z);
-  vec3 own = (from - 0.5 * (box_min + box_max)) / radius;
-  float to_nearest = -dot(own, along);
-  vec3 nearest = own + to_nearest * along;
-  float radii = max(length(nearest), 1.0);
-  float enter = asinh4((range.x / radius - to_nearest) / radii);
-  float leave = asinh4((range.y / radius - to_nearest) / radii);
-  return CubeRay(nearest, along, enter, leave, to_nearest * radius, radii * radius, radii);
-}
-
-CubeRay into_cube(vec3 from, vec3 along) {
-  if (space == BOX) return through_box(from, along);
-  if (space == NDC) return through_frustum(from, along);
-  return through_contraction(from, along);
-}
-
-float sinh4(float t) { float e = exp(4.0 * t); return 0.5 * (e - 1.0 / e); }
-
-vec3 place_at(CubeRay ray, float t) {
-  if (space != CONTRACTION) return ray.origin + t * ray.direction;
-  vec3 u = ray.origin + ray.bend * sinh4(t) * ray.direction;
-  float len = length(u);
-  return 0.5 + 0.25 * u * (len > 1.0 ? (2.0 - 1.0 / len) / len : 1.0);
-}
-
-float distance_at(CubeRay ray, float t) {
-  if (space == CONTRACTION) return ray.start + ray.scale * sinh4(t);
-  return ray.start + ray.scale * t / (1.0 - ray.bend * t);
-}
+vec3 place_at(CubeRay ray, float t) { return ray.origin + t * ray.direction; }
 
 // How far t goes until a ray leaves the empty bricks around, at least: `low` and `high` are their
 // corners in voxels.
 float way_out(CubeRay ray, vec3 at, vec3 low, vec3 high) {
-  if (space == CONTRACTION) {
-    // A place moves at most twice as fast as t.
-    vec3 free = min(at - low, high - at);
-    return 0.5 * min(min(free.x, free.y), free.z) / resolution;
-  }
   vec3 speed = ray.direction * resolution;
   vec3 wall = mix(low, high, step(0.0, speed));
   vec3 way = mix((wall - at) / speed, vec3(FAR), lessThan(abs(speed), vec3(1e-6)));
@@ -235,7 +164,7 @@ void main() {
   } else if (mode == OPACITY) {
     shown = vec4(vec3(opacity), 1.0);
   } else if (mode == DEPTH) {
-    float z = -own.z * distance_at(ray, seen.median);
+    float z = -own.z * ray.side * seen.median;
     // Even in disparity, so that what is near has most colours.
     vec2 ends = 1.0 / depth_range;
     vec3 colour = of_depth((1.0 / z - ends.x) / (ends.y - ends.x));

@@ -4,7 +4,6 @@ const BRICK = 8;
 // With the first neighbours behind, between which and the last own voxels places are interpolated.
 const TILE = BRICK + 1;
 const MODES = { colour: 0, depth: 1, opacity: 2, reads: 3 };
-const SPACES = { box: 0, ndc: 1, contraction: 2 };
 
 /** Bytes of a base64 text, inflated. */
 async function inflated(text) {
@@ -94,7 +93,7 @@ class Volume {
     gl.useProgram(program);
     this.at = (name) => gl.getUniformLocation(program, name);
     this.setVolume(unpacked(bytes, scene.resolution, scene.bricks, most));
-    this.setSpace(scene.bounds);
+    this.setBox(scene.bounds);
   }
 
   setVolume({ side, size, bricks, colours, views }) {
@@ -123,20 +122,11 @@ class Volume {
     gl.uniform1i(this.at(name), unit);
   }
 
-  setSpace({ min, max, near, far, space }) {
+  setBox({ min, max, near, far }) {
     const { gl } = this;
-    const kind = typeof space === "string" ? space : Object.keys(space)[0];
-    gl.uniform1i(this.at("space"), SPACES[kind]);
     gl.uniform3fv(this.at("box_min"), min);
     gl.uniform3fv(this.at("box_max"), max);
     gl.uniform2f(this.at("range"), near, far);
-    if (kind !== "ndc") return;
-    const { camera_to_world: m, min: low, max: high, near: front, far: back } = space.ndc;
-    // Rows of the inverse rotation are columns of the pose; depth is -z. Column by column:
-    gl.uniformMatrix3fv(this.at("frustum_rotation"), false, m.flatMap((row) => [row[0], row[1], -row[2]]));
-    gl.uniform3fv(this.at("frustum_centre"), m.map((row) => row[3]));
-    gl.uniform4f(this.at("frustum_slopes"), low[0], low[1], high[0], high[1]);
-    gl.uniform2f(this.at("frustum_depths"), front, back);
   }
 
   /**
