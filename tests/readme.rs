@@ -86,6 +86,7 @@ fn every_command_plans() {
                 assert!(
                     line.is_empty()
                         || line.starts_with("make ")
+                        || line.starts_with("cd ")
                         || line.starts_with("export ")
                         || line.starts_with("nerf-sr-remote ")
                         || line.contains("--help")
