@@ -15,6 +15,7 @@ use crate::limits::capped;
 use crate::remedy::Remedy;
 use crate::session::Session;
 use crate::verbs::{self, Style};
+use crate::watch::Watch;
 
 /// Where the pipeline is looked for.
 const PIPELINE: &str = "pipeline.yaml";
@@ -115,6 +116,11 @@ enum Verb {
         /// Where pages are written [default: out beside the pipeline]
         #[arg(long, value_name = "DIR")]
         out: Option<PathBuf>,
+        /// Shows a test view and its scores from time to time while a field trains; takes 2 % of
+        /// the time at most [default view: the first]
+        #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
+            default_missing_value = "")]
+        watch: Option<String>,
         /// What a cluster wants besides: partition, account, set-up lines [default:
         /// ~/.config/nerf-sr/slurm.yaml if it is there]
         #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
@@ -307,17 +313,22 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
-        Verb::Run { what, jobs, threads, memory, keep_going, out, site } => {
+        Verb::Run { what, jobs, threads, memory, keep_going, out, watch, site } => {
+            let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
             let executor: Box<dyn Executor> = match cli.executor {
                 Choose::Local => {
                     let remedy =
                         Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
-                    Box::new(Local { budget: budget(jobs, threads, memory)?, keep_going, remedy })
+                    let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
+                    let budget = budget(jobs, threads, memory)?;
+                    Box::new(Local { budget, keep_going, remedy, watch })
                 }
                 Choose::Slurm
-                    if jobs.is_some() || threads.is_some() || memory.is_some() || keep_going =>
+                    if [jobs.is_some(), threads.is_some(), memory.is_some(), watch.is_some()]
+                        .contains(&true)
+                        || keep_going =>
                 {
-                    let problem = "--jobs, --threads, --memory and --keep-going are for \
+                    let problem = "--jobs, --threads, --memory, --keep-going and --watch are for \
                         --executor local; say `resources` in the pipeline";
                     return Err(PlanError::Usage(problem.to_owned()).into());
                 }
@@ -326,7 +337,6 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
                         .map_err(|e| PlanError::Usage(e.to_string()))?,
                 }),
             };
-            let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
             verbs::run(&session, &what.into(), &out, executor.as_ref())
         }
         Verb::Cancel { stage } => verbs::cancel(&session.store, stage.as_deref()),

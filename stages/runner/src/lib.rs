@@ -6,6 +6,7 @@
 //! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all
 //!   that they were made of.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
+//! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: hands the run's record (`recorded`) to stages that show it (the report), and puts what
 //!   they make in its place (`publish`, `aside`).
 
@@ -26,6 +27,7 @@ mod session;
 mod sink;
 mod verbs;
 mod waiting;
+mod watch;
 mod words;
 
 pub use cli::main;

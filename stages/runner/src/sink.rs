@@ -89,6 +89,7 @@ pub(crate) fn show(
         hashes: &[],
         output: &output,
         work: None,
+        from_checkpoint: false,
         device: plan.device(&sink.stage),
         threads,
         lock: None,

@@ -81,7 +81,7 @@ impl Checkpoints {
         if !path.exists() {
             return Curve::default();
         }
-        match restored(folder, &path, trainer, supervision) {
+        match restored(folder, &path, trainer, Some(supervision)) {
             Some(curve) => {
                 say(&format!("going on from step {}", trainer.steps()));
                 curve
@@ -136,6 +136,16 @@ impl Checkpoints {
 
 const CHECKPOINT: &str = "checkpoint.safetensors";
 
+/// The curve of the latest checkpoint below a work folder, with a trainer as it was then. None
+/// where there is no whole checkpoint, as while one gives way to the next.
+pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option<Curve> {
+    let files = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
+    let latest = files
+        .filter(|entry| entry.file_name() == CHECKPOINT)
+        .max_by_key(|entry| entry.metadata().ok().and_then(|metadata| metadata.modified().ok()))?;
+    restored(latest.path().parent()?, latest.path(), trainer, None)
+}
+
 fn curve_name(step: u64) -> String {
     format!("curve-{step}.json")
 }
@@ -144,16 +154,19 @@ fn kept_name(step: u64) -> String {
     format!("kept-{step}.bin")
 }
 
-/// The curve of a checkpoint's step, with trainer and supervision as they were then, where all of
-/// it is there.
+/// The curve of a checkpoint's step, with trainer and, where it is wanted, supervision as they were
+/// then, where all of it is there.
 fn restored(
     folder: &Path,
     checkpoint: &Path,
     trainer: &mut dyn FieldTrainer,
-    supervision: &mut Supersampling,
+    supervision: Option<&mut Supersampling>,
 ) -> Option<Curve> {
     let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
+    let Some(supervision) = supervision else {
+        return trainer.resume(checkpoint).then_some(curve);
+    };
     let mut kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
     let is_whole = kept.metadata().ok()?.len() == supervision.written_len() as u64;
     // A trainer that can't resume is as it was.

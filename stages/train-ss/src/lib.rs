@@ -67,6 +67,7 @@ impl Stage for TrainSs {
     type Params = Params;
     const NAME: &'static str = "train-ss";
     const SUMMARY: &'static str = "Trains a radiance field from LR images by supersampling.";
+    const FROM_CHECKPOINT: bool = true;
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
@@ -129,11 +130,18 @@ impl Stage for TrainSs {
         let mut file = FieldFile {
             format: FIELD_FORMAT,
             field: model,
-            members: params.ensemble,
+            members: if context.from_checkpoint() { 1 } else { params.ensemble },
             bounds: views.bounds,
             background: views.background,
         };
         let init = init.map(|input| InitField::read(input, &file)).transpose()?;
+        let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
+        if context.from_checkpoint() {
+            let from = init.as_ref().map(|init| (init.member(0), combine));
+            let member = Member::new(context, params.member(0), (model, from), 0, 0)?;
+            log.add(member.from_checkpoint(views.bounds)?);
+            return publish(context, &file, &log);
+        }
         let first = match (&init, combine) {
             (Some(init), Combine::Ensemble) => init.keep_beside(context, &mut file)?,
             _ => 0,
@@ -143,7 +151,6 @@ impl Stage for TrainSs {
         let compared = if params.pose_refinement { members[0].rays } else { 0 };
         let progress = context.progress("training", compared + params.rays);
         let data = TrainingData { input, references, views: &views, progress: &progress };
-        let mut log = TrainingLog { resolved: params.record(), ..TrainingLog::default() };
         let mut done = compared;
         for (index, own) in members.into_iter().enumerate() {
             // What the first member finds of poses holds for all.
@@ -161,13 +168,18 @@ impl Stage for TrainSs {
             log.add(trained);
             progress.set(done, "");
         }
-        context.write_json(FIELD_FILE, &file)?;
-        context.write_json(TRAINING_FILE, &log)?;
-        let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
-        let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
-        let summary = format!(
-            "{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB"
-        );
-        context.write_summary(&with_warnings(&summary, &log.warnings))
+        publish(context, &file, &log)
     }
+}
+
+/// Writes what lies beside the weights.
+fn publish(context: &Context, file: &FieldFile, log: &TrainingLog) -> anyhow::Result<()> {
+    context.write_json(FIELD_FILE, file)?;
+    context.write_json(TRAINING_FILE, log)?;
+    let psnr = log.curve.last().map_or(0.0, |p| p.psnr);
+    let (rays, steps, samples) = (amount(log.rays), log.steps, log.samples_per_ray);
+    let summary = format!(
+        "{rays} rays in {steps} steps, {samples:.1} samples a ray, training PSNR {psnr:.2} dB"
+    );
+    context.write_summary(&with_warnings(&summary, &log.warnings))
 }

@@ -4,10 +4,10 @@ use anyhow::Context as _;
 use artifact::{Context, Failure, GivenInput, Progress};
 use poses::Moved;
 use radiance::{FieldFile, FieldModel};
-use scene::Views;
+use scene::{Bounds, Views};
 
-use crate::checkpoint::Checkpoints;
-use crate::field_trainer::{Collapsed, average, start};
+use crate::checkpoint::{Checkpoints, read_latest};
+use crate::field_trainer::{Collapsed, FieldTrainer, average, start};
 use crate::params::Combine;
 use crate::resolve::Resolved;
 use crate::setup::supervision;
@@ -131,6 +131,18 @@ impl<'a> Member<'a> {
         Err(Failure::Numerical(format!("{said}, or let it start over: parameter restarts")).into())
     }
 
+    /// Its field and its log as the latest checkpoint has them, of whichever member that is.
+    pub(crate) fn from_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+        let work = self.context.work().context("--from-checkpoint goes with --work")?;
+        let mut trainer = self.start(&self.params, bounds)?;
+        let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
+            Failure::BadInput(format!("--work {}: no whole checkpoint is there", work.display()))
+        })?;
+        let log = curve.finish(trainer.steps(), trainer.rays_done());
+        self.write_weights(trainer, bounds)?;
+        Ok(log)
+    }
+
     /// What an earlier run finished, if anything: its weights go to the output.
     fn finished(&self) -> Option<TrainingLog> {
         let work = self.work.as_ref()?;
@@ -162,8 +174,7 @@ impl<'a> Member<'a> {
             );
             return Err(Failure::Usage(message).into());
         }
-        let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
-        let mut trainer = start(params, from, views.bounds, &context.device)?;
+        let mut trainer = self.start(params, views.bounds)?;
         let mut checkpoints = Checkpoints::new(work);
         let mut curve =
             checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
@@ -200,16 +211,27 @@ impl<'a> Member<'a> {
         log.poses =
             supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
         log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
-        trainer.finish(&self.output)?;
-        if let Some((from, Combine::AverageWeights)) = &self.from {
-            average(self.model, views.bounds, from, &self.output)
-                .context("cannot average the weights")?;
-        }
+        self.write_weights(trainer, views.bounds)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot keep the field")?;
             artifact::write_json(&work.join(DONE_LOG), &log)?;
         }
         Ok(log)
+    }
+
+    fn start(&self, params: &Resolved, bounds: Bounds) -> anyhow::Result<Box<dyn FieldTrainer>> {
+        let from = self.from.as_ref().map(|(weights, _)| weights.as_path());
+        start(params, from, bounds, &self.context.device)
+    }
+
+    /// Ends a training: writes its weights, combined with those it went on from.
+    fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
+        trainer.finish(&self.output)?;
+        if let Some((from, Combine::AverageWeights)) = &self.from {
+            average(self.model, bounds, from, &self.output)
+                .context("cannot average the weights")?;
+        }
+        Ok(())
     }
 }

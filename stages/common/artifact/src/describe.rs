@@ -38,6 +38,10 @@ pub struct Description {
     /// A sink that shows what there is, where some of it couldn't be made.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub partial: bool,
+    /// A stage that leaves checkpoints and, with `--from-checkpoint`, makes its output of the
+    /// latest.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub from_checkpoint: bool,
     /// What parameters and inputs must be together.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub rules: Vec<Rule>,

@@ -97,6 +97,7 @@ mod tests {
             environment: Vec::new(),
             sink: false,
             partial: false,
+            from_checkpoint: false,
             rules: Vec::new(),
         };
         let expected = "\

@@ -151,6 +151,7 @@ mod tests {
             environment: Vec::new(),
             sink: false,
             partial: false,
+            from_checkpoint: false,
             rules: vec![
                 Rule::new("weights are needed").when("method", methods).needs("weights"),
                 Rule::new("the scale must be whole")

@@ -48,6 +48,8 @@ pub trait Stage {
     const SINK: bool = false;
     /// Whether it shows what there is of a run, some of which failed.
     const PARTIAL: bool = false;
+    /// Whether it can make its output from a checkpoint alone ([`Context::from_checkpoint`]).
+    const FROM_CHECKPOINT: bool = false;
     /// Environment variables that change the result.
     const ENVIRONMENT: &'static [&'static str] = &[];
 
@@ -83,6 +85,7 @@ pub trait Stage {
             environment: Self::ENVIRONMENT.iter().map(|&name| name.to_owned()).collect(),
             sink: Self::SINK,
             partial: Self::PARTIAL,
+            from_checkpoint: Self::FROM_CHECKPOINT,
             rules: Self::rules(),
         }
     }
@@ -105,6 +108,9 @@ struct Arguments {
     /// Private folder that survives an interruption (checkpoints)
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
+    /// Makes the output from the latest checkpoint in --work, and works no further
+    #[arg(long, requires = "work")]
+    from_checkpoint: bool,
     /// Where to compute: cpu or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -135,6 +141,7 @@ pub struct Context {
     inputs: BTreeMap<String, GivenInput>,
     output: PathBuf,
     work: Option<PathBuf>,
+    from_checkpoint: bool,
     progress: ProgressMode,
     interrupted: Arc<AtomicBool>,
     /// Hash of the parameters, of what the inputs are, of the stage's code and of where it
@@ -258,6 +265,12 @@ impl Context {
         self.work.as_deref()
     }
 
+    /// Whether the latest checkpoint in [`Context::work`] is the output, and nothing is to be
+    /// learnt beyond it. Only where the stage says [`Stage::FROM_CHECKPOINT`].
+    pub fn from_checkpoint(&self) -> bool {
+        self.from_checkpoint
+    }
+
     /// Starts a progress display.
     pub fn progress(&self, label: &str, total: u64) -> Progress {
         Progress::new(label, total, self.progress)
@@ -314,8 +327,11 @@ fn parse_and_run<S: Stage>(
     arguments: impl IntoIterator<Item = OsString>,
 ) -> anyhow::Result<()> {
     let description = S::describe(version, code);
-    let mut command =
-        Arguments::command().name(S::NAME).about(S::SUMMARY).after_help(help_of(&description));
+    let mut command = Arguments::command()
+        .name(S::NAME)
+        .about(S::SUMMARY)
+        .after_help(help_of(&description))
+        .mut_arg("from_checkpoint", |argument| argument.hide(!S::FROM_CHECKPOINT));
     if !version.is_empty() {
         command = command.version(version);
     }
@@ -343,6 +359,10 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
     // What made an input isn't known here; rules about that are the runner's to check.
     let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
     if let Some(problem) = description.broken_rule(&resolved, &given) {
+        return Err(Failure::Usage(problem).into());
+    }
+    if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
+        let problem = format!("--from-checkpoint: {} makes nothing of a checkpoint", S::NAME);
         return Err(Failure::Usage(problem).into());
     }
     let threads = match arguments.threads {
@@ -377,6 +397,7 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         inputs,
         output: staging.folder.clone(),
         work: arguments.work,
+        from_checkpoint: arguments.from_checkpoint,
         progress: arguments.progress,
         interrupted,
         identity,

@@ -54,6 +54,8 @@ pub struct Call<'a> {
     pub output: &'a Path,
     /// `--work`; none for a sink.
     pub work: Option<&'a Path>,
+    /// `--from-checkpoint`: the output is what the checkpoint in `work` has learnt.
+    pub from_checkpoint: bool,
     /// `--device`.
     pub device: &'a str,
     /// `--threads`.
@@ -202,6 +204,9 @@ impl Call<'_> {
         }
         if let Some(work) = self.work {
             command.arg("--work").arg(work);
+        }
+        if self.from_checkpoint {
+            command.arg("--from-checkpoint");
         }
         command.args([
             "--device",

@@ -42,6 +42,15 @@ impl Display {
         }
     }
 
+    /// Shows a picture above the bars, where there are bars. `draw` is given the terminal's size,
+    /// columns and rows, and returns lines with escape sequences.
+    pub fn picture(&self, draw: impl FnOnce(u16, u16) -> String) {
+        if let Some(bars) = &self.bars {
+            let (rows, columns) = console::Term::stderr().size();
+            bars.println(draw(columns, rows)).unwrap_or_default();
+        }
+    }
+
     /// Shows a stage from now on.
     pub fn start(&self, label: &str) -> StageView<'_> {
         let bar = self.bars.as_ref().map(|bars| {

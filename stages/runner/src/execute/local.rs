@@ -13,7 +13,7 @@ use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_li
 use planning::{Plan, Sink};
 use stage_call::{Display, StageFailure};
 
-use super::node::{Action, Found};
+use super::node::{Action, Found, folder_of};
 use super::places::{Budget, Need, Place, Places};
 use super::{Executor, NodeJob, Work};
 use crate::counts;
@@ -21,6 +21,7 @@ use crate::recorded::Course;
 use crate::remedy::Remedy;
 use crate::session::{Session, command_line};
 use crate::sink::{Showing, Shown, show};
+use crate::watch::{Chain, Watch};
 
 /// This machine.
 pub(crate) struct Local {
@@ -30,6 +31,8 @@ pub(crate) struct Local {
     pub(crate) keep_going: bool,
     /// What to say after a failure.
     pub(crate) remedy: Remedy,
+    /// How trainings are watched, where that is asked for.
+    pub(crate) watch: Option<Watch>,
 }
 
 impl Executor for Local {
@@ -166,7 +169,25 @@ impl<'a> Schedule<'a> {
             threads,
             display: self.display,
             stop,
+            watch: None,
         }
+    }
+
+    /// What shows a node's checkpoints, where that is asked for and there are any.
+    fn watch(&self, index: usize) -> Option<(&'a Watch, Chain)> {
+        let Work { session, plan, .. } = *self.work;
+        let node = &plan.nodes[index];
+        let watch =
+            self.options.watch.as_ref().filter(|_| node.program.description.from_checkpoint)?;
+        let output_of =
+            |index: usize| self.outcome.records[index].as_ref().map(|r| r.output.clone());
+        let chain = Chain::find(plan, index, &|from| folder_of(from, &session.store, &output_of))
+            .map(|chain| (watch, chain));
+        if chain.is_none() {
+            let problem = "nothing in this plan renders and scores it";
+            self.display.line(&format!("{}: not watched: {problem}", node.label()));
+        }
+        chain
     }
 
     /// Looks at the nodes whose parents are done. Parents come before what needs them, so one pass
@@ -219,7 +240,8 @@ impl<'a> Schedule<'a> {
                         std::mem::replace(&mut self.progress[index], NodeProgress::Running);
                     let NodeProgress::Ready { action, .. } = progress else { continue };
                     self.places.take(index, need);
-                    starting.push((self.job(index), index, action));
+                    let job = NodeJob { watch: self.watch(index), ..self.job(index) };
+                    starting.push((job, index, action));
                 }
                 _ => {}
             }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{
@@ -11,9 +11,10 @@ use artifact::{
 };
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use serde_json::{Map, Value};
-use stage_call::{Call, Display, StageFailure, seconds};
+use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds};
 
 use crate::waiting::{by, enter, until_held};
+use crate::watch::{Chain, Watch, Watching};
 
 /// A node's inputs: where each lies, and the hash of its content.
 struct Inputs {
@@ -50,6 +51,8 @@ pub(crate) struct NodeJob<'a> {
     pub(crate) threads: usize,
     pub(crate) display: &'a Display,
     pub(crate) stop: &'a AtomicBool,
+    /// How its checkpoints are shown, where they are.
+    pub(crate) watch: Option<(&'a Watch, Chain)>,
 }
 
 impl NodeJob<'_> {
@@ -105,7 +108,7 @@ impl NodeJob<'_> {
             .node
             .inputs
             .iter()
-            .map(|input| (input.name.clone(), self.folder_of(input)))
+            .filter_map(|input| Some((input.name.clone(), self.folder_of(input)?)))
             .collect();
         self.make(&lock, attempt, action, &Inputs { folders, hashes }).map(|record| (record, true))
     }
@@ -151,13 +154,14 @@ impl NodeJob<'_> {
             hashes: &inputs.hashes,
             output: &attempt.output,
             work: Some(&attempt.work),
+            from_checkpoint: false,
             device: self.device(),
             threads: self.threads,
             lock: Some(lock),
         };
         let view = self.display.start(&label);
         let started = Instant::now();
-        let result = call.run(&attempt.log, &view, self.stop);
+        let result = self.run_watched(&call, &attempt, &view);
         view.end();
         let usage = result?;
         let record = Record {
@@ -185,14 +189,45 @@ impl NodeJob<'_> {
         Ok(record)
     }
 
-    fn folder_of(&self, input: &NodeInput) -> PathBuf {
-        match &input.from {
-            Origin::Node { index, subtree } => {
-                let object = self.store.object(&self.output_of(*index));
-                subtree.as_ref().map_or(object.clone(), |s| object.join(s))
-            }
-            Origin::Folder(folder) => folder.clone(),
+    /// Runs the stage; whoever watches its checkpoints ends when it does.
+    fn run_watched(
+        &self,
+        call: &Call<'_>,
+        attempt: &Attempt,
+        view: &StageView<'_>,
+    ) -> Result<Usage, StageFailure> {
+        let Some((watch, chain)) = &self.watch else {
+            return call.run(&attempt.log, view, self.stop);
+        };
+        let is_over = AtomicBool::new(false);
+        let scratch = self.store.scratch(self.file.id()).join(format!("watch-{}", call.label));
+        let (label, display, is_over) = (call.label, self.display, &is_over);
+        let watching = Watching { watch, chain, label, scratch, display, is_over };
+        std::thread::scope(|scope| {
+            scope.spawn(|| watching.run(call));
+            let result = call.run(&attempt.log, view, self.stop);
+            is_over.store(true, Ordering::Relaxed);
+            result
+        })
+    }
+
+    fn folder_of(&self, input: &NodeInput) -> Option<PathBuf> {
+        folder_of(&input.from, self.store, &|index| Some(self.output_of(index)))
+    }
+}
+
+/// Where an input lies; none where it isn't made yet.
+pub(super) fn folder_of(
+    from: &Origin,
+    store: &Store,
+    output_of: &dyn Fn(usize) -> Option<String>,
+) -> Option<PathBuf> {
+    match from {
+        Origin::Node { index, subtree } => {
+            let object = store.object(&output_of(*index)?);
+            Some(subtree.as_ref().map_or(object.clone(), |s| object.join(s)))
         }
+        Origin::Folder(folder) => Some(folder.clone()),
     }
 }
 

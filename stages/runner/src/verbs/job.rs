@@ -104,7 +104,7 @@ impl Task<'_> {
             node.parents().filter_map(|parent| Some((parent, records[parent].clone()?))).collect();
         let (threads, display) = (slurm::cores(), Display::new());
         let Self { plan, store, run: file, stop, .. } = *self;
-        NodeJob { plan, node, parents, store, file, threads, display: &display, stop }
+        NodeJob { plan, node, parents, store, file, threads, display: &display, stop, watch: None }
             .run()
             .map(drop)
     }
