@@ -14,12 +14,16 @@ use common::surfaces::{Compared, Glb, compare, true_surface};
 use common::{Finished, Project, stage};
 use demo_scene::World;
 use glam::DVec3;
-use pixels::{Image, psnr_of, read_premultiplied};
+use pixels::{Filter, Image, Resampling, psnr_of, read_premultiplied};
 use scene::{Camera, Views};
 use serde_json::Value;
 
 /// Grid of points of the true surface.
 const CELL: f64 = 0.008;
+/// Splats are drawn with so many times the images' width, as a viewer's window has, and shrunk.
+const ENLARGED: u32 = 4;
+/// Decibels of the splats after a short training, in the mean; 043 has figures.
+const LEAST_SPLATS: f64 = 24.0;
 
 /// What a measuring needs: the exported files, the cameras they were made from, and the test images.
 struct Exported {
@@ -47,9 +51,9 @@ fn exported_files_show_the_demo_scene() {
     assert_near("mesh", exported.mesh());
     assert_near("points", exported.points());
     // By the reference renderer, over the field's background.
-    assert_shown(&exported.splats(1.0), 20.0);
+    assert_shown(&exported.splats(1.0), LEAST_SPLATS);
     if let Some(scores) = seen_in_viewer(&exported) {
-        assert_shown(&scores, 16.0);
+        assert_shown(&scores, LEAST_SPLATS);
     }
     if let Some(read) = read_by_others(&exported) {
         assert_same_files(&exported, &read);
@@ -109,11 +113,22 @@ impl Exported {
         let views = Views::read(&input).unwrap().views;
         let score = |view: &scene::View| {
             let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
-            let drawn = render_splats(&splats, &view.camera, f64::from(background));
-            psnr(&image.over(background), &drawn)
+            let drawn = render_splats(&splats, &enlarged(&view.camera), f64::from(background));
+            psnr(&image.over(background), &shrunk(&drawn))
         };
         views.iter().map(score).collect()
     }
+}
+
+fn enlarged(camera: &Camera) -> Camera {
+    let k = camera.intrinsics;
+    camera.resized(ENLARGED * k.width, ENLARGED * k.height)
+}
+
+/// An image of an enlarged camera at the camera's size.
+fn shrunk(image: &Image) -> Image {
+    let to = [image.width, image.height].map(|side| side / ENLARGED as usize);
+    Resampling::new(Filter::Box, (image.width, image.height), (to[0], to[1])).apply(image)
 }
 
 fn psnr(a: &Image, b: &Image) -> f64 {
@@ -126,7 +141,7 @@ fn psnr(a: &Image, b: &Image) -> f64 {
 fn assert_near(what: &str, compared: Compared) {
     println!("{what}: {compared:?}");
     assert!(compared.to_truth < 0.01 && compared.from_truth < 0.01, "{what}: {compared:?}");
-    assert!(compared.outward >= 0.92, "{what}: {compared:?}");
+    assert!(compared.outward >= 0.97, "{what}: {compared:?}");
 }
 
 /// At least so many dB in the mean. A scene that is mirrored or upside down has about 12.
@@ -140,21 +155,25 @@ fn assert_shown(scores: &[f64], least: f64) {
 /// without a browser.
 fn seen_in_viewer(exported: &Exported) -> Option<Vec<f64>> {
     let drawn = tempfile::tempdir().unwrap();
-    let files = [exported.files.join("splats.ply"), exported.truth.join("views.json")];
+    let input = GivenInput::open("truth", &exported.truth).unwrap();
+    let mut views = Views::read(&input).unwrap();
+    views.views.iter_mut().for_each(|view| view.camera = enlarged(&view.camera));
+    let cameras = drawn.path().join("views.json");
+    artifact::write_json(&cameras, &views).unwrap();
+    let files = [exported.files.join("splats.ply"), cameras];
     let said =
         run_in_browser("splats.mjs", files.iter().map(PathBuf::as_path).chain([drawn.path()]))?;
     let count = read_ply(&files[0])["x"].len();
     assert_eq!(said, serde_json::json!({"count": count, "problems": []}));
-    let input = GivenInput::open("truth", &exported.truth).unwrap();
     let score = |view: &scene::View| {
         let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
         let path = drawn.path().join(format!("{}.png", view.camera.name));
         let shown = read_premultiplied(&path).unwrap().over(0.0);
         // Nothing of the scene is in the corner.
         let background = shown.data[0];
-        psnr(&image.over(background), &shown)
+        psnr(&image.over(background), &shrunk(&shown))
     };
-    Some(Views::read(&input).unwrap().views.iter().map(score).collect())
+    Some(views.views.iter().map(score).collect())
 }
 
 /// Points of the true surface with their normals, as PLY text.

@@ -57,12 +57,13 @@ async function draw({ intrinsics, camera_to_world: pose }) {
   camera.updateProjectionMatrix();
   new THREE.Matrix4().set(...pose.flat(), 0, 0, 0, 1).decompose(camera.position, camera.quaternion, camera.scale);
   camera.updateMatrixWorld(true);
-  // Splats are sorted elsewhere: the first updates start that, later ones take the order in.
-  for (let pause = 0; pause < 2 || viewer.sortRunning; pause += 1) {
-    viewer.update();
-    viewer.render();
-    await new Promise((resolve) => setTimeout(resolve, 100));
-  }
+  // The viewer sorts beside, when a camera has moved far, and at first the nearest splats alone: here all are sorted.
+  viewer.update();
+  do {
+    await new Promise((resolve) => setTimeout(resolve, 20));
+  } while (viewer.sortRunning);
+  await viewer.runSplatSort(true, true);
+  while (viewer.sortRunning) await new Promise((resolve) => setTimeout(resolve, 20));
   viewer.update();
   viewer.render();
   return renderer.domElement.toDataURL("image/png");

@@ -13,20 +13,22 @@ const POINTS: usize = 100_000;
 /// `images/NAME.png`.
 pub(crate) fn transforms(cameras: &[Camera], points: Option<&str>) -> Value {
     let shared = shared_intrinsics(cameras);
-    let frame = |camera: &Camera| {
-        let mut entry = if shared.is_some() { Map::new() } else { lens(&camera.intrinsics) };
-        let mut matrix = camera.camera_to_world.to_vec();
-        matrix.push([0.0, 0.0, 0.0, 1.0]);
-        entry.insert("file_path".to_owned(), json!(image(camera, "images/")));
-        entry.insert("transform_matrix".to_owned(), json!(matrix));
-        Value::Object(entry)
-    };
+    let frames: Value = cameras.iter().map(|camera| frame(camera, shared.is_some())).collect();
     let mut file = shared.map(lens).unwrap_or_default();
-    file.insert("frames".to_owned(), cameras.iter().map(frame).collect());
+    file.insert("frames".to_owned(), frames);
     if let Some(points) = points {
         file.insert("ply_file_path".to_owned(), json!(points));
     }
     Value::Object(file)
+}
+
+fn frame(camera: &Camera, has_shared_lens: bool) -> Value {
+    let mut entry = if has_shared_lens { Map::new() } else { lens(&camera.intrinsics) };
+    let mut matrix = camera.camera_to_world.to_vec();
+    matrix.push([0.0, 0.0, 0.0, 1.0]);
+    entry.insert("file_path".to_owned(), json!(image(camera, "images/")));
+    entry.insert("transform_matrix".to_owned(), json!(matrix));
+    Value::Object(entry)
 }
 
 /// The intrinsics of all cameras, where they have the same.

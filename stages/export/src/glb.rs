@@ -46,13 +46,10 @@ pub(crate) fn buffer_length(mesh: &Mesh) -> usize {
 
 fn description(mesh: &Mesh) -> Value {
     let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
-    let bound = |of: fn(Vec3, Vec3) -> Vec3| {
-        mesh.positions.iter().copied().reduce(of).unwrap_or_default().to_array()
-    };
     let list = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": vertices, "type": "VEC3"});
     let mut positions = list(0);
-    positions["min"] = json!(bound(Vec3::min));
-    positions["max"] = json!(bound(Vec3::max));
+    positions["min"] = json!(bound(mesh, Vec3::min));
+    positions["max"] = json!(bound(mesh, Vec3::max));
     let indices = json!({"bufferView": 3, "componentType": UNSIGNED, "count": 3 * triangles,
         "type": "SCALAR"});
     let view = |first: usize, length: usize, target: u32| json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target});
@@ -83,4 +80,8 @@ fn description(mesh: &Mesh) -> Value {
         ],
         "buffers": [{"byteLength": buffer_length(mesh)}],
     })
+}
+
+fn bound(mesh: &Mesh, of: fn(Vec3, Vec3) -> Vec3) -> [f32; 3] {
+    mesh.positions.iter().copied().reduce(of).unwrap_or_default().to_array()
 }

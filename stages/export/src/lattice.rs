@@ -59,12 +59,12 @@ impl Lattice {
             return self.spacing;
         }
         let at = self.point(place);
-        let step = |axis: usize| {
+        let steps = (0..3).map(|axis| {
             let mut next = place;
             next[axis] += 1.0;
             (self.point(next) - at).length()
-        };
-        (0..3).map(step).fold(0.0, f64::max)
+        });
+        steps.fold(0.0, f64::max)
     }
 
     /// Whether the lattice's axes are left-handed in the world: a frustum's third goes away from the

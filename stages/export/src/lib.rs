@@ -27,6 +27,7 @@ mod surface_nets;
 mod surfel;
 #[cfg(test)]
 mod tests;
+mod unseen;
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
@@ -51,6 +52,8 @@ pub const EXPORT_FILE: &str = "export.json";
 
 /// Pixels of all rendered views together, unless `size` is given.
 const PIXELS: f64 = 16e6;
+/// Size of the rendered views over the cameras': a supersampled field has more than these show.
+const MOST_SCALE: f64 = 2.0;
 
 /// Parameters of `export`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -64,8 +67,8 @@ pub struct Params {
     pub mesh: bool,
     /// Writes the cameras as `transforms.json` and as COLMAP's text files.
     pub cameras: bool,
-    /// Width at which the field is rendered from each camera. Default: the cameras' own, or less
-    /// where all views together would have more than 16 million pixels.
+    /// Width at which the field is rendered from each camera. Default: twice the cameras' own, or
+    /// less where all views together would have more than 16 million pixels.
     #[schemars(range(min = 1, max = 65536), extend("x-default" = "by cameras"))]
     pub size: Option<u32>,
     /// Maximum number of points and of splats.
@@ -185,7 +188,7 @@ fn render(
 ) -> anyhow::Result<Vec<SeenView>> {
     let progress = context.progress("rendering", cameras.len() as u64);
     let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
-    let most = (PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(1.0);
+    let most = (PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(MOST_SCALE);
     cameras
         .iter()
         .map(|camera| {
@@ -243,6 +246,8 @@ impl ExportJob<'_> {
         let lattice = Lattice::new(&self.field.file.bounds, self.params.resolution);
         let values = fusion::fuse(&self.views, &lattice);
         let mut mesh: Mesh = surface_nets::extract(&lattice, &values);
+        mesh.find_normals();
+        unseen::drop_unseen(&self.views, &lattice, &mut mesh);
         mesh.drop_small_pieces();
         mesh.find_normals();
         if mesh.triangles.is_empty() {
@@ -261,12 +266,13 @@ impl ExportJob<'_> {
         write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
     ) -> anyhow::Result<()> {
         let path = self.context.output_path(file)?;
-        let written = || {
-            let mut out = BufWriter::new(File::create(&path)?);
-            write(&mut out)?;
-            out.flush()
-        };
-        written().with_context(|| format!("cannot write {}", path.display()))
+        File::create(&path)
+            .map(BufWriter::new)
+            .and_then(|mut out| {
+                write(&mut out)?;
+                out.flush()
+            })
+            .with_context(|| format!("cannot write {}", path.display()))
     }
 }
 

@@ -11,6 +11,8 @@ const OPAQUE: f32 = 0.5;
 /// Neighbouring pixels show one surface where their depths differ by at most so many pixel widths:
 /// slants of up to 80°.
 const SLANT: f32 = 6.0;
+/// A normal is known by so many pixels to each side: more than noise, less than what is thin.
+const BASELINE: usize = 4;
 
 /// A view's surface, seen by a pinhole camera.
 pub(crate) struct SeenView {
@@ -37,6 +39,8 @@ pub(crate) struct SeenPixel {
     pub(crate) opacity: u8,
     /// Whether something nearer ends beside it: up to where isn't known to a pixel's width.
     pub(crate) is_edge: bool,
+    /// Whether its surface ends beside it: its normal is known by one side alone.
+    pub(crate) is_border: bool,
 }
 
 /// What a view says of a world point.
@@ -112,8 +116,12 @@ impl SeenView {
                 let above = [at.checked_sub(width), (y + 1 < height).then_some(at + width)];
                 let is_nearer = |other: usize| self.is_nearer(other, at);
                 self.pixels[at].is_edge = beside.into_iter().chain(above).flatten().any(is_nearer);
-                let (along, down) = (self.tangent(at, beside), self.tangent(at, above));
-                let (Some(along), Some(down)) = (along, down) else { continue };
+                let along = self.tangent(at, (x, width), 1);
+                let down = self.tangent(at, (y, height), width);
+                let (Some((along, is_inside)), Some((down, is_within))) = (along, down) else {
+                    continue;
+                };
+                self.pixels[at].is_border = !(is_inside && is_within);
                 let normal = along.cross(down).normalize_or_zero();
                 let towards = if normal.dot(self.point(at)) > 0.0 { -normal } else { normal };
                 self.pixels[at].normal = towards;
@@ -121,16 +129,40 @@ impl SeenView {
         }
     }
 
-    /// The way from one neighbour of a pixel to the other, or to the pixel itself where a neighbour
-    /// shows something else; `None` where both do.
-    fn tangent(&self, at: usize, [before, after]: [Option<usize>; 2]) -> Option<Vec3> {
-        let goes_on = |other: &usize| {
-            let [depth, there] = [at, *other].map(|i| self.pixels[i].depth);
-            depth > 0.0 && there > 0.0 && (there - depth).abs() <= self.jump(depth)
-        };
-        let (before, after) = (before.filter(goes_on), after.filter(goes_on));
-        (before.is_some() || after.is_some())
-            .then(|| self.point(after.unwrap_or(at)) - self.point(before.unwrap_or(at)))
+    /// The way along the surface from before a pixel to behind it, in a row or a column, and whether
+    /// the surface goes on to both sides; `None` where it ends on both. `place` is the pixel's place
+    /// in its line and the line's length, `stride` the distance of the line's pixels.
+    fn tangent(
+        &self,
+        at: usize,
+        (place, length): (usize, usize),
+        stride: usize,
+    ) -> Option<(Vec3, bool)> {
+        let stride = stride.cast_signed();
+        let before = self.last_of_surface(at, place, -stride);
+        let after = self.last_of_surface(at, length - 1 - place, stride);
+        let way = self.point(after) - self.point(before);
+        (before != after).then_some((way, before != at && after != at))
+    }
+
+    /// The farthest pixel within [`BASELINE`] that still shows a pixel's surface, `room` pixels
+    /// before the image ends.
+    fn last_of_surface(&self, at: usize, room: usize, stride: isize) -> usize {
+        let mut last = at;
+        for _ in 0..room.min(BASELINE) {
+            let next = last.wrapping_add_signed(stride);
+            if !self.goes_on(last, next) {
+                break;
+            }
+            last = next;
+        }
+        last
+    }
+
+    /// Whether two neighbours show one surface.
+    fn goes_on(&self, at: usize, other: usize) -> bool {
+        let [depth, there] = [at, other].map(|i| self.pixels[i].depth);
+        depth > 0.0 && there > 0.0 && (there - depth).abs() <= self.jump(depth)
     }
 
     /// Whether a pixel shows a surface well before another's, or where that has none.
@@ -245,5 +277,6 @@ fn seen(pixel: &Pixel, to_z: f32) -> SeenPixel {
         colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(OPAQUE))),
         opacity: level(pixel.opacity),
         is_edge: false,
+        is_border: false,
     }
 }

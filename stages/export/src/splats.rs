@@ -8,15 +8,14 @@ use crate::surfel::Surfel;
 /// The constant spherical harmonic.
 const HARMONIC: f32 = 0.282_094_79;
 
-/// Standard deviation of a disc along its surface, over the distance of neighbours.
-const RADIUS: f64 = 0.35;
+/// Standard deviation of a disc along its surface, over the distance of neighbours: discs close the
+/// surface, seen from however near.
+const RADIUS: f64 = 0.5;
 /// Standard deviation along the normal, over that.
 const FLATNESS: f64 = 0.1;
-/// Optical depth of a surface at the size at which the views see it, for one disc in each square of
-/// that distance; there are more. More of it widens edges, since viewers blur splats.
-const DEPTH: f64 = 0.75;
-/// Variance of that blur, in square pixels.
-const BLUR: f64 = 0.3;
+/// Opacity of a disc on an opaque surface. There are several in each square of the distance; more of
+/// it widens edges, since viewers blur splats.
+const OPACITY: f64 = 0.6;
 /// Opacities written: a logit of 1 is infinite.
 const OPACITIES: [f64; 2] = [0.02, 0.99];
 
@@ -37,18 +36,10 @@ fn splat(surfel: &Surfel) -> [f32; 17] {
     let [x, y, z] = surfel.position.as_vec3().to_array();
     let [nx, ny, nz] = surfel.normal.as_vec3().to_array();
     let [r, g, b] = surfel.colour.map(|v| (v - 0.5) / HARMONIC);
-    let opacity = opacity(surfel);
+    let opacity = (OPACITY * f64::from(surfel.opacity)).clamp(OPACITIES[0], OPACITIES[1]);
     let along = RADIUS * surfel.spacing;
     let [along, across] = [along, FLATNESS * along].map(|deviation| deviation.ln() as f32);
     let turn = DQuat::from_rotation_arc(DVec3::Z, surfel.normal).as_quat();
     let logit = (opacity / (1.0 - opacity)).ln() as f32;
     [x, y, z, nx, ny, nz, r, g, b, logit, along, along, across, turn.w, turn.x, turn.y, turn.z]
-}
-
-/// Opacity of one of several discs that lie over each other in a pixel.
-fn opacity(surfel: &Surfel) -> f64 {
-    let share = surfel.spacing / surfel.footprint;
-    let spread = std::f64::consts::TAU * (BLUR + (RADIUS * share).powi(2));
-    let each = DEPTH * share * share / spread;
-    (f64::from(surfel.opacity) * each).clamp(OPACITIES[0], OPACITIES[1])
 }

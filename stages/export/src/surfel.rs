@@ -17,8 +17,6 @@ pub(crate) struct Surfel {
     pub(crate) opacity: f32,
     /// Distance to its neighbours, about, in scene units.
     pub(crate) spacing: f64,
-    /// Width of the pixels that show it, in scene units.
-    pub(crate) footprint: f64,
 }
 
 /// A pixel that shows a surface: the cell of its point, then view and pixel, which order them.
@@ -80,6 +78,10 @@ fn samples(views: &[SeenView], bounds: &Bounds, edge: f64) -> Vec<Sample> {
 
 /// The mean of a cell's pixels: those count more that see the surface from near and not aslant.
 fn surfel(views: &[SeenView], bounds: &Bounds, edge: f64, group: &[Sample]) -> Option<Surfel> {
+    // Up to where a surface goes is known to a pixel.
+    if group.iter().all(|&(_, number, at)| views[number as usize].pixel(at as usize).is_border) {
+        return None;
+    }
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     let (mut opacity, mut footprint, mut cell, mut weights) = (0.0, 0.0, 0.0, 0.0);
     for &(_, number, at) in group {
@@ -104,6 +106,5 @@ fn surfel(views: &[SeenView], bounds: &Bounds, edge: f64, group: &[Sample]) -> O
         colour: (colour * share).as_vec3().to_array(),
         opacity: (opacity * share) as f32,
         spacing: (cell / weights).max(footprint / weights / (group.len() as f64).sqrt()),
-        footprint: footprint / weights,
     })
 }

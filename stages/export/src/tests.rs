@@ -196,7 +196,6 @@ fn one_surfel() -> Surfel {
         colour: [1.0, 0.5, 0.0],
         opacity: 0.75,
         spacing: 0.1,
-        footprint: 0.05,
     }
 }
 
@@ -234,8 +233,8 @@ fn splats_are_discs_across_their_normal() {
         data.as_chunks::<4>().0.iter().map(|b| f64::from(f32::from_le_bytes(*b))).collect();
     assert_eq!(names.len(), numbers.len());
     let of = |name: &str| numbers[names.iter().position(|n| *n == name).unwrap()];
-    // Twice as far apart as pixels are wide; 0.75 of what 0.75 optical depths need.
-    assert!((1.0 / (1.0 + (-of("opacity")).exp()) - 0.453).abs() < 1e-3);
+    // 0.75 of an opaque surface's 0.6.
+    assert!((1.0 / (1.0 + (-of("opacity")).exp()) - 0.45).abs() < 1e-6);
     let colour = |c: i32| 0.5 + 0.282_094_79 * of(&format!("f_dc_{c}"));
     assert!((colour(0) - 1.0).abs() < 1e-6 && (colour(2)).abs() < 1e-6);
     let turn = glam::DQuat::from_xyzw(of("rot_1"), of("rot_2"), of("rot_3"), of("rot_0"));
