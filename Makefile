@@ -73,13 +73,13 @@ lint: setup ## rustfmt, clippy with and without libtorch and of the fuzz targets
 # libFuzzer's coverage on a stable compiler; for the target alone, since build scripts have no libFuzzer to link with.
 FUZZ_FLAGS := -Cpasses=sancov-module $(addprefix -Cllvm-args=-sanitizer-coverage-,level=4 inline-8bit-counters pc-table trace-compares)
 FUZZ_HOST = $(shell rustc -vV | sed -n 's/^host: //p')
-FUZZ_TARGETS ?= colmap llff transforms picture field runner
+FUZZ_TARGETS ?= $(basename $(notdir $(wildcard tests/fuzz/src/bin/*.rs)))
 FUZZ_SECONDS ?= 60
 IN_FUZZ = cd tests/fuzz && FUZZ_SEEDS=$(CURDIR)/out/fuzz/seeds CARGO_TARGET_DIR=$(CURDIR)/target/fuzz
 fuzz: ## Broken files for every reader: make fuzz FUZZ_SECONDS=3600 FUZZ_TARGETS="colmap llff"
 	@python3 tests/fuzz/seeds.py out/fuzz/seeds
 	@$(IN_FUZZ) RUSTFLAGS="$(FUZZ_FLAGS)" cargo build --release --quiet --target $(FUZZ_HOST)
-	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target; \
+	@for target in $(FUZZ_TARGETS); do mkdir -p out/fuzz/corpus/$$target out/fuzz/seeds/$$target; \
 	  target/fuzz/$(FUZZ_HOST)/release/$$target -max_total_time=$(FUZZ_SECONDS) -timeout=20 -rss_limit_mb=2048 -max_len=4096 \
 	    -artifact_prefix=out/fuzz/$$target- out/fuzz/corpus/$$target out/fuzz/seeds/$$target 2>&1 | tee out/fuzz/$$target.log | tail -3; \
 	  test $${PIPESTATUS[0]} = 0 || exit 1; done

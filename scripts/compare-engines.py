@@ -4,7 +4,8 @@
 compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ...] [--seeds N] [--picture FILE.svg]
 
 OLD and NEW are work trees, each built by `make build`. OLD prepares each scene and scores the views of both. With several
-factors of the rays, --picture draws PSNR against training time.
+factors of the rays, --picture draws PSNR against training time. Times are by the clock; processor time, which a busy machine
+changes less, stands beside them and in the picture.
 """
 
 import argparse
@@ -28,8 +29,19 @@ SCENES = {
 }
 
 
-def run(tree: pathlib.Path, stage: str, folder: pathlib.Path, output: str, inputs: dict[str, str], params: dict) -> tuple[float, int]:
-    """Runs a stage of a build; returns its seconds and its peak memory in MiB."""
+class Cost(NamedTuple):
+    """What a stage took: seconds by the clock, of processor time, and its peak memory in MiB."""
+
+    seconds: float
+    processor: float
+    memory: int
+
+    def words(self) -> str:
+        return f"{self.seconds:.1f} s ({self.processor:.1f} s)"
+
+
+def run(tree: pathlib.Path, stage: str, folder: pathlib.Path, output: str, inputs: dict[str, str], params: dict) -> Cost:
+    """Runs a stage of a build."""
     (folder / "params.json").write_text(json.dumps(params))
     words = [f"--input={name}={folder / path}" for name, path in inputs.items()]
     begin = time.monotonic()
@@ -40,7 +52,7 @@ def run(tree: pathlib.Path, stage: str, folder: pathlib.Path, output: str, input
         _, status, usage = os.wait4(process.pid, 0)
     if status:
         sys.exit(f"{stage} failed: {(folder / 'log').read_text()[-500:]}")
-    return time.monotonic() - begin, usage.ru_maxrss // 1024
+    return Cost(time.monotonic() - begin, usage.ru_utime + usage.ru_stime, usage.ru_maxrss // 1024)
 
 
 def prepare(options: argparse.Namespace, folder: pathlib.Path, name: str) -> None:
@@ -64,12 +76,12 @@ class Result(NamedTuple):
     rays: int
     psnr: float
     ssim: float
-    training: float
-    rendering: float
-    memory: int
+    training: Cost
+    rendering: Cost
 
     def line(self) -> str:
-        figures = f"{self.psnr:.3f} | {self.ssim:.4f} | {self.training:.1f} s | {self.rendering:.1f} s | {self.memory} MiB"
+        memory = max(self.training.memory, self.rendering.memory)
+        figures = f"{self.psnr:.3f} | {self.ssim:.4f} | {self.training.words()} | {self.rendering.words()} | {memory} MiB"
         return f"| {self.scene} | {self.build} | {self.seed} | {self.rays / 1e6:g} M | {figures} | {os.getloadavg()[0]:.1f} |"
 
 
@@ -78,11 +90,11 @@ def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build:
     rays = int(rays * factor)
     params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed}
     tree, at = getattr(options, build), f"{build}-{seed}-{rays}"
-    training, memory = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
-    rendering, most = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
+    training = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
+    rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
     run(options.old, "eval", folder, f"{at}/eval", {"views": f"{at}/views", "truth": "scene/truth"}, {})
     mean = json.loads((folder / at / "eval/metrics.json").read_text())["mean"]
-    return Result(name, build, seed, rays, mean["psnr"], mean["ssim"], training, rendering, max(memory, most))
+    return Result(name, build, seed, rays, mean["psnr"], mean["ssim"], training, rendering)
 
 
 WIDTH, HEIGHT, LEFT, TOP, BETWEEN = 420, 300, 52, 30, 30
@@ -103,7 +115,7 @@ def panel(scene: str, results: list[Result], left: int) -> str:
     curves = {build: [] for build in COLOURS}
     for build, rays in dict.fromkeys((r.build, r.rays) for r in results):
         seeds = [r for r in results if (r.build, r.rays) == (build, rays)]
-        curves[build].append((statistics.mean(r.training for r in seeds), statistics.mean(r.psnr for r in seeds)))
+        curves[build].append((statistics.mean(r.training.processor for r in seeds), statistics.mean(r.psnr for r in seeds)))
     points = [point for curve in curves.values() for point in curve]
     longest = max(seconds for seconds, _ in points) * 1.05
     low, high = (pick(psnr for _, psnr in points) for pick in (min, max))
@@ -118,7 +130,7 @@ def panel(scene: str, results: list[Result], left: int) -> str:
         parts.append(f'<line x1="{left + LEFT}" x2="{left + WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>')
         parts.append(f'<text x="{left + LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{low + (high - low) * share:.1f}</text>')
         parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 22}" text-anchor="middle">{longest * share:.0f}</text>')
-    parts.append(f'<text x="{left + (LEFT + WIDTH) / 2}" y="{HEIGHT - 6}" text-anchor="middle">seconds of training</text>')
+    parts.append(f'<text x="{left + (LEFT + WIDTH) / 2}" y="{HEIGHT - 6}" text-anchor="middle">processor seconds of training</text>')
     for build, curve in curves.items():
         places = [place(*point) for point in sorted(curve)]
         line = " ".join(f"{x:.1f},{y:.1f}" for x, y in places)
@@ -139,7 +151,7 @@ def main() -> None:
     parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
     options = parser.parse_args()
-    print("| scene | build | seed | rays | PSNR | SSIM | training | rendering | peak memory | load |\n" + "| --- " * 10 + "|")
+    print("| scene | build | seed | rays | PSNR | SSIM | training (processor) | rendering (processor) | peak memory | load |\n" + "| --- " * 10 + "|")
     results = []
     for name in options.only:
         with tempfile.TemporaryDirectory() as folder:

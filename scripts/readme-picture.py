@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """Makes docs/demo.png, the picture on top of the README, from the last `make demo`. Needs Pillow (make goldens installs it).
 
-    .venv/bin/python scripts/readme-picture.py
+    scripts/readme-pictures.sh calls it.
 """
 
-import json
 import pathlib
+import subprocess
 
 from PIL import Image, ImageDraw
 
@@ -13,16 +13,19 @@ ROOT = pathlib.Path(__file__).resolve().parent.parent
 SIDE = 300
 
 
-def main():
-    run = json.loads((ROOT / ".nerf-sr/sinks/report/run/run.json").read_text())
-    folder = {node["stage"]: pathlib.Path(node["folder"]) for node in run["nodes"]}
+def artifact(stage: str) -> pathlib.Path:
+    """A folder that the last run made."""
+    return pathlib.Path(subprocess.run([ROOT / "target/release/nerf-sr", "path", stage], cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE).stdout.strip())
+
+
+def main() -> None:
     name = "r_5"
-    truth = folder["prep"] / "truth"
+    truth = artifact("prep/truth")
     parts = [
         ("LR input, 100 px", truth / f"low/{name}.png", Image.NEAREST),
-        ("rendered, 200 px", folder["render-depth"] / f"previews/{name}.png", Image.LANCZOS),
+        ("rendered, 200 px", artifact("render-depth") / f"previews/{name}.png", Image.LANCZOS),
         ("ground truth", truth / f"images/{name}.png", Image.LANCZOS),
-        ("error", folder["eval"] / f"errors/{name}.png", Image.NEAREST),
+        ("error", artifact("eval") / f"errors/{name}.png", Image.NEAREST),
     ]
     sheet = Image.new("RGB", (len(parts) * SIDE, SIDE + 18), "white")
     draw = ImageDraw.Draw(sheet)

@@ -10,7 +10,7 @@ use std::process::Command;
 use std::time::SystemTime;
 
 use common::{Finished, Project, bin, root};
-use forms::{WIDTH, as_colmap, as_llff, as_transforms};
+use forms::{FORMS, WIDTH, as_colmap};
 
 /// A folder without a pipeline.
 fn empty() -> Project {
@@ -38,21 +38,19 @@ const SHORT: [&str; 12] = [
 #[test]
 fn what_init_writes_runs_as_it_is() {
     let project = empty();
-    as_transforms(&project);
-    as_colmap(&project);
-    as_llff(&project);
-    for (folder, found, photographs) in [
-        ("data", "Blender's form (transforms_train.json): 21 photographs", "downscaled"),
-        ("transforms", "transforms.json (instant-ngp, nerfstudio): 20 photographs", "photographs"),
-        ("colmap", "COLMAP (sparse): 20 photographs", "photographs"),
-        ("llff", "LLFF (poses_bounds.npy): 20 photographs", "downscaled"),
-    ] {
+    let demo = "Blender's form (transforms_train.json): 21 photographs".to_owned();
+    let mut folders = vec![("data", demo, "downscaled")];
+    for form in FORMS {
+        (form.write)(&project);
+        folders.push((form.name, format!("{}: 20 photographs", form.found), form.lr_source));
+    }
+    for (folder, found, lr_source) in folders {
         let pipeline = format!("of-{folder}/pipeline.yaml");
         std::fs::create_dir(project.path(&format!("of-{folder}"))).unwrap();
         let said = project.ok(&["--pipeline", &pipeline, "init", folder]);
         assert!(said.contains(&format!("found: {found} of {WIDTH}×{WIDTH}\n")), "{said}");
         let text = std::fs::read_to_string(project.path(&pipeline)).unwrap();
-        assert!(text.contains(&format!("lr_source: {photographs}")), "{text}");
+        assert!(text.contains(&format!("lr_source: {lr_source}")), "{text}");
         let run = [&["--pipeline", pipeline.as_str(), "run"][..], &SHORT].concat();
         let said = project.ok(&run);
         assert!(said.contains("eval: ") && said.contains("index.html"), "{said}");

@@ -9,7 +9,7 @@ mod forms;
 use std::path::Path;
 
 use common::{Project, stage};
-use forms::{ANGLE, WIDTH, as_colmap, as_llff, as_transforms, photographs};
+use forms::{ANGLE, FORMS, WIDTH, as_colmap, as_llff, as_transforms, photographs};
 use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 use serde_json::{Value, json};
@@ -37,18 +37,18 @@ fn views(folder: &Path) -> Vec<Value> {
 #[test]
 fn every_form_gives_the_same_cameras_and_images() {
     let project = Project::tiny();
-    let folders = [as_transforms(&project), as_colmap(&project), as_llff(&project)];
     let mut scenes = Vec::new();
-    for (i, folder) in folders.iter().enumerate() {
-        let scene = project.path(&format!("scene-{i}"));
+    for form in FORMS {
+        let folder = (form.write)(&project);
+        let scene = project.path(&format!("scene-{}", form.name));
         let made = stage(
             "prep",
             r#"{"lr_source": "photographs", "scale": 1.5}"#,
-            &[("dataset", folder)],
+            &[("dataset", &folder)],
             &scene,
             &[],
         );
-        assert_eq!(made.code, 0, "{}", made.stderr);
+        assert_eq!(made.code, 0, "{}: {}", form.name, made.stderr);
         let summary = std::fs::read_to_string(scene.join("scene.json")).unwrap();
         for words in [
             "17 views to train on, 3 others for testing",

@@ -111,6 +111,7 @@ fn every_command_plans() {
             // for run's own options.
             if words[0] == "run" {
                 words[0] = "plan";
+                words.retain(|word| !word.starts_with("--watch"));
                 while let Some(at) =
                     words.iter().position(|w| ["-j", "--threads", "--memory", "--out"].contains(w))
                 {

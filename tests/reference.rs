@@ -7,6 +7,8 @@ use std::fmt::Write as _;
 use artifact::{Description, ParameterSection, by_group};
 use serde_json::Value;
 
+use crate::common::verbs_of;
+
 /// The first lines of every page.
 pub(crate) fn heading(title: &str, summary: &str) -> String {
     format!(
@@ -180,15 +182,8 @@ fn type_of(property: &Value) -> String {
 pub(crate) fn command_page(help: impl Fn(&[&str]) -> String) -> String {
     let mut page = heading("Command line", "What `nerf-sr` and its verbs print with `--help`.");
     let runner = help(&["--help"]);
-    let verbs = runner
-        .lines()
-        .skip_while(|line| *line != "Commands:")
-        .skip(1)
-        .take_while(|line| !line.is_empty());
-    let verbs: Vec<String> =
-        verbs.filter_map(|line| line.split_whitespace().next()).map(str::to_owned).collect();
     writeln!(page, "\n## nerf-sr\n\n```\n{}\n```", runner.trim_end()).unwrap();
-    for verb in verbs.iter().filter(|verb| *verb != "help") {
+    for verb in verbs_of(&runner) {
         writeln!(page, "\n## nerf-sr {verb}\n\n```\n{}\n```", help(&[verb, "--help"]).trim_end())
             .unwrap();
     }

@@ -1,12 +1,17 @@
-//! `schemas/` and `docs/reference/` are made from the types; this test keeps them current.
-//! `UPDATE=1 cargo test --test schemas` writes them anew.
+//! `schemas/` and `docs/reference/` are made from the types and from what the built stages say; this
+//! test keeps them current. After `make build`,
+//! `UPDATE=1 cargo test --release --workspace --exclude nerf-sr-remote --test schemas` writes them
+//! anew.
 
 #![allow(missing_docs, reason = "a test")]
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::process::Command;
+use std::sync::LazyLock;
+use std::time::SystemTime;
 
-use artifact::{Description, Named, RENAMES, Rename, Schema, Stage};
+use artifact::{Description, Named, RENAMES, Rename, Schema};
 use schemars::{JsonSchema, schema_for};
 use serde_json::Value;
 
@@ -15,24 +20,48 @@ fn of<T: JsonSchema>() -> Value {
 }
 
 /// What all stages say of themselves.
-fn descriptions() -> Vec<Description> {
-    vec![
-        demo_scene::DemoScene::describe("", ""),
-        prep::Prep::describe("", ""),
-        train_ss::TrainSs::describe("", ""),
-        render_depth::RenderDepth::describe("", ""),
-        eval::Eval::describe("", ""),
-        report::Report::describe("", ""),
-        table::Table::describe("", ""),
-        camera_path::CameraPath::describe("", ""),
-        video::Video::describe("", ""),
-        viewer::Viewer::describe("", ""),
-        register::Register::describe("", ""),
-        train_refine::TrainRefine::describe("", ""),
-        refine::Refine::describe("", ""),
-        upsample::Upsample::describe("", ""),
-        export::Export::describe("", ""),
-    ]
+fn descriptions() -> &'static [Description] {
+    static DESCRIPTIONS: LazyLock<Vec<Description>> =
+        LazyLock::new(|| common::stage_names().iter().map(|name| description(name)).collect());
+    &DESCRIPTIONS
+}
+
+/// What a built stage says of itself, without what differs between builds.
+fn description(name: &str) -> Description {
+    let program = common::bin(name);
+    assert_up_to_date(&program);
+    let output = Command::new(program).arg("describe").output().unwrap();
+    assert!(output.status.success(), "{name}: {}", String::from_utf8_lossy(&output.stderr));
+    let said: Description = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(said.name, name, "folder, crate and program have one name");
+    Description { version: String::new(), code: String::new(), ..said }
+}
+
+/// Whether files are written anew.
+fn is_update() -> bool {
+    std::env::var_os("UPDATE").is_some()
+}
+
+/// Refuses to write what a program says that is older than its sources.
+fn assert_up_to_date(program: &Path) {
+    if !is_update() {
+        return;
+    }
+    // Beside a program cargo lists what it was built from.
+    let list = std::fs::read_to_string(program.with_extension("d")).unwrap();
+    let sources = list.split_whitespace().skip(1).map(Path::new).filter(|path| path.is_file());
+    for source in sources {
+        assert!(
+            modified(source) <= modified(program),
+            "{} is older than {}; run `make build` first",
+            program.display(),
+            source.display()
+        );
+    }
+}
+
+fn modified(file: &Path) -> SystemTime {
+    file.metadata().unwrap().modified().unwrap()
 }
 
 /// The schemas of all files, by their place in `schemas/`.
@@ -53,8 +82,9 @@ fn schemas() -> BTreeMap<String, Value> {
         ("export", of::<export::ExportSummary>()),
         ("degradation", of::<pixels::Degradation>()),
     ];
-    let parameters =
-        descriptions().into_iter().map(|d| (format!("parameters/{}.json", d.name), d.parameters));
+    let parameters = descriptions()
+        .iter()
+        .map(|d| (format!("parameters/{}.json", d.name), d.parameters.clone()));
     files
         .into_iter()
         .map(|(name, schema)| (format!("{name}.json"), schema))
@@ -65,17 +95,16 @@ fn schemas() -> BTreeMap<String, Value> {
 /// Compares a folder with what it should hold, or writes it anew.
 fn check_folder(folder: &str, expected: &BTreeMap<String, String>) {
     let root = common::root().join(folder);
-    let update = std::env::var_os("UPDATE").is_some();
     for (name, text) in expected {
         let path = root.join(name);
-        if update {
+        if is_update() {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(&path, text).unwrap();
         } else {
             let found = std::fs::read_to_string(&path).unwrap_or_default();
             assert!(
                 found == *text,
-                "{folder}/{name} is out of date: UPDATE=1 cargo test --test schemas"
+                "{folder}/{name} is out of date; CONTRIBUTING.md says how it is made"
             );
         }
     }
@@ -102,6 +131,7 @@ fn reference_pages_are_current() {
         .map(|d| (format!("{}.md", d.name), reference::stage_page(d)))
         .collect();
     pages.insert("files.md".to_owned(), reference::files_page(&schemas()));
+    assert_up_to_date(&common::bin("nerf-sr"));
     let project = common::Project::tiny();
     let help = |arguments: &[&str]| project.run(arguments).stdout;
     pages.insert("command-line.md".to_owned(), reference::command_page(help));
@@ -123,10 +153,7 @@ fn help_leads_to_the_reference() {
         .iter()
         .filter(|d| d.documented().iter().any(|section| !section.parameters.is_empty()))
     {
-        let help = std::process::Command::new(common::bin(&description.name))
-            .arg("--help")
-            .output()
-            .unwrap();
+        let help = Command::new(common::bin(&description.name)).arg("--help").output().unwrap();
         let help = String::from_utf8(help.stdout).unwrap();
         let page = format!("docs/reference/{}.md", description.name);
         assert!(help.contains(&page) && common::root().join(&page).exists(), "{page}");

@@ -631,10 +631,8 @@ fn what_slurm_is_told() {
     fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
     run(&["run"]).fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
-    run(&["run", "-j", "2"]).fails(
-        2,
-        &["--jobs, --threads, --memory, --keep-going and --watch are for --executor local"],
-    );
+    run(&["run", "-j", "2"])
+        .fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");
     run(&["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();

@@ -24,7 +24,7 @@ fn a_checkpoint_becomes_a_field() {
         stage_command("train-ss", PARAMETERS, &[("scene", &scene)], &output, &words)
     };
     let run = |output: &str, more: &[&str]| Finished::of(train(output, more).output().unwrap());
-    run("early", &["--from-checkpoint"]).fails(3, &["--work", "no whole checkpoint"]);
+    run("early", &["--from-checkpoint"]).fails(3, &["--work", "no complete checkpoint"]);
     assert!(!project.path("early").exists());
 
     let stopped = train("stopped", &[]).env("NERF_SR_STOP_AFTER", "30000").output().unwrap();
@@ -49,7 +49,7 @@ fn a_checkpoint_becomes_a_field() {
     // A stage without checkpoints says so, and its help is silent about them.
     let words = ["--work", &work_folder, "--from-checkpoint"];
     let prep = stage("demo-scene", "{}", &[], &project.path("no"), &words);
-    prep.fails(2, &["--from-checkpoint: demo-scene makes nothing of a checkpoint"]);
+    prep.fails(2, &["--from-checkpoint: stage demo-scene doesn't have this option"]);
 }
 
 /// Long enough for a look or two on any machine: a look may take a fiftieth of the time.
@@ -68,7 +68,7 @@ fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let watch = format!("--watch={second}");
     let watched = project.run(&[arguments.as_slice(), &[watch.as_str()]].concat());
     assert_eq!(watched.code, 0, "{}", watched.stderr);
-    let start = format!("train-ss: view {second} after ");
+    let start = format!("train-ss: view {second}: ");
     let looks: Vec<&str> = watched.stderr.lines().filter(|l| l.starts_with(&start)).collect();
     assert!(!looks.is_empty(), "no look in:\n{}", watched.stderr);
     let psnr = |look: &str| {
@@ -101,7 +101,7 @@ fn what_cannot_be_watched_is_said_and_the_run_goes_on() {
     let project = Project::tiny();
     let none = project.run(&["run", "train-ss", "--watch"]);
     assert_eq!(none.code, 0, "{}", none.stderr);
-    assert!(none.stderr.contains("train-ss: not watched: nothing in this plan renders"));
+    assert!(none.stderr.contains("train-ss: not watched: no stage of this run can score"));
     let unknown = project.run(&["run", "eval", "-p", "train-ss.seed=2", "--watch=nowhere"]);
     assert_eq!(unknown.code, 0, "{}", unknown.stderr);
     let said = unknown.stderr.lines().find(|line| line.contains("not watched")).unwrap();

@@ -13,6 +13,35 @@ use super::common::{Project, stage};
 pub const WIDTH: u32 = 32;
 pub const ANGLE: f64 = 0.691_111_2;
 
+/// A form of folders.
+pub struct Form {
+    /// The folder's name.
+    pub name: &'static str,
+    /// Writes the folder.
+    pub write: fn(&Project) -> PathBuf,
+    /// What `nerf-sr init` calls it.
+    pub found: &'static str,
+    /// Where `nerf-sr init` has LR images come from.
+    pub lr_source: &'static str,
+}
+
+/// All but the demo scene's own.
+pub const FORMS: &[Form] = &[
+    Form {
+        name: "transforms",
+        write: as_transforms,
+        found: "transforms.json (instant-ngp, nerfstudio)",
+        lr_source: "photographs",
+    },
+    Form { name: "colmap", write: as_colmap, found: "COLMAP (sparse)", lr_source: "photographs" },
+    Form {
+        name: "llff",
+        write: as_llff,
+        found: "LLFF (poses_bounds.npy)",
+        lr_source: "downscaled",
+    },
+];
+
 /// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's
 /// training views, in `folder/images`.
 pub fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {

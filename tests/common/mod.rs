@@ -26,6 +26,50 @@ pub fn bin(name: &str) -> PathBuf {
     path
 }
 
+/// All stages, sorted: a stage's folder, crate and program have one name.
+pub fn stage_names() -> Vec<String> {
+    let folders = std::fs::read_dir(root().join("stages")).unwrap();
+    let mut names: Vec<String> = folders
+        .map(|entry| entry.unwrap().path())
+        .filter(|folder| folder.join("src/main.rs").exists())
+        .map(|folder| folder.file_name().unwrap().to_str().unwrap().to_owned())
+        .filter(|name| !["runner", "remote"].contains(&name.as_str()))
+        .collect();
+    names.sort();
+    names
+}
+
+/// The runner's verbs.
+pub fn verbs() -> Vec<String> {
+    let help = Finished::of(Command::new(bin("nerf-sr")).arg("--help").output().unwrap()).stdout;
+    verbs_of(&help).into_iter().map(str::to_owned).collect()
+}
+
+/// The verbs that the runner's help lists.
+pub fn verbs_of(help: &str) -> Vec<&str> {
+    let lines = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    lines
+        .take_while(|line| !line.is_empty())
+        .filter_map(|line| line.split_whitespace().next())
+        .filter(|verb| *verb != "help")
+        .collect()
+}
+
+/// A verb with what it can't do without, where `prep` is made. A new verb that needs arguments has
+/// them here.
+pub fn call_of(verb: &str) -> Vec<&str> {
+    let arguments: &[&str] = match verb {
+        "init" => &["data"],
+        "why" | "path" | "log" | "describe" => &["prep"],
+        "diff" => &["prep", "prep"],
+        "pin" | "unpin" => &["mine"],
+        "gc" => &["--keep-days", "0"],
+        "completions" => &["bash"],
+        _ => &[],
+    };
+    [&[verb][..], arguments].concat()
+}
+
 /// A pipeline that runs in seconds: 12 views of 24 pixels, a small field.
 pub const TINY: &str = "
 default: [eval]

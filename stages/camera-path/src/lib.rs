@@ -103,16 +103,12 @@ impl Stage for CameraPath {
                 Failure::Usage("parameter poses: kind list needs at least one".to_owned()).into()
             );
         }
-        let view = |(i, pose): (usize, Pose)| {
+        let views = poses.into_iter().enumerate().map(|(i, pose)| {
             let camera =
                 Camera { name: format!("frame_{i:05}"), camera_to_world: pose, ..first.clone() };
             View::camera_only(camera.resized(width, height))
-        };
-        let views = Views::new(
-            given.background,
-            given.bounds,
-            poses.into_iter().enumerate().map(view).collect(),
-        );
+        });
+        let views = Views::new(given.background, given.bounds, views.collect());
         views.check().map_err(|e| Failure::Usage(format!("parameter poses: {e}")))?;
         context.write_json(VIEWS_FILE, &views)?;
         context.write_summary(&format!(
@@ -158,14 +154,8 @@ fn spiral(
         (mean(cameras, Camera::centre), mean(cameras, Camera::forward).normalize_or(DVec3::NEG_Z));
     let right = forward.cross(mean(cameras, |c| c.rotation().y_axis)).normalize_or(DVec3::X);
     let up = right.cross(forward);
-    // Nine in ten cameras lie within (as in LLFF's own spirals).
-    let reach = |axis: DVec3| {
-        let mut offsets: Vec<f64> =
-            cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
-        offsets.sort_by(f64::total_cmp);
-        params.radius * offsets[(offsets.len() - 1) * 9 / 10]
-    };
-    let (aside, above, ahead) = (reach(right), reach(up), reach(forward));
+    let [aside, above, ahead] =
+        [right, up, forward].map(|axis| params.radius * reach(cameras, centre, axis));
     let (near, far) = match bounds.space {
         Space::Ndc(frustum) => (frustum.near, frustum.far),
         _ => (bounds.near, bounds.far),
@@ -183,6 +173,15 @@ fn spiral(
         .collect()
 }
 
+/// How far most cameras stand from a point along an axis: nine in ten lie within (as in LLFF's own
+/// spirals).
+fn reach(cameras: &[Camera], centre: DVec3, axis: DVec3) -> f64 {
+    let mut offsets: Vec<f64> =
+        cameras.iter().map(|c| (c.centre() - centre).dot(axis).abs()).collect();
+    offsets.sort_by(f64::total_cmp);
+    offsets[(offsets.len() - 1) * 9 / 10]
+}
+
 fn orbit(
     cameras: &[Camera],
     bounds: &Bounds,
@@ -191,16 +190,13 @@ fn orbit(
 ) -> Vec<Pose> {
     let up = mean(cameras, |c| c.rotation().y_axis).normalize_or(DVec3::Z);
     let middle = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let level = |c: &Camera| {
-        let from = c.centre() - middle;
-        from - from.dot(up) * up
-    };
     let height = mean(cameras, |c| c.centre() - middle).dot(up);
     // As far away as the cameras are, all in all.
     let distance = cameras.iter().map(|c| (c.centre() - middle).length()).sum::<f64>()
         / cameras.len().max(1) as f64;
     let around = (distance * distance - height * height).max(0.0).sqrt();
-    let first = level(&cameras[0]).normalize_or(up.any_orthonormal_vector());
+    let from = cameras[0].centre() - middle;
+    let first = (from - from.dot(up) * up).normalize_or(up.any_orthonormal_vector());
     shares
         .map(|share| {
             let turn = DQuat::from_axis_angle(up, TAU * params.turns * share);

@@ -173,11 +173,6 @@ impl Stage for DemoScene {
 fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     use std::f64::consts::{PI, TAU};
     let share = (f64::from(i) + 0.5) / f64::from(count);
-    let row =
-        |r: &DMat3, centre: DVec3, k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]];
-    let matrix = |r: DMat3, centre: DVec3| {
-        [row(&r, centre, 0), row(&r, centre, 1), row(&r, centre, 2), [0.0, 0.0, 0.0, 1.0]]
-    };
     if layout == Layout::Forward {
         let (u, v) = if split == "train" {
             (share - 0.5, (f64::from(i) * 0.618_033_988_75 + 0.5) % 1.0 - 0.5)
@@ -201,6 +196,11 @@ fn pose(layout: Layout, split: &str, i: u32, count: u32) -> [[f64; 4]; 4] {
     let right = DVec3::Z.cross(back).normalize();
     let r = DMat3::from_cols(right, back.cross(right), back);
     matrix(r, centre)
+}
+
+fn matrix(r: DMat3, centre: DVec3) -> [[f64; 4]; 4] {
+    let [x, y, z] = [0, 1, 2].map(|k| [r.x_axis[k], r.y_axis[k], r.z_axis[k], centre[k]]);
+    [x, y, z, [0.0, 0.0, 0.0, 1.0]]
 }
 
 #[cfg(test)]

@@ -28,9 +28,8 @@ pub(crate) fn render(
     let focal = half_x / libm::tan(0.5 * angle_x);
     let column = |c: usize| DVec3::new(pose[0][c], pose[1][c], pose[2][c]);
     let (right, up, back, centre) = (column(0), column(1), column(2), column(3));
-    let direction = |x: f64, y: f64| {
-        (((x - half_x) / focal) * right - ((y - half_y) / focal) * up - back).normalize()
-    };
+    let slope = |at: f64, half: f64| (at - half) / focal;
+    let direction = |x, y| (slope(x, half_x) * right - slope(y, half_y) * up - back).normalize();
     let mut colour = Vec::with_capacity((width * height * 4) as usize);
     let mut depth = Vec::with_capacity((width * height) as usize);
     for j in 0..height {

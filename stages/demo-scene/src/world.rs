@@ -1,3 +1,5 @@
+use std::f64::consts::TAU;
+
 use glam::{DMat3, DVec3};
 
 use crate::material::Material;
@@ -70,11 +72,8 @@ impl World {
     /// textures.
     pub fn new(seed: u32) -> Self {
         let turn = f64::from(seed % 360) * 2.4;
-        let place = |slot: u32, distance: f64| {
-            let angle =
-                turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * std::f64::consts::TAU / 5.0;
-            distance * towards(angle) + DVec3::Z * FLOOR
-        };
+        let angle = |slot: u32| turn + f64::from((slot * (1 + seed % 4) + seed) % 5) * TAU / 5.0;
+        let place = |slot, distance: f64| distance * towards(angle(slot)) + DVec3::Z * FLOOR;
         let mut groups = vec![
             base(),
             crate_at(place(0, 0.62), 0.5 + turn),
@@ -189,8 +188,7 @@ fn crate_at(foot: DVec3, angle: f64) -> Cluster {
 /// A cage of rods around a striped ball.
 fn cage(foot: DVec3) -> Cluster {
     let mut things = vec![Thing::new(Shape::Ball(0.17), foot + DVec3::Z * 0.36, Material::Stripes)];
-    let on_circle =
-        |k: usize, n: usize| 0.27 * towards(k as f64 / n as f64 * std::f64::consts::TAU);
+    let on_circle = |k: usize, n: usize| 0.27 * towards(k as f64 / n as f64 * TAU);
     for k in 0..12 {
         let p = on_circle(k, 12);
         things.push(Thing::new(Shape::Rod(p, p + DVec3::Z * 0.7, 0.011), foot, Material::Rod));
@@ -206,17 +204,19 @@ fn cage(foot: DVec3) -> Cluster {
 
 /// A copper spring, in pieces short enough for tight bounding balls.
 fn spring(foot: DVec3) -> Vec<Cluster> {
-    const TURNS: f64 = 5.0;
     const PIECES: usize = 80;
-    let point = |k: usize| {
-        let share = k as f64 / PIECES as f64;
-        let radius = 0.20 - 0.08 * share;
-        radius * towards(share * TURNS * std::f64::consts::TAU) + DVec3::Z * (0.02 + 0.95 * share)
-    };
+    let point = |k: usize| along_spring(k as f64 / PIECES as f64);
     let rods: Vec<Thing> = (0..PIECES)
         .map(|k| Thing::new(Shape::Rod(point(k), point(k + 1), 0.018), foot, Material::Copper))
         .collect();
     rods.chunks(16).map(|piece| group(piece.to_vec())).collect()
+}
+
+/// The point of a spring's wire at a share of its length.
+fn along_spring(share: f64) -> DVec3 {
+    const TURNS: f64 = 5.0;
+    let radius = 0.20 - 0.08 * share;
+    radius * towards(share * TURNS * TAU) + DVec3::Z * (0.02 + 0.95 * share)
 }
 
 /// A sign on a thin post.
@@ -281,8 +281,6 @@ impl Shape {
 
     /// Distance from the surface, below 0 inside, in the shape's own space.
     fn distance(self, p: DVec3) -> f64 {
-        let outside =
-            |beyond: DVec3| beyond.max(DVec3::ZERO).length() + beyond.max_element().min(0.0);
         match self {
             Self::Ball(r) => p.length() - r,
             Self::Block(half) => outside(p.abs() - half),
@@ -308,6 +306,11 @@ impl Shape {
             Self::Rod(a, b, r) => intersect_rod([a, b], r, o, d),
         }
     }
+}
+
+/// Distance from what ends at 0 along each axis, by how far a point lies beyond that.
+fn outside(beyond: DVec3) -> f64 {
+    beyond.max(DVec3::ZERO).length() + beyond.max_element().min(0.0)
 }
 
 fn intersect_ball(r: f64, o: DVec3, d: DVec3) -> Option<(f64, DVec3)> {

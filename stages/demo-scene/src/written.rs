@@ -86,15 +86,15 @@ impl Written {
             self.splits.push((format!("{split}_filenames"), names));
             return Ok(());
         }
-        let frame = |(number, pose): (usize, &[[f64; 4]; 4])| {
+        let frames = poses.iter().enumerate().map(|(number, pose)| {
             let mut frame =
                 json!({"file_path": format!("./{split}/r_{number}"), "transform_matrix": pose});
             if split == "test" {
                 frame["depth_file_path"] = json!(format!("./test/r_{number}_depth.exr"));
             }
             frame
-        };
-        let frames: Vec<Value> = poses.iter().enumerate().map(frame).collect();
+        });
+        let frames: Vec<Value> = frames.collect();
         context
             .write_json(
                 &format!("transforms_{split}.json"),
@@ -122,10 +122,6 @@ impl Written {
 
 /// Writes an image over white.
 fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
-    let over_white = |p: &[u8]| -> [u8; 3] {
-        let alpha = u32::from(p[3]);
-        std::array::from_fn(|c| ((u32::from(p[c]) * alpha + 255 * (255 - alpha) + 127) / 255) as u8)
-    };
     let rgb: Vec<u8> = image.data.chunks_exact(4).flat_map(over_white).collect();
     let encoder = JpegEncoder::new_with_quality(BufWriter::new(File::create(path)?), QUALITY);
     Ok(encoder.write_image(
@@ -134,6 +130,11 @@ fn write_jpeg(path: &Path, image: &Rgba8) -> anyhow::Result<()> {
         image.height as u32,
         ExtendedColorType::Rgb8,
     )?)
+}
+
+fn over_white(p: &[u8]) -> [u8; 3] {
+    let alpha = u32::from(p[3]);
+    std::array::from_fn(|c| ((u32::from(p[c]) * alpha + 255 * (255 - alpha) + 127) / 255) as u8)
 }
 
 /// Depth of the first surface at each pixel's centre; where there is none, `Z` is 0 and `A` is 0.

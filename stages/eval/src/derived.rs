@@ -52,11 +52,10 @@ pub(crate) fn near_references(
     references: &Views,
 ) -> Option<NearReferences> {
     let least = NEAR.to_radians().cos();
-    let is_near = |camera: &Camera| {
-        references.views.iter().any(|other| cosine(camera, &other.camera) >= least)
-    };
     let near: Vec<f64> = (scored.iter().zip(&truth.views))
-        .filter(|(_, view)| is_near(&view.camera))
+        .filter(|(_, view)| {
+            references.views.iter().any(|other| cosine(&view.camera, &other.camera) >= least)
+        })
         .filter_map(|(scores, _)| value(&scores.scores, "psnr"))
         .collect();
     (!near.is_empty()).then(|| NearReferences {

@@ -1,6 +1,7 @@
 //! `eval`: scores views against ground truth, and says by which conventions.
 //!
-//! * `metric`: what a metric is; `metrics`: the list of all. A new one is a file and a line there.
+//! * `metric`: what a metric is; `metrics`: all of them. A new one is a file, and two lines in
+//!   `metrics/mod.rs`.
 //! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are given
 //!   and the build has libtorch): against HR truth.
 //! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there is, no
@@ -12,18 +13,10 @@
 //! Means over views are means of per-view values. Open backgrounds are scored on white. Where a
 //! view has a mask, what doesn't count is taken as right, and PSNR is that of the rest.
 
-mod depth;
 mod derived;
-mod low_resolution;
-#[cfg(feature = "torch")]
-mod lpips;
 mod metric;
 mod metrics;
-mod perceptual;
-mod psnr;
 mod scored_view;
-mod ssim;
-mod warp;
 
 use std::collections::BTreeMap;
 
@@ -34,20 +27,15 @@ use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use depth::{DepthError, depth_error};
 pub use derived::NearReferences;
 use derived::{least_gain, near_references};
-#[cfg(feature = "torch")]
-pub use lpips::Lpips;
 pub use metric::{Figure, Score, Scores};
 use metric::{Metric, mean_of};
-use metrics::metrics;
-pub use perceptual::LpipsNetwork;
-use perceptual::Perceptual;
-pub use psnr::psnr;
+#[cfg(feature = "torch")]
+pub use metrics::Lpips;
+pub use metrics::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
+use metrics::{Perceptual, metrics};
 use scored_view::{ScoredScene, ScoredView};
-pub use ssim::{Ssim, ssim};
-pub use warp::WarpScore;
 
 /// Parameters of `eval`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -204,14 +192,13 @@ fn score(
 
 /// Mean absolute error of the three channels as a colour.
 fn draw_error(found: &Image, expected: &Image, range: f32) -> Rgba8 {
-    let pixel = |(a, b): (&[f32], &[f32])| {
+    let pairs = found.data.chunks_exact(3).zip(expected.data.chunks_exact(3));
+    let data = pairs.flat_map(|(a, b)| {
         let error = a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0;
         let [r, g, b] = heat(Palette::Error, error / range);
         [r, g, b, 255]
-    };
-    let data =
-        found.data.chunks_exact(3).zip(expected.data.chunks_exact(3)).flat_map(pixel).collect();
-    Rgba8::new(found.width, found.height, data)
+    });
+    Rgba8::new(found.width, found.height, data.collect())
 }
 
 fn conventions(

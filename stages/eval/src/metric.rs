@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// Something that views are scored by. A new one is a type in a file of its own, and a line in
-/// `metrics.rs`: `metrics.json`, the page and the summary follow from what it says of itself.
+/// Something that views are scored by. A new one is a type in a file of `metrics/`, and its place in
+/// the list of `metrics/mod.rs`: `metrics.json`, the page and the summary follow from what it says of
+/// itself.
 pub(crate) trait Metric: Sync {
     /// Its key among the conventions, and its pictures' folder.
     fn name(&self) -> &'static str;
@@ -18,7 +19,9 @@ pub(crate) trait Metric: Sync {
     /// Scores a view; nothing where the view lacks what that needs.
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
     /// What a line for people says of means over all views.
-    fn in_words(&self, mean: &Scores) -> Option<String>;
+    fn in_words(&self, _mean: &Scores) -> Option<String> {
+        None
+    }
 }
 
 /// A figure of `metrics.json`, and how it is shown.
@@ -100,18 +103,13 @@ pub(crate) fn value(scores: &Scores, path: &str) -> Option<f64> {
 
 /// Means of the values of the views that have them.
 pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
-    let mut sums: BTreeMap<(String, Option<String>), (f64, usize)> = BTreeMap::new();
-    let mut add = |key: (String, Option<String>), value: f64| {
-        let (sum, count) = sums.entry(key).or_default();
-        *sum += value;
-        *count += 1;
-    };
+    let mut sums = Sums::new();
     for (name, score) in views.flatten() {
         match score {
-            Score::One(value) => add((name.clone(), None), *value),
+            Score::One(value) => add(&mut sums, (name.clone(), None), *value),
             Score::Several(parts) => {
                 for (part, value) in parts {
-                    add((name.clone(), Some(part.clone())), *value);
+                    add(&mut sums, (name.clone(), Some(part.clone())), *value);
                 }
             }
         }
@@ -132,6 +130,15 @@ pub(crate) fn mean_of<'a>(views: impl Iterator<Item = &'a Scores>) -> Scores {
         }
     }
     means
+}
+
+/// Sums of values and how many there are, by name and part.
+type Sums = BTreeMap<(String, Option<String>), (f64, usize)>;
+
+fn add(sums: &mut Sums, key: (String, Option<String>), value: f64) {
+    let (sum, count) = sums.entry(key).or_default();
+    *sum += value;
+    *count += 1;
 }
 
 #[cfg(test)]

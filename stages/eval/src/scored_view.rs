@@ -21,8 +21,8 @@ pub(crate) struct ScoredView<'a> {
     pub(crate) found: Image,
     /// HR truth, where there is any; what doesn't count is as found.
     pub(crate) expected: Option<Image>,
-    /// What a PSNR over all pixels has to be raised by to be that of the pixels that count.
-    pub(crate) masked_decibels: f64,
+    /// Share of the pixels that count: those that the mask leaves.
+    pub(crate) counted_share: f64,
     pub(crate) lr: Option<LrPair>,
 }
 
@@ -30,8 +30,8 @@ pub(crate) struct ScoredView<'a> {
 pub(crate) struct LrPair {
     pub(crate) shrunk: Image,
     pub(crate) expected: Image,
-    /// As [`ScoredView::masked_decibels`].
-    pub(crate) masked_decibels: f64,
+    /// As [`ScoredView::counted_share`].
+    pub(crate) counted_share: f64,
 }
 
 impl<'a> ScoredView<'a> {
@@ -45,13 +45,10 @@ impl<'a> ScoredView<'a> {
         let image = view.image.as_ref().with_context(|| format!("view {name}: it has no image"));
         let image = image.bad_input("views")?;
         let found = read_image(scene.views_in, view, image, scene.views.background)?;
-        let read_true = |file: &Option<String>| {
-            let read = |file| read_image(scene.truth_in, true_view, file, scene.truth.background);
-            file.as_ref().map(|file| read(file)).transpose()
-        };
-        let expected = read_true(&true_view.image)?;
+        let read_true = |file| read_image(scene.truth_in, true_view, file, scene.truth.background);
+        let expected = true_view.image.as_deref().map(read_true).transpose()?;
         check_sizes(true_view, &found, expected.as_ref())?;
-        let lr = read_true(&true_view.low_resolution)?;
+        let lr = true_view.low_resolution.as_deref().map(read_true).transpose()?;
         if expected.is_none() && lr.is_none() {
             let message = format!("truth: view {name} has no image at all");
             return Err(Failure::BadInput(message).into());
@@ -60,10 +57,10 @@ impl<'a> ScoredView<'a> {
         let lr = lr.map(|expected| LrPair {
             shrunk: shrunk(&found, &expected, filter),
             expected,
-            masked_decibels: 0.0,
+            counted_share: 1.0,
         });
-        let masked_decibels = 0.0;
-        let mut scored = Self { scene, view, true_view, found, expected, masked_decibels, lr };
+        let counted_share = 1.0;
+        let mut scored = Self { scene, view, true_view, found, expected, counted_share, lr };
         scored.fill_what_does_not_count()?;
         Ok(scored)
     }
@@ -74,23 +71,23 @@ impl<'a> ScoredView<'a> {
         hr.or_else(|| self.lr.as_ref().map(|lr| (&lr.shrunk, &lr.expected)))
     }
 
-    /// What doesn't count can't differ; PSNR is that of the rest: so many dB less.
+    /// What doesn't count can't differ.
     fn fill_what_does_not_count(&mut self) -> anyhow::Result<()> {
         let name = &self.true_view.camera.name;
         let Some((_, shown)) = self.shown() else { return Ok(()) };
         let mask = self.true_view.read_mask(self.scene.truth_in, (shown.width, shown.height));
         let Some(mask) = mask.bad_input(format!("view {name}"))? else { return Ok(()) };
         if let Some(expected) = &mut self.expected {
-            self.masked_decibels = fill(name, &mask, expected, &self.found)?;
+            self.counted_share = fill(name, &mask, expected, &self.found)?;
         }
         if let Some(lr) = &mut self.lr {
-            lr.masked_decibels = fill(name, &mask, &mut lr.expected, &lr.shrunk)?;
+            lr.counted_share = fill(name, &mask, &mut lr.expected, &lr.shrunk)?;
         }
         Ok(())
     }
 }
 
-/// Gives the truth what was found where that doesn't count. Returns the share that counts in dB.
+/// Gives the truth what was found where that doesn't count. Returns the share that counts.
 fn fill(name: &str, mask: &Mask, truth: &mut Image, found: &Image) -> anyhow::Result<f64> {
     let mask = mask.resized((truth.width, truth.height), 0);
     mask.fill(truth, found);
@@ -99,7 +96,7 @@ fn fill(name: &str, mask: &Mask, truth: &mut Image, found: &Image) -> anyhow::Re
             format!("view {name}: its mask leaves no pixel to score; remove the view or its mask");
         return Err(Failure::BadInput(message).into());
     }
-    Ok(10.0 * mask.share().log10())
+    Ok(mask.share())
 }
 
 /// Refuses a render, or HR truth, of another size than the true camera's.

@@ -45,12 +45,10 @@ impl Border {
             return Self::Transparent;
         }
         let (width, height) = (image.width, image.height);
-        let pixel = |x: usize, y: usize| -> [u8; 3] {
-            std::array::from_fn(|c| image.data[4 * (y * width + x) + c])
-        };
-        let rows = (0..width).flat_map(|x| [pixel(x, 0), pixel(x, height - 1)]);
+        let rows = (0..width).flat_map(|x| [(x, 0), (x, height - 1)]);
+        let columns = (0..height).flat_map(|y| [(0, y), (width - 1, y)]);
         let border: Vec<[u8; 3]> =
-            rows.chain((0..height).flat_map(|y| [pixel(0, y), pixel(width - 1, y)])).collect();
+            rows.chain(columns).map(|(x, y)| colour(image, y * width + x)).collect();
         let middle = median(&border);
         let alike = border.iter().filter(|colour| is_like(**colour, middle)).count();
         if 10 * alike >= 9 * border.len() { Self::Flat(middle) } else { Self::Mixed }
@@ -74,8 +72,7 @@ impl Borders {
         if borders.contains(&Border::Transparent) {
             return Self { behind: Behind::Transparent, flat: 0, views };
         }
-        let colour =
-            |border: &Border| if let Border::Flat(colour) = border { Some(*colour) } else { None };
+        let colour = |b: &Border| if let Border::Flat(c) = b { Some(*c) } else { None };
         let known: Vec<[u8; 3]> = borders.iter().filter_map(colour).collect();
         let common = median(&known);
         let flat = known.iter().filter(|colour| is_like(**colour, common)).count();
@@ -121,6 +118,10 @@ impl Display for Borders {
     }
 }
 
+fn colour(image: &Rgba8, pixel: usize) -> [u8; 3] {
+    std::array::from_fn(|c| image.data[4 * pixel + c])
+}
+
 fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
     colour.iter().zip(other).all(|(a, b)| a.abs_diff(b) <= NOISE)
 }
@@ -137,15 +138,16 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
 /// Looks at the borders of training views, spread evenly; where the first has alpha, at no other.
 /// No more images than threads are held at once.
 pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
-    let look = |frame: &Frame| -> anyhow::Result<Border> {
-        Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?))
-    };
     let count = frames.len().min(LOOKED_AT);
     if count > 0 && look(frames[0])? == Border::Transparent {
         return Ok(Borders::new(&[Border::Transparent]));
     }
     let chosen = (0..count).into_par_iter().map(|i| look(frames[i * frames.len() / count]));
     Ok(Borders::new(&chosen.collect::<anyhow::Result<Vec<Border>>>()?))
+}
+
+fn look(frame: &Frame) -> anyhow::Result<Border> {
+    Ok(Border::of(&frame.photograph().bad_input(frame_name(frame))?))
 }
 
 #[cfg(test)]

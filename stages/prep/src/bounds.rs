@@ -50,17 +50,11 @@ pub fn place(
     let boxed = bounds_of(training);
     let goes_on_unseen = goes_on && training.iter().any(|(_, depths)| depths.is_none());
     let guessed = if goes_on_unseen { guessed_depths(training) } else { None };
-    let ndc = || -> Result<Bounds, SpaceError> {
-        let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
-        let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
-        let space = Space::Ndc(frustum(&all)?);
-        Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
-    };
     match kind {
         Some(SpaceKind::Box) => Ok(boxed),
-        Some(SpaceKind::Ndc) => ndc(),
+        Some(SpaceKind::Ndc) => in_ndc(training, others, guessed),
         Some(SpaceKind::Contraction) => Ok(contracted(boxed, training)),
-        None => Ok(match ndc() {
+        None => Ok(match in_ndc(training, others, guessed) {
             Ok(bounds) => bounds,
             Err(_) if goes_on_unseen || reaches_beyond(&boxed, training) => {
                 contracted(boxed, training)
@@ -68,6 +62,17 @@ pub fn place(
             Err(_) => boxed,
         }),
     }
+}
+
+fn in_ndc(
+    training: &[SeenDepths],
+    others: &[SeenDepths],
+    guessed: Option<[f64; 2]>,
+) -> Result<Bounds, SpaceError> {
+    let known = |(camera, depths): &SeenDepths| (camera.clone(), depths.or(guessed));
+    let all: Vec<SeenDepths> = training.iter().chain(others).map(known).collect();
+    let space = Space::Ndc(frustum(&all)?);
+    Ok(Bounds { space, ..around_frusta(&all).ok_or(SpaceError::NoDepths)? })
 }
 
 /// Share of the distance to what cameras look at before which nothing is taken to lie, and how many
@@ -92,13 +97,10 @@ fn guessed_depths(sights: &[SeenDepths]) -> Option<[f64; 2]> {
 
 /// What all cameras see, from the middle of them: the frustum of NDC.
 fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
-    let mean = |f: &dyn Fn(&Camera) -> DVec3| {
-        sights.iter().map(|(c, _)| f(c)).sum::<DVec3>() / sights.len().max(1) as f64
-    };
     let forward = common_direction(sights.iter().map(|(c, _)| c)).ok_or(SpaceError::NotForward)?;
-    let up = mean(&|c| c.rotation().y_axis);
+    let up = mean(sights, |c| c.rotation().y_axis);
     let right = forward.cross(up).try_normalize().ok_or(SpaceError::NotForward)?;
-    let (up, centre) = (right.cross(forward), mean(&Camera::centre));
+    let (up, centre) = (right.cross(forward), mean(sights, Camera::centre));
     let mut frustum = Frustum {
         camera_to_world: pose_of(DMat3::from_cols(right, up, -forward), centre),
         min: [f64::INFINITY; 2],
@@ -124,14 +126,18 @@ fn frustum(sights: &[SeenDepths]) -> Result<Frustum, SpaceError> {
     if frustum.is_valid() { Ok(frustum) } else { Err(SpaceError::NotForward) }
 }
 
+fn mean(sights: &[SeenDepths], of: fn(&Camera) -> DVec3) -> DVec3 {
+    sights.iter().map(|(camera, _)| of(camera)).sum::<DVec3>() / sights.len().max(1) as f64
+}
+
 /// Whether more lies outside the box than a box can hold.
 fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
     let reach = BEYOND * 0.5 * bounds.longest_side();
-    let far = |(camera, depths): &SeenDepths| {
+    let far = sights.iter().filter(|(camera, depths)| {
         depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
-    };
-    2 * sights.iter().filter(|s| far(s)).count() > sights.len()
+    });
+    2 * far.count() > sights.len()
 }
 
 /// The same box with all around it: from where the nearest view sees something to far beyond the
@@ -149,11 +155,9 @@ fn contracted(boxed: Bounds, sights: &[SeenDepths]) -> Bounds {
     } else {
         0.5 * (DVec3::from(boxed.max) - DVec3::from(boxed.min))
     };
-    let known = |pick: &dyn Fn([f64; 2]) -> f64| {
-        sights.iter().filter_map(|(_, depths)| depths.map(pick)).collect::<Vec<_>>()
-    };
-    let near = known(&|d| 0.5 * d[0]).into_iter().fold(0.05 * radius, f64::min);
-    let far = known(&|d| 10.0 * d[1]).into_iter().fold(100.0 * radius, f64::max);
+    let known = sights.iter().filter_map(|(_, depths)| *depths);
+    let near = known.clone().map(|d| 0.5 * d[0]).fold(0.05 * radius, f64::min);
+    let far = known.map(|d| 10.0 * d[1]).fold(100.0 * radius, f64::max);
     let (min, max) = if looks_out {
         ((centre - half).to_array(), (centre + half).to_array())
     } else {
@@ -178,23 +182,17 @@ fn border(camera: &Camera, depths: [f64; 2]) -> impl Iterator<Item = DVec3> + '_
 /// scenes' habit.
 fn bounds_of(sights: &[SeenDepths]) -> Bounds {
     let cameras: Vec<&Camera> = sights.iter().map(|(camera, _)| camera).collect();
-    let count = cameras.len().max(1) as f64;
     let centre = if let Some(crossing) = crossing(&cameras, 1e-3) {
         crossing
     } else if let Some(bounds) = around_frusta(sights) {
         return bounds;
     } else {
-        let mean =
-            |f: &dyn Fn(&Camera) -> DVec3| cameras.iter().map(|c| f(c)).sum::<DVec3>() / count;
-        mean(&|c| c.centre()) + 4.0 * mean(&|c| c.forward()).normalize_or(DVec3::NEG_Z)
+        let forward = mean(sights, Camera::forward).normalize_or(DVec3::NEG_Z);
+        mean(sights, Camera::centre) + 4.0 * forward
     };
-    let reach = |camera: &&Camera| {
-        let k = &camera.intrinsics;
-        let slope = (0.5 * f64::from(k.width) / k.fx).max(0.5 * f64::from(k.height) / k.fy);
-        (camera.centre() - centre).length() * slope
-    };
+    let widest = cameras.iter().map(|camera| half_width(camera, centre)).fold(0.0, f64::max);
     // A twentieth more: silhouettes that touch the border.
-    let half = 1.05 * cameras.iter().map(reach).fold(0.0, f64::max).max(f64::MIN_POSITIVE.sqrt());
+    let half = 1.05 * widest.max(f64::MIN_POSITIVE.sqrt());
     let box_only = Bounds {
         min: (centre - DVec3::splat(half)).to_array(),
         max: (centre + DVec3::splat(half)).to_array(),
@@ -203,6 +201,13 @@ fn bounds_of(sights: &[SeenDepths]) -> Bounds {
         space: Space::Box,
     };
     with_range(box_only, cameras)
+}
+
+/// Half the longer side of what a camera sees as far away as a place.
+fn half_width(camera: &Camera, place: DVec3) -> f64 {
+    let k = &camera.intrinsics;
+    let slope = (0.5 * f64::from(k.width) / k.fx).max(0.5 * f64::from(k.height) / k.fy);
+    (camera.centre() - place).length() * slope
 }
 
 /// The determinant of axes that say nothing of where they cross.

@@ -1,10 +1,10 @@
 use artifact::counted;
-use dataset::{Dataset, Format, Split};
+use dataset::{Dataset, Split};
 use pixels::Kernel;
 use scene::{Camera, Intrinsics};
 
 use crate::params::{LrSource, Params};
-use crate::sizes::{Sizes, enlarged, sizes};
+use crate::sizes::{Sizes, enlarged, scaled, sizes};
 
 /// Which images are made of photographs: whether there is HR truth, at which sizes, by which
 /// kernel.
@@ -22,10 +22,9 @@ pub(crate) struct ImagePlan {
 impl ImagePlan {
     /// Of a data set's training and test views. What parameters can't have is said.
     pub(crate) fn new(set: &Dataset, split: &Split, params: &Params) -> Result<Self, String> {
-        let is_benchmark = matches!(set.format, Format::Blender | Format::Llff);
         let has_truth = match params.lr_source {
             Some(source) => source == LrSource::Downscaled,
-            None => is_benchmark || params.lr_width.is_some(),
+            None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
         if !has_truth && params.lr_width.is_some() {
             return Err(
@@ -72,13 +71,14 @@ impl ImagePlan {
 
     /// LR and HR size of a view: other shapes are shrunk as much as the first view is.
     pub(crate) fn sizes_of(&self, native: &Intrinsics) -> Sizes {
-        let of = |length: u32, first: u32, target: u32| {
-            ((f64::from(length) * f64::from(target) / f64::from(first)).round() as u32).max(1)
-        };
-        let size = |target: (u32, u32)| {
-            (of(native.width, self.native.0, target.0), of(native.height, self.native.1, target.1))
-        };
-        Sizes { lr: size(self.sizes.lr), hr: size(self.sizes.hr) }
+        let Sizes { lr, hr } = self.sizes;
+        Sizes { lr: self.size_beside(lr, native), hr: self.size_beside(hr, native) }
+    }
+
+    /// Size of a view beside the first view's.
+    fn size_beside(&self, first: (u32, u32), native: &Intrinsics) -> (u32, u32) {
+        let (width, height) = self.native;
+        (scaled(native.width, width, first.0), scaled(native.height, height, first.1))
     }
 
     /// A camera at LR size.
@@ -96,10 +96,7 @@ impl ImagePlan {
     /// Size of an LR image shrunk as HR images were to make LR ones.
     pub(crate) fn one_size_down(&self, (width, height): (u32, u32)) -> (u32, u32) {
         let Sizes { lr, hr } = self.sizes;
-        let shrunk = |length: u32, lr: u32, hr: u32| {
-            ((f64::from(length) * f64::from(lr) / f64::from(hr)).round() as u32).max(1)
-        };
-        (shrunk(width, lr.0, hr.0), shrunk(height, lr.1, hr.1))
+        (scaled(width, hr.0, lr.0), scaled(height, hr.1, lr.1))
     }
 
     /// What was chosen, in a line.

@@ -57,10 +57,7 @@ impl Stage for Prep {
     fn inputs() -> Vec<(&'static str, Input)> {
         vec![(
             "dataset",
-            Input::required(
-                &["dataset"],
-                "posed photographs: Blender's form, transforms.json, LLFF or COLMAP",
-            ),
+            Input::required(&["dataset"], "posed photographs, whatever form their folder has"),
         )]
     }
 

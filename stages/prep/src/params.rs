@@ -21,8 +21,8 @@ pub struct Params {
     #[schemars(range(min = 1.0, max = 16.0), extend("x-group" = "output", "x-default" = "2"))]
     pub scale: Option<f64>,
     /// Where LR images come from: `photographs` as given, without HR ground truth, or `downscaled`
-    /// from HR images by `kernel`. Default: `photographs` for COLMAP and transforms.json without
-    /// `lr_width`, else `downscaled`.
+    /// from HR images by `kernel`. Default: `downscaled` for a benchmark's data set and with
+    /// `lr_width`, else `photographs`.
     #[schemars(extend("x-group" = "data", "x-default" = "by data set"))]
     pub lr_source: Option<LrSource>,
     /// Kernel that makes LR images from HR ones. With `lr_source: photographs`, the kernel that is

@@ -1,6 +1,6 @@
 use artifact::counted;
 use glam::DVec3;
-use scene::Camera;
+use scene::{Camera, Intrinsics};
 
 /// Cameras that are so many times as far from the middle of all as half of them are, at least, are
 /// far off. One that is doubles the box as often as that; walks through a room have 2 to 5.
@@ -83,18 +83,13 @@ fn far_off(all: &[Named]) -> Option<String> {
         return None;
     }
     let far: Vec<usize> = (0..all.len()).filter(|&i| away[i] > FAR_OFF * usual).collect();
-    let times = |i: usize| {
-        format!(
-            "{} is {:.0} times as far from the middle of all cameras as half of them",
-            all[i],
-            away[i] / usual
-        )
-    };
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
     far.first().map(|&first| {
         format!(
-            "{}{more}; is its pose right? The scene's bounds follow from all poses",
-            times(first)
+            "{} is {:.0} times as far from the middle of all cameras as half of them{more}; is its \
+            pose right? The scene's bounds follow from all poses",
+            all[first],
+            away[first] / usual
         )
     })
 }
@@ -108,12 +103,7 @@ fn median(of: impl Iterator<Item = f64>) -> f64 {
 
 /// Principal points far from the middles of images: commonly numbers for images of another size.
 fn off_centre(all: &[Named]) -> Option<String> {
-    let is_off = |named: &&Named| {
-        let k = &named.camera.intrinsics;
-        let off = |at: f64, length: u32| (at / f64::from(length) - 0.5).abs() > OFF_CENTRE;
-        off(k.cx, k.width) || off(k.cy, k.height)
-    };
-    let off: Vec<&Named> = all.iter().filter(is_off).collect();
+    let off: Vec<&Named> = all.iter().filter(|n| is_off_centre(&n.camera.intrinsics)).collect();
     let first = off.first()?;
     let k = &first.camera.intrinsics;
     Some(format!(
@@ -126,6 +116,11 @@ fn off_centre(all: &[Named]) -> Option<String> {
         k.width,
         k.height
     ))
+}
+
+fn is_off_centre(k: &Intrinsics) -> bool {
+    let off = |at: f64, length: u32| (at / f64::from(length) - 0.5).abs() > OFF_CENTRE;
+    off(k.cx, k.width) || off(k.cy, k.height)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@ use artifact::WARNING;
 use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space};
 
-use crate::bounds::place;
+use crate::bounds::{SeenDepths, place};
 use crate::image_plan::ImagePlan;
 use crate::params::Params;
 use crate::{pose_warnings, references};
@@ -50,12 +50,9 @@ fn bounds(
         .zip(params.far)
         .map(|(near, far)| [near, far])
         .filter(|[near, far]| 0.0 < *near && near < far);
-    let sights = |frames: &[&Frame]| -> Vec<_> {
-        frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect()
-    };
+    let (train, test) = (sights(train, given), sights(test, given));
     let goes_on = background == Background::Opaque;
-    let mut bounds =
-        place(&sights(train), &sights(test), goes_on, params.space).map_err(|e| e.to_string())?;
+    let mut bounds = place(&train, &test, goes_on, params.space).map_err(|e| e.to_string())?;
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
@@ -73,6 +70,11 @@ fn bounds(
         return Err(format!("parameter near: {} is not before far = {}", bounds.near, bounds.far));
     }
     Ok(bounds)
+}
+
+/// What views see, between given depths where a view's own aren't known.
+fn sights(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<SeenDepths> {
+    frames.iter().map(|f| (f.camera(), f.depths.or(given))).collect()
 }
 
 /// Warnings of what looks wrong about poses; such as can't be right are refused.

@@ -111,9 +111,13 @@ pub fn sizes(
             limit: hr,
         });
     }
-    let height =
-        |w: u32| ((f64::from(native.1) * f64::from(w) / f64::from(native.0)).round() as u32).max(1);
+    let height = |width: u32| scaled(native.1, native.0, width);
     Ok(Sizes { lr: (lr, height(lr)), hr: (hr, height(hr)) })
+}
+
+/// A length where `from` becomes `to`, in whole pixels.
+pub(crate) fn scaled(length: u32, from: u32, to: u32) -> u32 {
+    ((f64::from(length) * f64::from(to) / f64::from(from)).round() as u32).max(1)
 }
 
 /// LR and HR size where the photographs are the LR images: HR from `hr_width` or `scale`.

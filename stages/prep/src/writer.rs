@@ -57,23 +57,29 @@ impl<'a> SceneWriter<'a> {
     /// `train`: LR images; `downscaled`: the same task one size down, where its solution is known.
     fn write_train_and_downscaled(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
-        let train = |frame: &&Frame| View {
-            image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
-            mask: mask_name(frame),
-            ..View::camera_only(images.at_lr(&frame.camera()))
-        };
-        let train: Vec<View> = self.plan.train.iter().map(train).collect();
-        let downscaled = |view: &View| {
-            let k = &view.camera.intrinsics;
-            let (width, height) = images.one_size_down((k.width, k.height));
-            View { camera: view.camera.resized(width, height), ..view.clone() }
-        };
-        self.write_views("downscaled", train.iter().map(downscaled).collect())?;
+        let train: Vec<View> = self.plan.train.iter().map(|f| self.training_view(f)).collect();
+        let downscaled = train.iter().map(|view| self.one_size_down(view)).collect();
+        self.write_views("downscaled", downscaled)?;
         self.write_views("train", train)?;
         self.write_degradation("train", images.kernel, images.sizes.hr)?;
         // LR images that weren't rounded are shrunk by the box: the same, and for any size.
         let kernel = if images.kernel == Kernel::Average { Kernel::Box } else { images.kernel };
         self.write_degradation("downscaled", kernel, images.sizes.lr)
+    }
+
+    fn training_view(&self, frame: &Frame) -> View {
+        let images = &self.plan.images;
+        View {
+            image: Some(format!("images/{}.{}", frame.name, degrade::extension(images.kernel))),
+            mask: mask_name(frame),
+            ..View::camera_only(images.at_lr(&frame.camera()))
+        }
+    }
+
+    fn one_size_down(&self, view: &View) -> View {
+        let k = &view.camera.intrinsics;
+        let (width, height) = self.plan.images.one_size_down((k.width, k.height));
+        View { camera: view.camera.resized(width, height), ..view.clone() }
     }
 
     /// `train-cameras`: the training cameras at HR size.
@@ -91,21 +97,33 @@ impl<'a> SceneWriter<'a> {
         if self.plan.references.is_empty() {
             return Ok(());
         }
-        let view = |&i: &usize| {
-            let frame = self.plan.train[i];
-            View {
-                image: Some(format!("images/{}.png", frame.name)),
-                mask: mask_name(frame),
-                ..View::camera_only(self.plan.images.at_hr(&frame.camera()))
-            }
-        };
-        self.write_views("references", self.plan.references.iter().map(view).collect())
+        let frames = self.plan.references.iter().map(|&i| self.plan.train[i]);
+        self.write_views("references", frames.map(|frame| self.reference(frame)).collect())
+    }
+
+    fn reference(&self, frame: &Frame) -> View {
+        View {
+            image: Some(format!("images/{}.png", frame.name)),
+            mask: mask_name(frame),
+            ..View::camera_only(self.plan.images.at_hr(&frame.camera()))
+        }
     }
 
     /// `truth`: test views at HR size, with their LR photographs; `cameras`: their cameras alone.
     fn write_truth_and_cameras(&self) -> anyhow::Result<()> {
         let images = &self.plan.images;
-        let view = |frame: &&Frame| View {
+        let truth: Vec<View> = self.plan.test.iter().map(|frame| self.test_view(frame)).collect();
+        self.write_views(
+            "cameras",
+            truth.iter().map(|view| View::camera_only(view.camera.clone())).collect(),
+        )?;
+        self.write_degradation("truth", images.kernel, images.sizes.hr)?;
+        self.write_views("truth", truth)
+    }
+
+    fn test_view(&self, frame: &Frame) -> View {
+        let images = &self.plan.images;
+        View {
             image: images.has_truth.then(|| format!("images/{}.png", frame.name)),
             mask: mask_name(frame),
             depth: frame
@@ -119,14 +137,7 @@ impl<'a> SceneWriter<'a> {
                 degrade::extension(images.kernel)
             )),
             ..View::camera_only(images.at_hr(&frame.camera()))
-        };
-        let truth: Vec<View> = self.plan.test.iter().map(view).collect();
-        self.write_views(
-            "cameras",
-            truth.iter().map(|view| View::camera_only(view.camera.clone())).collect(),
-        )?;
-        self.write_degradation("truth", images.kernel, images.sizes.hr)?;
-        self.write_views("truth", truth)
+        }
     }
 
     fn write_training_images(&self) -> anyhow::Result<()> {
@@ -267,12 +278,12 @@ impl<'a> SceneWriter<'a> {
     ) -> anyhow::Result<()> {
         let native = read_exr(source)?;
         let shown = source.display().to_string();
-        let channel = |name: &str| {
+        let [depth, opacity] = ["Z", "A"].map(|name| {
             native
                 .channel(name)
                 .with_context(|| format!("{}: no channel {name}", printable(&shown)))
-        };
-        let (depth, opacity) = (channel("Z")?, channel("A")?);
+        });
+        let (depth, opacity) = (depth?, opacity?);
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
         let channels = [

@@ -36,13 +36,13 @@ pub(crate) fn read_references(
         else {
             continue;
         };
-        let unknown = || {
-            Failure::BadInput(format!(
+        let Some(view) = rendered_list.taken_by(&image.camera) else {
+            let message = format!(
                 "input reference-views: no view {name} with that pose; \
                 render it for input references"
-            ))
+            );
+            return Err(Failure::BadInput(message).into());
         };
-        let view = rendered_list.taken_by(&image.camera).ok_or_else(unknown)?;
         let view = read_view(rendered, view, background.shown())?.0;
         let known = KnownView::new(view, truth.over(background.shown()))
             .bad_input("input reference-views")?;

@@ -117,16 +117,13 @@ impl Registered {
         background: f32,
     ) -> Result<Self, RenderError> {
         let pyramid = Pyramid::new(image, params.smaller);
-        let moved = |camera: &Camera, level: u32, renderings: u32| {
-            let options = Options { renderings, background, ..Options::default() };
-            refine(field, camera, &pyramid, level, &options)
-        };
-        let given = moved(camera, 0, 1)?;
+        let options = Options { renderings: params.renderings, background, ..Options::default() };
+        let given = refine(field, camera, &pyramid, 0, &Options { renderings: 1, ..options })?;
         let mut to = camera.clone();
         for level in (1..=pyramid.smaller()).rev() {
-            to = moved(&to, level, params.renderings)?.camera;
+            to = refine(field, &to, &pyramid, level, &options)?.camera;
         }
-        let last = moved(&to, 0, params.renderings)?;
+        let last = refine(field, &to, &pyramid, 0, &options)?;
         let best = if last.after < given.before { last } else { given.clone() };
         let from = camera.resized(image.width as u32, image.height as u32);
         Ok(Self {

@@ -120,10 +120,6 @@ pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow
         )
         .into());
     }
-    let is_plain = |file: &&FileEntry| {
-        file.path != MANIFEST_FILE
-            && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
-    };
     if manifest.files.iter().try_fold(0_u64, |sum, file| sum.checked_add(file.size)).is_none() {
         return Err(refuse("sizes that no disk has".to_owned()).into());
     }
@@ -133,4 +129,9 @@ pub(crate) fn read_manifest(folder: &Path, identity: &str, name: &str) -> anyhow
         }
         None => Ok(manifest),
     }
+}
+
+fn is_plain(file: &FileEntry) -> bool {
+    file.path != MANIFEST_FILE
+        && relative_path(&file.path).is_ok_and(|path| path.to_str() == Some(file.path.as_str()))
 }

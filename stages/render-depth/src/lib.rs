@@ -194,21 +194,18 @@ impl RenderJob<'_> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
         let n = self.params.samples_per_axis as usize;
-        let all = |rows: Range<usize>| -> Vec<[usize; 2]> {
-            rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect()
-        };
         if n == 1 || self.params.tolerance == 0.0 {
-            return self.cast(&all(rows), n);
+            return self.cast(&places(rows, width), n);
         }
         // The row above is there already, the row below is the next band's first.
         let kept = rows.start.saturating_sub(1).max(centres.first);
         centres.pixels.drain(..(kept - centres.first) * width);
         centres.first = kept;
         let next = kept + centres.pixels.len() / width;
-        centres.pixels.extend(self.cast(&all(next..(rows.end + 1).min(height)), 1)?);
+        centres.pixels.extend(self.cast(&places(next..(rows.end + 1).min(height), width), 1)?);
 
         let tolerance = self.params.tolerance as f32;
-        let mut pixels = all(rows.clone());
+        let mut pixels = places(rows.clone(), width);
         pixels.retain(|&pixel| centres.error(pixel, width) > tolerance);
         let several = self.cast(&pixels, n)?;
         let first = (rows.start - centres.first) * width;
@@ -237,32 +234,28 @@ impl RenderJob<'_> {
             .unzip();
         let rendered: Result<Vec<_>, _> = self.members.iter().map(|m| m.render(&rays)).collect();
         let rendered = rendered.map_err(fields::rendering_failure)?;
-        let mut subs = Vec::new();
-        let shown = |i: usize| {
+        let (mut shown, mut subs) = (Vec::with_capacity(pixels.len()), Vec::new());
+        for i in 0..pixels.len() {
             let rays = i * n * n..(i + 1) * n * n;
             subs.clear();
             subs.extend(
                 rendered.iter().flat_map(|r| r[rays.clone()].iter().zip(&to_z[rays.clone()])),
             );
-            self.shown(&subs)
-        };
-        Ok((0..pixels.len()).map(shown).collect())
+            shown.push(self.shown(&subs));
+        }
+        Ok(shown)
     }
 
     /// What a pixel shows of its rays, each with its z-depth per distance.
     fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
-        let share = 1.0 / subs.len() as f32;
-        let mean = |of: &dyn Fn(&radiance::Pixel) -> f32| {
-            subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share
-        };
-        let [r, g, b] = std::array::from_fn(|c| mean(&|p| p.premultiplied[c]));
+        let [r, g, b] = std::array::from_fn(|c| mean(subs, |p| p.premultiplied[c]));
         let mut distances: Vec<(f32, f32)> =
             subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect();
         // A mean would invent a surface between two.
         let (distance, to_z) = middle(&mut distances, |d| d.0).copied().unwrap_or_default();
         ViewPixel {
-            channels: [r, g, b, mean(&|p| p.opacity), distance * to_z, distance],
-            colour: std::array::from_fn(|c| mean(&|p| p.colour[c])),
+            channels: [r, g, b, mean(subs, |p| p.opacity), distance * to_z, distance],
+            colour: std::array::from_fn(|c| mean(subs, |p| p.colour[c])),
         }
     }
 
@@ -272,6 +265,16 @@ impl RenderJob<'_> {
             Depth::Median => pixel.median_depth,
         }
     }
+}
+
+/// The pixels `[x, y]` of some rows.
+fn places(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
+    rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect()
+}
+
+fn mean(subs: &[(&radiance::Pixel, &f32)], of: impl Fn(&radiance::Pixel) -> f32) -> f32 {
+    let share = 1.0 / subs.len() as f32;
+    subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share
 }
 
 /// What a pixel shows.
@@ -301,11 +304,15 @@ impl Centres {
         if !inside {
             return f32::INFINITY;
         }
-        let bend = |c: usize, by: usize| {
-            let [before, own, after] = [at - by, at, at + by].map(|i| self.pixels[i].channels[c]);
-            (before - 2.0 * own + after).abs()
-        };
-        (0..4).map(|c| bend(c, 1) + bend(c, width)).fold(0.0, f32::max) / 24.0
+        let bends = (0..4).map(|c| self.bend(at, c, 1) + self.bend(at, c, width));
+        bends.fold(0.0, f32::max) / 24.0
+    }
+
+    /// A channel's second difference at a pixel, along a step.
+    fn bend(&self, at: usize, channel: usize, step: usize) -> f32 {
+        let [before, own, after] =
+            [at - step, at, at + step].map(|i| self.pixels[i].channels[channel]);
+        (before - 2.0 * own + after).abs()
     }
 }
 

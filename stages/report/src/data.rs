@@ -210,15 +210,15 @@ impl Scales {
     }
 
     fn layer_data(&self, layers: &[Layer<'_>]) -> Vec<LayerData> {
-        let data = |(index, layer): (usize, &Layer<'_>)| LayerData {
+        let data = layers.iter().enumerate().map(|(index, layer)| LayerData {
             label: layer.label.clone(),
             group: layer.group.heading(),
             kind: layer.group.file_name(),
             scene: layer.scene,
             row: layer.row,
             scale: self.of_layer.get(&index).copied(),
-        };
-        layers.iter().enumerate().map(data).collect()
+        });
+        data.collect()
     }
 }
 
@@ -241,12 +241,12 @@ fn figures(report: &Report<'_>) -> Vec<FigureData> {
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
     let known = || report.figures.iter().filter(|figure| figure.is_known(&report.rows));
-    let scores = |(scene, name): (usize, &String)| {
-        let view = row.view(name).filter(|_| scene == row.scene)?;
-        Some(known().map(|figure| figure.of(&view["scores"])).collect())
-    };
     let views = report.scenes.iter().enumerate();
     let views = views.flat_map(|(scene, views)| views.views.iter().map(move |name| (scene, name)));
+    let scores = views.map(|(scene, name)| {
+        let view = row.view(name).filter(|_| scene == row.scene)?;
+        Some(known().map(|figure| figure.of(&view["scores"])).collect())
+    });
     RowData {
         label: row.label.clone(),
         scene: row.scene,
@@ -254,19 +254,20 @@ fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
         rendering: row.rendering,
         axes: row.node.values.clone(),
         mean: known().map(|figure| figure.mean(row)).collect(),
-        scores: views.map(scores).collect(),
+        scores: scores.collect(),
     }
 }
 
 /// Curves of all trainings that left one.
 fn curves(nodes: &[RunNode]) -> Vec<Curve> {
-    let curve = |node: &RunNode| {
-        let text = std::fs::read_to_string(node.folder.join("training.json")).ok()?;
-        let log: Value = serde_json::from_str(&text).ok()?;
-        let point = |point: &Value| Some([point["rays"].as_f64()?, point["psnr"].as_f64()?]);
-        let points: Vec<_> = log["curve"].as_array()?.iter().filter_map(point).collect();
-        let label = artifact::label(&node.stage, &node.point);
-        (points.len() > 1).then_some(Curve { label, points })
-    };
     nodes.iter().filter_map(curve).collect()
+}
+
+fn curve(node: &RunNode) -> Option<Curve> {
+    let text = std::fs::read_to_string(node.folder.join("training.json")).ok()?;
+    let log: Value = serde_json::from_str(&text).ok()?;
+    let point = |point: &Value| Some([point["rays"].as_f64()?, point["psnr"].as_f64()?]);
+    let points: Vec<_> = log["curve"].as_array()?.iter().filter_map(point).collect();
+    let label = artifact::label(&node.stage, &node.point);
+    (points.len() > 1).then_some(Curve { label, points })
 }

@@ -97,9 +97,8 @@ impl<'a> Report<'a> {
     pub(crate) fn best(&self) -> Option<&Row<'a>> {
         let by = self.figures.first();
         let value = |row: &Row<'_>| by.and_then(|figure| figure.mean(row));
-        let is_better = |a: f64, b: f64| {
-            if by.and_then(|f| f.higher_is_better) == Some(false) { a < b } else { a > b }
-        };
+        let lower_is_better = by.and_then(|f| f.higher_is_better) == Some(false);
+        let is_better = |a: f64, b: f64| if lower_is_better { a < b } else { a > b };
         self.rows.iter().reduce(|best, row| match (value(best), value(row)) {
             (Some(held), Some(new)) if is_better(new, held) => row,
             (None, Some(_)) => row,
@@ -154,13 +153,11 @@ fn times(run: &RunRecord, node: &RunNode, index: usize) -> [f64; 2] {
         next = run.nodes[index].inputs.get("views").and_then(|input| input.node);
     }
     let seconds = |i: &usize| run.nodes[*i].seconds;
-    let trains = |i: &usize| {
+    let mut trained = run.ancestors(index);
+    trained.retain(|i| {
         ["field", "refiner", "views"].contains(&run.nodes[*i].kind.as_str())
             && !rendered.contains(i)
-    };
+    });
     let of = |seconds: f64| seconds + 0.0; // a sum of nothing is -0
-    [
-        of(run.ancestors(index).iter().filter(|i| trains(i)).map(seconds).sum()),
-        of(rendered.iter().map(seconds).sum()),
-    ]
+    [of(trained.iter().map(seconds).sum()), of(rendered.iter().map(seconds).sum())]
 }

@@ -154,18 +154,18 @@ pub(crate) fn layers<'a>(report: &'a Report<'a>) -> anyhow::Result<Vec<Layer<'a>
 /// Ground truth, photographs and true depth, where there are any.
 fn add_observations(layers: &mut Vec<Layer<'_>>, scene: usize, folder: &Arc<Folder>, whose: &str) {
     let views = &folder.views.views;
-    let mut add = |label: &str, group, source| {
-        let label = format!("{label}{whose}");
-        layers.push(Layer { label, group, scene, row: None, source });
-    };
+    let layer = |label, group, source| Layer { label, group, scene, row: None, source };
     if views.iter().any(|view| view.low_resolution.is_some()) {
-        add("LR photograph", Group::LowResolution, Source::LowResolution(Arc::clone(folder)));
+        let source = Source::LowResolution(Arc::clone(folder));
+        layers.push(layer(format!("LR photograph{whose}"), Group::LowResolution, source));
     }
     if views.iter().any(|view| view.image.is_some()) {
-        add("Ground truth", Group::Truth, Source::Image(Arc::clone(folder)));
+        let source = Source::Image(Arc::clone(folder));
+        layers.push(layer(format!("Ground truth{whose}"), Group::Truth, source));
     }
     if views.iter().any(|view| view.depth.is_some()) {
-        add("Ground truth", Group::Depth, Source::Depth(Arc::clone(folder)));
+        let source = Source::Depth(Arc::clone(folder));
+        layers.push(layer(format!("Ground truth{whose}"), Group::Depth, source));
     }
 }
 
@@ -176,34 +176,32 @@ fn add_method<'a>(
     index: usize,
 ) -> anyhow::Result<()> {
     let row = &report.rows[index];
-    let label = if report.rows.len() == 1 { ONLY_RENDER.to_owned() } else { row.label.clone() };
-    let mut add = |group, source| {
-        layers.push(Layer {
-            label: label.clone(),
-            group,
-            scene: row.scene,
-            row: Some(index),
-            source,
-        });
-    };
     if let Some(path) = folder_of(report, row, "views").filter(|path| is_views(path)) {
         let folder = Folder::read(path)?;
         let has_depth = folder.views.views.iter().any(|view| view.depth.is_some());
-        add(Group::Render, Source::Image(Arc::clone(&folder)));
+        let render = Source::Image(Arc::clone(&folder));
+        layers.push(of_method(report, index, Group::Render, render));
         if has_depth {
-            add(Group::Depth, Source::Depth(folder));
+            layers.push(of_method(report, index, Group::Depth, Source::Depth(folder)));
         }
     }
-    let has = |pointer: &str| {
-        let views = row.metrics["views"].as_array();
-        views.into_iter().flatten().any(|view| view.pointer(pointer).is_some_and(Value::is_string))
-    };
     for (group, pointer) in [(Group::Error, "/error_map"), (Group::Warp, "/pictures/warp")] {
-        if has(pointer) {
-            add(group, Source::Scored(row, pointer));
+        if names_files(row, pointer) {
+            layers.push(of_method(report, index, group, Source::Scored(row, pointer)));
         }
     }
     Ok(())
+}
+
+fn of_method<'a>(report: &Report<'_>, index: usize, group: Group, source: Source<'a>) -> Layer<'a> {
+    let row = &report.rows[index];
+    let label = if report.rows.len() == 1 { ONLY_RENDER.to_owned() } else { row.label.clone() };
+    Layer { label, group, scene: row.scene, row: Some(index), source }
+}
+
+fn names_files(row: &Row<'_>, pointer: &str) -> bool {
+    let views = row.metrics["views"].as_array();
+    views.into_iter().flatten().any(|view| view.pointer(pointer).is_some_and(Value::is_string))
 }
 
 fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf> {
@@ -216,10 +214,11 @@ fn is_views(folder: &Path) -> bool {
 
 /// The rows that are scored on a truth, in words.
 fn users(report: &Report<'_>, truth: &Path) -> String {
-    let is_user =
-        |row: &&Row<'_>| folder_of(report, row, "truth").is_some_and(|path| path == truth);
-    let labels: Vec<&str> =
-        report.rows.iter().filter(is_user).map(|row| row.label.as_str()).collect();
+    let users = report
+        .rows
+        .iter()
+        .filter(|row| folder_of(report, row, "truth").is_some_and(|path| path == truth));
+    let labels: Vec<&str> = users.map(|row| row.label.as_str()).collect();
     match labels.as_slice() {
         [one] => (*one).to_owned(),
         [first, ..] => format!("{first} and {} more", labels.len() - 1),

@@ -155,8 +155,7 @@ fn wish(items: &[Item], index: usize) -> f64 {
 fn free_place(taken: &[(f64, f64)], wish: f64) -> f64 {
     let room = |half: f64| half + LANE;
     let beside = taken.iter().flat_map(|(x, half)| [x + room(*half), x - room(*half)]);
-    let is_free =
-        |place: &f64| taken.iter().all(|(x, half)| (x - place).abs() > room(*half) - 1e-6);
+    let is_free = |at: &f64| taken.iter().all(|(x, half)| (x - at).abs() > room(*half) - 1e-6);
     let near = |a: &f64, b: &f64| (a - wish).abs().total_cmp(&(b - wish).abs());
     [wish].into_iter().chain(beside).filter(is_free).min_by(near).unwrap_or(wish)
 }

@@ -90,23 +90,27 @@ pub(crate) fn pictures(
 ) -> anyhow::Result<Vec<Picture>> {
     let files = file_names(layers, wanted);
     let progress = context.progress("pictures", 2 * wanted.len() as u64);
-    let write = |(wanted, file): (&Wanted<'_>, String)| {
-        context.check_interrupt()?;
-        let original = write_original(context, layers, wanted, file)?;
-        progress.add(1);
-        anyhow::Ok(original)
-    };
-    let originals = wanted.par_iter().zip(files).map(write).collect::<anyhow::Result<Vec<_>>>()?;
+    let originals = wanted
+        .par_iter()
+        .zip(files)
+        .map(|(wanted, file)| {
+            context.check_interrupt()?;
+            let original = write_original(context, layers, wanted, file)?;
+            progress.add(1);
+            anyhow::Ok(original)
+        })
+        .collect::<anyhow::Result<Vec<_>>>()?;
     let originals: Vec<Original> = originals.into_iter().flatten().collect();
     let mut first = first_quality(&originals, budget)?;
     loop {
-        let encode = |original: &Original| {
-            context.check_interrupt()?;
-            progress.add(1);
-            copy(original, QUALITIES[first])
-        };
-        let pictures =
-            originals.par_iter().map(encode).collect::<anyhow::Result<Vec<Picture>>>()?;
+        let pictures = originals
+            .par_iter()
+            .map(|original| {
+                context.check_interrupt()?;
+                progress.add(1);
+                copy(original, QUALITIES[first])
+            })
+            .collect::<anyhow::Result<Vec<Picture>>>()?;
         let bytes: usize = pictures.iter().map(|picture| picture.uri.len()).sum();
         if bytes <= budget || first + 1 == QUALITIES.len() {
             return Ok(pictures);
@@ -219,23 +223,26 @@ fn encode_jpeg(image: &Rgba8, quality: u8, group: Group) -> anyhow::Result<Vec<u
 /// Names of originals, each once: a folder a view, with plain letters alone.
 fn file_names(layers: &[Layer<'_>], wanted: &[Wanted<'_>]) -> Vec<String> {
     let mut taken = BTreeSet::new();
-    let mut name = |wanted: &Wanted<'_>| {
-        let layer = &layers[wanted.layer];
-        let whose = match (layer.row, layer.group) {
-            (None, _) => String::new(),
-            (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
-            (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),
-        };
-        let stem = format!("views/{}/{}{whose}", plain(wanted.name), layer.group.file_name());
-        let numbered = |number: usize| match number {
-            1 => format!("{stem}.png"),
-            _ => format!("{stem}-{number}.png"),
-        };
-        let free = (1..).map(numbered).find(|file| !taken.contains(file)).unwrap_or_default();
+    let mut names = Vec::with_capacity(wanted.len());
+    for wanted in wanted {
+        let stem = stem(&layers[wanted.layer], wanted.name);
+        let numbered = (2usize..).map(|number| format!("{stem}-{number}.png"));
+        let mut files = [format!("{stem}.png")].into_iter().chain(numbered);
+        let free = files.find(|file| !taken.contains(file)).unwrap_or_default();
         taken.insert(free.clone());
-        free
+        names.push(free);
+    }
+    names
+}
+
+/// Path of a view's original without its ending; other originals may have the same.
+fn stem(layer: &Layer<'_>, view: &str) -> String {
+    let whose = match (layer.row, layer.group) {
+        (None, _) => String::new(),
+        (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
+        (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),
     };
-    wanted.iter().map(&mut name).collect()
+    format!("views/{}/{}{whose}", plain(view), layer.group.file_name())
 }
 
 /// Letters that are plain in paths and addresses, 60 at most.

@@ -127,8 +127,6 @@ fn graph(run: &RunRecord) -> (Vec<Block<'_>>, Vec<(usize, usize)>, Vec<&PathBuf>
 
 fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Markup {
     let Drawing { width, height, boxes, edges } = drawing;
-    let place =
-        |[x, y]: [f64; 2]| format!("left:{x:.0}px;top:{y:.0}px;width:{WIDTH}px;height:{HEIGHT}px");
     html! {
         div class="canvas" style=(format!("width:{width:.0}px;height:{height:.0}px")) {
             svg width=(width) height=(height) aria-hidden="true" {
@@ -155,6 +153,10 @@ fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Marku
             }
         }
     }
+}
+
+fn place([x, y]: [f64; 2]) -> String {
+    format!("left:{x:.0}px;top:{y:.0}px;width:{WIDTH}px;height:{HEIGHT}px")
 }
 
 /// The last part of a path.
@@ -191,11 +193,11 @@ impl Block<'_> {
 
     /// State and hash, or the number of points.
     fn stand(&self) -> String {
-        let of_state = |(state, count): (State, usize)| match self.count() {
+        let states = self.states().map(|(state, count)| match self.count() {
             1 => format!("{} {}", state.sign(), state.words()),
             _ => format!("{} {count} {}", state.sign(), state.words()),
-        };
-        let states: Vec<String> = self.states().map(of_state).collect();
+        });
+        let states: Vec<String> = states.collect();
         let hash = match self.done.as_slice() {
             [node] if self.count() == 1 => short(&node.output),
             _ => "",
@@ -210,10 +212,6 @@ fn short(hash: &str) -> &str {
 
 fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
     let program = block.done.first().map(|node| node.program.as_str()).unwrap_or_default();
-    let one = |content: Markup| html! { div class="node" { (content) } };
-    let several = |point: &str, content: Markup| {
-        html! { details class="point" { summary { (point) } (content) } }
-    };
     html! {
         details class="stage" {
             summary {
@@ -224,13 +222,22 @@ fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
             // A link's target, which opens what it is in.
             span id={ "stage-" (number) } class="target" {}
             @for node in &block.done {
-                @let content = node_details(run, node);
-                @if block.count() == 1 { (one(content)) } @else { (several(&node.point, content)) }
+                (at_point(block, &node.point, &node_details(run, node)))
             }
             @for node in &block.undone {
-                @let content = unfinished_details(node);
-                @if block.count() == 1 { (one(content)) } @else { (several(&node.point, content)) }
+                (at_point(block, &node.point, &unfinished_details(node)))
             }
+        }
+    }
+}
+
+/// A block's node, below its point where there are several.
+fn at_point(block: &Block<'_>, point: &str, node: &Markup) -> Markup {
+    html! {
+        @if block.count() == 1 {
+            div class="node" { (node) }
+        } @else {
+            details class="point" { summary { (point) } (node) }
         }
     }
 }

@@ -15,8 +15,7 @@ pub struct ResultRow {
     pub stage: String,
     /// The sweep's point, e.g. `supersample=2`; empty without a sweep.
     pub point: String,
-    /// Means over the views: `psnr`, `ssim`, `lpips` where weights were given, `depth` where there
-    /// is truth.
+    /// Means over the views, as `metrics.json` has them.
     pub mean: Value,
     /// Number of views.
     pub views: usize,
@@ -47,18 +46,17 @@ pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
 
 /// What each node's stage warned of in its summary, with the node's name, in the order of the run.
 pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
-    let of_node = |node: &RunNode| {
-        let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
-        let name = if node.point.is_empty() {
-            node.stage.clone()
-        } else {
-            format!("{} [{}]", node.stage, node.point)
-        };
-        let warnings: Vec<_> =
-            warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect();
-        warnings
+    run.nodes.iter().flat_map(warnings_of_node).collect()
+}
+
+fn warnings_of_node(node: &RunNode) -> Vec<(String, String)> {
+    let summary = std::fs::read_to_string(node.folder.join(SUMMARY_FILE)).unwrap_or_default();
+    let name = if node.point.is_empty() {
+        node.stage.clone()
+    } else {
+        format!("{} [{}]", node.stage, node.point)
     };
-    run.nodes.iter().flat_map(of_node).collect()
+    warnings_of(&summary).map(|warning| (name.clone(), warning.to_owned())).collect()
 }
 
 /// The nodes that scored, each with its place in the list: what came through fewer stages first, so

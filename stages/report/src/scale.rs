@@ -62,11 +62,11 @@ fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     let digits = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;
-    let tick = |i: i64| {
+    let ticks = (first..=last).map(|i| {
         let value = i as f64 * step;
         (((value - low) / span).clamp(0.0, 1.0), format!("{value:.digits$}"))
-    };
-    (first..=last).map(tick).collect()
+    });
+    ticks.collect()
 }
 
 #[cfg(test)]

@@ -57,15 +57,18 @@ pub(crate) fn place_aside(
         return None;
     }
     let name = format!("{}-{}", target.file_name()?.to_str()?, short_name(&old.data_sets));
-    let numbered = |number: usize| match number {
-        1 => target.with_file_name(&name),
-        _ => target.with_file_name(format!("{name}-{number}")),
-    };
-    let is_free = |place: &PathBuf| {
+    (1..).map(|number| numbered(target, &name, number)).find(|place| {
         place.symlink_metadata().is_err()
             || (Mark::read(place).is_some_and(|mark| old.succeeds(&mark)) && is_ours(place))
-    };
-    (1..).map(numbered).find(is_free)
+    })
+}
+
+/// A folder of this name beside the target, the first without a number.
+fn numbered(target: &Path, name: &str, number: usize) -> PathBuf {
+    match number {
+        1 => target.with_file_name(name),
+        _ => target.with_file_name(format!("{name}-{number}")),
+    }
 }
 
 /// Most data sets that a folder's name has.
@@ -73,18 +76,20 @@ const MAX_NAMES: usize = 3;
 
 /// A name for data sets that every file system takes.
 fn short_name(data_sets: &[String]) -> String {
-    let last = |path: &String| {
-        let name = Path::new(path).file_name().and_then(OsStr::to_str).unwrap_or("data");
-        let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
-        name.chars().map(|c| if is_plain(c) { c } else { '-' }).take(60).collect::<String>()
-    };
-    let mut names: Vec<String> = data_sets.iter().take(MAX_NAMES).map(last).collect();
+    let mut names: Vec<String> =
+        data_sets.iter().take(MAX_NAMES).map(|path| last_name(path)).collect();
     match data_sets.len() {
         0 => names.push("before".to_owned()),
         1..=MAX_NAMES => {}
         more => names.push(format!("{}-more", more - MAX_NAMES)),
     }
     names.join("-")
+}
+
+fn last_name(path: &str) -> String {
+    let name = Path::new(path).file_name().and_then(OsStr::to_str).unwrap_or("data");
+    let is_plain = |c: char| c.is_alphanumeric() || "-_.".contains(c);
+    name.chars().map(|c| if is_plain(c) { c } else { '-' }).take(60).collect()
 }
 
 #[cfg(test)]

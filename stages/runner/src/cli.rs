@@ -93,38 +93,45 @@ struct OfExperiment {
     data: Option<PathBuf>,
 }
 
+// Without a text of its own: clap would give it to the verb.
+#[derive(Args)]
+struct RunOptions {
+    /// Stages at once [default: the number of cores, at most 4]
+    #[arg(short, long, value_name = "N")]
+    jobs: Option<usize>,
+    /// Threads of each stage, and cores of all together; results don't depend on it [default:
+    /// all cores]
+    #[arg(long, value_name = "N")]
+    threads: Option<usize>,
+    /// Memory of all stages together, such as 8G, by what each took when it last ran [default:
+    /// all there is]
+    #[arg(long, value_name = "AMOUNT")]
+    memory: Option<Memory>,
+    /// Go on with what doesn't need a failed stage
+    #[arg(short, long)]
+    keep_going: bool,
+    /// Where pages and watched views are written [default: out beside the pipeline]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Show a test view and its scores while a field trains, for about 2 % of the processor
+    /// time; needs a target that scores views, such as eval [default view: the first]
+    #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
+        default_missing_value = "")]
+    watch: Option<String>,
+    /// What a cluster wants besides: partition, account, set-up lines [default:
+    /// ~/.config/nerf-sr/slurm.yaml if it is there]
+    #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
+    site: Option<PathBuf>,
+}
+
 #[derive(Subcommand)]
 enum Verb {
     /// Make the targets; what is cached isn't run again
     Run {
         #[command(flatten)]
         what: What,
-        /// Stages at once [default: the number of cores, at most 4]
-        #[arg(short, long, value_name = "N")]
-        jobs: Option<usize>,
-        /// Threads of each stage, and cores of all together; results don't depend on it [default:
-        /// all cores]
-        #[arg(long, value_name = "N")]
-        threads: Option<usize>,
-        /// Memory of all stages together, such as 8G, by what each took when it last ran [default:
-        /// all there is]
-        #[arg(long, value_name = "AMOUNT")]
-        memory: Option<Memory>,
-        /// Go on with what doesn't need a failed stage
-        #[arg(short, long)]
-        keep_going: bool,
-        /// Where pages are written [default: out beside the pipeline]
-        #[arg(long, value_name = "DIR")]
-        out: Option<PathBuf>,
-        /// Shows a test view and its scores from time to time while a field trains; takes 2 % of
-        /// the time at most [default view: the first]
-        #[arg(long, value_name = "VIEW", num_args = 0..=1, require_equals = true,
-            default_missing_value = "")]
-        watch: Option<String>,
-        /// What a cluster wants besides: partition, account, set-up lines [default:
-        /// ~/.config/nerf-sr/slurm.yaml if it is there]
-        #[arg(long, value_name = "FILE", env = "NERF_SR_SITE")]
-        site: Option<PathBuf>,
+        #[command(flatten)]
+        how: RunOptions,
     },
     /// Cancel jobs that were submitted to a cluster, and those that need them
     Cancel {
@@ -141,7 +148,7 @@ enum Verb {
     },
     /// Write a commented pipeline for a folder of posed photographs
     Init {
-        /// The folder: Blender's form, transforms.json, LLFF or COLMAP
+        /// The folder; its form is found by looking
         #[arg(value_name = "DIR")]
         folder: PathBuf,
     },
@@ -313,30 +320,11 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Devices { given: cli.device.clone(), by_resources: cli.executor == Choose::Slurm };
     let session = Session::open(&cli.pipeline, cli.store.as_deref(), devices)?;
     match cli.verb {
-        Verb::Run { what, jobs, threads, memory, keep_going, out, watch, site } => {
-            let out = out.unwrap_or_else(|| session.pipeline.home().join("out"));
-            let executor: Box<dyn Executor> = match cli.executor {
-                Choose::Local => {
-                    let remedy =
-                        Remedy::new(given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device));
-                    let watch = watch.map(|view| Watch { view, folder: out.join("watch") });
-                    let budget = budget(jobs, threads, memory)?;
-                    Box::new(Local { budget, keep_going, remedy, watch })
-                }
-                Choose::Slurm
-                    if [jobs.is_some(), threads.is_some(), memory.is_some(), watch.is_some()]
-                        .contains(&true)
-                        || keep_going =>
-                {
-                    let problem = "--jobs, --threads, --memory, --keep-going and --watch are for \
-                        --executor local; say `resources` in the pipeline";
-                    return Err(PlanError::Usage(problem.to_owned()).into());
-                }
-                Choose::Slurm => Box::new(Cluster {
-                    site: Site::find(site.as_deref())
-                        .map_err(|e| PlanError::Usage(e.to_string()))?,
-                }),
-            };
+        Verb::Run { what, how } => {
+            let home = session.pipeline.home();
+            let out = how.out.clone().unwrap_or_else(|| home.join("out"));
+            let words = given(&what, &cli.pipeline, cli.store.as_deref(), &cli.device);
+            let executor = executor(cli.executor, &how, Remedy::new(words), &out)?;
             verbs::run(&session, &what.into(), &out, executor.as_ref())
         }
         Verb::Cancel { stage } => verbs::cancel(&session.store, stage.as_deref()),
@@ -385,6 +373,32 @@ fn man(folder: &Path) -> anyhow::Result<ExitCode> {
         .and_then(|()| clap_mangen::generate_to(Cli::command(), folder))
         .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Who carries out a run. `remedy` is what to say after a failure, `out` where pages go.
+fn executor(
+    choice: Choose,
+    how: &RunOptions,
+    remedy: Remedy,
+    out: &Path,
+) -> Result<Box<dyn Executor>, PlanError> {
+    let RunOptions { jobs, threads, memory, keep_going, site, watch, .. } = how;
+    if choice == Choose::Local {
+        let watch = watch.clone().map(|view| Watch { view, folder: out.join("watch") });
+        let budget = budget(*jobs, *threads, *memory)?;
+        return Ok(Box::new(Local { budget, keep_going: *keep_going, remedy, watch }));
+    }
+    if jobs.is_some() || threads.is_some() || memory.is_some() || *keep_going {
+        let problem = "--jobs, --threads, --memory and --keep-going are for --executor local; say \
+            `resources` in the pipeline";
+        return Err(PlanError::Usage(problem.to_owned()));
+    }
+    if watch.is_some() {
+        let problem = "--watch is for --executor local: no runner stays while jobs run";
+        return Err(PlanError::Usage(problem.to_owned()));
+    }
+    let site = Site::find(site.as_deref()).map_err(|e| PlanError::Usage(e.to_string()))?;
+    Ok(Box::new(Cluster { site }))
 }
 
 /// What a run may take, as far as the machine can use it.

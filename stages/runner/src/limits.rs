@@ -6,14 +6,14 @@ const A_CORE: usize = 4;
 /// What is made of a number that an option asks for, and what is to be said where that is less.
 pub(crate) fn capped(option: &str, asked: usize, cores: usize) -> (usize, Option<String>) {
     let most = cores.saturating_mul(A_CORE);
-    let said = || {
+    let said = (asked > most).then(|| {
         let cores = counted(cores, "core");
         format!(
             "nerf-sr: {option} {asked} is more than {cores} can use: {most} it is; the results \
             are the same"
         )
-    };
-    (asked.min(most), (asked > most).then(said))
+    });
+    (asked.min(most), said)
 }
 
 #[cfg(test)]

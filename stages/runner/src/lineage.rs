@@ -44,14 +44,15 @@ impl Lineage {
         // is enough.
         let is_single =
             |stage: &str| found.iter().filter(|record| record.stage == stage).count() == 1;
-        let name = |record: &Record| {
-            if is_single(&record.stage) {
+        let records = found.iter().map(|record| {
+            let name = if is_single(&record.stage) {
                 record.stage.clone()
             } else {
                 label(&record.stage, &record.point)
-            }
-        };
-        Self { records: found.iter().map(|record| (name(record), record.clone())).collect() }
+            };
+            (name, record.clone())
+        });
+        Self { records: records.collect() }
     }
 
     /// What differs from an earlier one, stage by stage. Where what a stage was made of differs,
@@ -83,15 +84,12 @@ impl Lineage {
                 .map(owned)
                 .collect();
         }
-        let is_made = |hash: &Value| {
-            let outputs =
-                self.records.values().filter(|other| record.made_of.contains(&other.key()));
-            outputs.into_iter().any(|other| is_of(store, hash, &other.output))
-        };
         let mut parts: Map<String, Value> = record
             .key_parts
             .iter()
-            .filter(|(name, value)| !(name.starts_with("input ") && is_made(value)))
+            .filter(|(name, value)| {
+                !(name.starts_with("input ") && self.is_made(record, value, store))
+            })
             .map(owned)
             .collect();
         let manifest = store.manifest(&record.output).ok();
@@ -103,6 +101,12 @@ impl Lineage {
             add_content(&mut parts, record, &manifest, &store.object(&record.output));
         }
         parts
+    }
+
+    /// Whether an input's hash is of something here that the record's action was made of.
+    fn is_made(&self, record: &Record, hash: &Value, store: &Store) -> bool {
+        let outputs = self.records.values().filter(|other| record.made_of.contains(&other.key()));
+        outputs.into_iter().any(|other| is_of(store, hash, &other.output))
     }
 }
 
@@ -168,16 +172,17 @@ fn owned((name, value): (&String, &Value)) -> (String, Value) {
 
 /// Whether an input's hash is of an artifact or of one of its folders.
 fn is_of(store: &Store, hash: &Value, output: &str) -> bool {
-    let of_folder = |manifest: Manifest| {
-        let folders: BTreeSet<String> = manifest
-            .files
-            .iter()
-            .filter_map(|file| file.path.split_once('/'))
-            .map(|(folder, _)| folder.to_owned())
-            .collect();
-        folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
-    };
-    hash == output || store.manifest(output).is_ok_and(of_folder)
+    hash == output || store.manifest(output).is_ok_and(|manifest| is_of_folder(hash, &manifest))
+}
+
+fn is_of_folder(hash: &Value, manifest: &Manifest) -> bool {
+    let folders: BTreeSet<String> = manifest
+        .files
+        .iter()
+        .filter_map(|file| file.path.split_once('/'))
+        .map(|(folder, _)| folder.to_owned())
+        .collect();
+    folders.iter().any(|folder| *hash == manifest.subtree(folder).identity())
 }
 
 /// Tells of every number inside a value, by its path.

@@ -37,22 +37,20 @@ pub(crate) fn publish(
     stop: &AtomicBool,
 ) -> Result<Published, StageFailure> {
     let target = out.join(name);
-    let fail = |place: &Path, e: io::Error| StageFailure {
-        code: 1,
-        message: format!("{}: {e}", place.display()),
-    };
-    fs::create_dir_all(out).map_err(|e| fail(out, e))?;
+    fs::create_dir_all(out).map_err(|e| StageFailure::at(out, &e))?;
     let _lock = lock_folder(out, stop)?;
     // With the lock held, what lies there is a killed run's.
     let fresh = out.join(format!(".{name}.nerf-sr-new"));
-    remove(&fresh).map_err(|e| fail(&fresh, e))?;
+    remove(&fresh).map_err(|e| StageFailure::at(&fresh, &e))?;
     let aside = place_aside(made, &target, |folder| owned(folder, kind).is_ok());
     let placed = copy_folder(made, &fresh)
-        .map_err(|e| fail(&fresh, e))
+        .map_err(|e| StageFailure::at(&fresh, &e))
         .and_then(|()| put(&fresh, &target, kind));
     // What is left is the old page, or what couldn't be put there.
     if let (Ok(()), Some(aside)) = (&placed, &aside) {
-        remove(aside).and_then(|()| fs::rename(&fresh, aside)).map_err(|e| fail(&fresh, e))?;
+        remove(aside)
+            .and_then(|()| fs::rename(&fresh, aside))
+            .map_err(|e| StageFailure::at(&fresh, &e))?;
     }
     remove(&fresh).ok();
     placed.map(|()| Published { folder: target, aside })
@@ -60,8 +58,7 @@ pub(crate) fn publish(
 
 /// Puts a whole folder in the target's place; what was there takes the fresh one's name.
 fn put(fresh: &Path, target: &Path, kind: &str) -> Result<(), StageFailure> {
-    let fail =
-        |e: io::Error| StageFailure { code: 1, message: format!("{}: {e}", target.display()) };
+    let fail = |e: io::Error| StageFailure::at(target, &e);
     match target.symlink_metadata() {
         Err(e) if e.kind() == io::ErrorKind::NotFound => {
             return fs::rename(fresh, target).map_err(fail);

@@ -59,10 +59,6 @@ pub(crate) fn show(
     course: &Course<'_>,
 ) -> Result<Shown, StageFailure> {
     let Showing { plan, store, run, out, threads, stop } = *showing;
-    let fail = |path: &Path, e: &dyn std::fmt::Display| StageFailure {
-        code: 1,
-        message: format!("{}: {e}", path.display()),
-    };
     let Some(record) = record(plan, sink, course, store, out) else { return Ok(Shown::Missing) };
     let target = out.join(&sink.stage);
     let identity = identity(sink, &record);
@@ -76,7 +72,7 @@ pub(crate) fn show(
     std::fs::create_dir_all(&folder)
         .and_then(|()| write_json(&folder.join("run.json"), &record))
         .and_then(|()| write_json(&params, &sink.parameters))
-        .map_err(|e| fail(&scratch, &e))?;
+        .map_err(|e| StageFailure::at(&scratch, &e))?;
     let display = Display::new();
     let view = display.start(&sink.stage);
     let inputs = [("run".to_owned(), folder)];
@@ -100,15 +96,16 @@ pub(crate) fn show(
     let kind = &sink.program.description.output.kind;
     let manifest = output.join(MANIFEST_FILE);
     if !manifest.exists() {
-        let found = Manifest::of_folder(kind, &output).map_err(|e| fail(&output, &e))?;
-        write_json(&manifest, &found).map_err(|e| fail(&manifest, &e))?;
+        let found =
+            Manifest::of_folder(kind, &output).map_err(|e| StageFailure::at(&output, &e))?;
+        write_json(&manifest, &found).map_err(|e| StageFailure::at(&manifest, &e))?;
     }
     let mark = Mark {
         identity,
         is_whole: record.failed.iter().all(|point| point.reason.is_some()),
         data_sets: record.data_sets,
     };
-    mark.write(&output).map_err(|e| fail(&output, &e))?;
+    mark.write(&output).map_err(|e| StageFailure::at(&output, &e))?;
     let published = publish::publish(&output, out, &sink.stage, kind, stop)?;
     // A sink's leftovers have no value.
     std::fs::remove_dir_all(&scratch).ok();

@@ -45,14 +45,17 @@ pub(crate) fn enter(
     stop: &AtomicBool,
     say: &dyn Fn(&str),
 ) -> Result<Entered, StageFailure> {
-    let words = |holder: Option<&Holder>, waited: Duration| {
-        say(&format!(
-            "waits for garbage collection{}, for {} now",
-            by(holder),
-            seconds(waited.as_secs_f64())
-        ));
-    };
-    until_held(stop, &words, || store.try_enter())
+    until_held(
+        stop,
+        &|holder, waited| {
+            say(&format!(
+                "waits for garbage collection{}, for {} now",
+                by(holder),
+                seconds(waited.as_secs_f64())
+            ));
+        },
+        || store.try_enter(),
+    )
 }
 
 /// Enters the store for a verb that doesn't wait.

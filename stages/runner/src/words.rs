@@ -68,12 +68,12 @@ pub(crate) fn by_scene(session: &Session, node: &Node, state: &State) -> Option<
         State::Cached(record) => session.store.object(&record.output),
         _ => PathBuf::new(),
     };
-    let entry = |(name, value): (String, Value)| match value {
+    let entries = node.by_scene(&artifact).into_iter().map(|(name, value)| match value {
         Value::Null => name,
         Value::String(word) => format!("{name}={word}"),
         value => format!("{name}={value}"),
-    };
-    let entries: Vec<String> = node.by_scene(&artifact).into_iter().map(entry).collect();
+    });
+    let entries: Vec<String> = entries.collect();
     (!entries.is_empty()).then(|| format!("by scene: {}", entries.join(", ")))
 }
 

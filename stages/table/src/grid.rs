@@ -137,14 +137,16 @@ impl Shape<'_> {
     /// Whether results have the keys of a row from elsewhere: one of their columns, and in all else
     /// what all of them have.
     fn belongs(&self, further: &Row, rows: &[Row]) -> bool {
-        let is_key = |name: &String, value: &Value| {
-            value.is_string() && name != "method" && *name != self.params.grouped_by
-        };
-        further.iter().filter(|(name, value)| is_key(name, value)).all(|(name, value)| {
+        further.iter().filter(|(name, value)| self.is_key(name, value)).all(|(name, value)| {
             let theirs = distinct(rows, std::slice::from_ref(name)).concat();
             let is_column = self.params.columns.contains(name) || self.params.rows.contains(name);
             theirs.contains(&plain(value)) && (is_column || theirs.len() == 1)
         })
+    }
+
+    /// Whether a value is a key that all results of a table may have in common.
+    fn is_key(&self, name: &str, value: &Value) -> bool {
+        value.is_string() && name != "method" && name != self.params.grouped_by
     }
 }
 
@@ -159,12 +161,11 @@ fn reason(rows: &[Row]) -> Option<String> {
 
 /// Lines as a Markdown table; the first is its head.
 pub(crate) fn grid(lines: &[Vec<String>]) -> String {
-    let line = |cells: &[String]| {
-        format!(
-            "| {} |\n",
-            cells.iter().map(|cell| cell.replace('|', "\\|")).collect::<Vec<_>>().join(" | ")
-        )
-    };
     let rule = vec!["---".to_owned(); lines[0].len()];
-    [&lines[0], &rule].into_iter().chain(&lines[1..]).map(|cells| line(cells)).collect()
+    [&lines[0], &rule].into_iter().chain(&lines[1..]).map(|cells| grid_line(cells)).collect()
+}
+
+fn grid_line(cells: &[String]) -> String {
+    let cells: Vec<String> = cells.iter().map(|cell| cell.replace('|', "\\|")).collect();
+    format!("| {} |\n", cells.join(" | "))
 }

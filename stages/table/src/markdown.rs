@@ -102,17 +102,11 @@ fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, String> {
 fn gains(params: &Params, rows: &[Row]) -> String {
     let columns = distinct(rows, &params.columns);
     let all = [rows, &params.further[..]].concat();
-    let psnr = |method: &String, column: &Vec<String>| {
-        let mine = of(
-            &all,
-            &["method".to_owned()],
-            &[params.methods.get(method).unwrap_or(method).clone()],
-        );
-        mean(&of(&mine, &params.columns, column), "psnr")
-    };
     let lines = params.gains.iter().map(|gain| {
-        let cells =
-            columns.iter().map(|column| Some(psnr(&gain.of, column)? - psnr(&gain.over, column)?));
+        let cells = columns.iter().map(|column| {
+            let value = psnr(params, &all, &gain.of, column)?;
+            Some(value - psnr(params, &all, &gain.over, column)?)
+        });
         (&gain.name, cells.collect::<Vec<Option<f64>>>())
     });
     let lines: Vec<_> = lines.filter(|(_, cells)| cells.iter().any(Option::is_some)).collect();
@@ -124,12 +118,18 @@ fn gains(params: &Params, rows: &[Row]) -> String {
         .map(|column| if column.is_empty() { "all".to_owned() } else { column.join(", ") });
     let head: Vec<String> = std::iter::once("gain".to_owned()).chain(titles).collect();
     let cell = |gain: Option<f64>| gain.map_or(NOTHING.to_owned(), |gain| format!("{gain:+.2}"));
-    let line = |(name, cells): (&String, Vec<Option<f64>>)| {
-        std::iter::once(name.clone()).chain(cells.into_iter().map(cell)).collect()
-    };
-    let lines: Vec<Vec<String>> =
-        std::iter::once(head).chain(lines.into_iter().map(line)).collect();
+    let lines = lines.into_iter().map(|(name, cells)| {
+        std::iter::once(name.clone()).chain(cells.into_iter().map(cell)).collect::<Vec<_>>()
+    });
+    let lines: Vec<Vec<String>> = std::iter::once(head).chain(lines).collect();
     format!("\n## Gain, PSNR in dB\n\n{}", grid(&lines))
+}
+
+/// The mean PSNR of a method in a column.
+fn psnr(params: &Params, rows: &[Row], method: &str, column: &[String]) -> Option<f64> {
+    let name = params.methods.get(method).map_or(method, String::as_str);
+    let mine = of(rows, &["method".to_owned()], &[name.to_owned()]);
+    mean(&of(&mine, &params.columns, column), "psnr")
 }
 
 /// How far a value is spread over all results.

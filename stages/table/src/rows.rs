@@ -27,11 +27,7 @@ pub(crate) fn rows(
     let mut scored: Vec<(usize, &RunNode)> =
         run.nodes.iter().enumerate().filter(|(_, node)| node.is_shown).collect();
     // Blocks that come through fewer stages stand first: rendered views before refined ones.
-    let depth_of = |stage: &str| {
-        let of_stage = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
-        of_stage.map(|(index, _)| run.ancestors(index).len()).max()
-    };
-    scored.sort_by_key(|(_, node)| depth_of(&node.stage));
+    scored.sort_by_key(|(_, node)| depth(run, &node.stage));
     let mut rows: Vec<(usize, Row)> = Vec::new();
     for (index, node) in scored {
         let mut row = keys(params, &node.stage, &node.values);
@@ -50,6 +46,12 @@ pub(crate) fn rows(
     }
     rows.sort_by_key(|(place, _)| *place);
     Ok(rows.into_iter().map(|(_, row)| row).collect())
+}
+
+/// How many nodes a stage's results were made of, at most.
+fn depth(run: &RunRecord, stage: &str) -> Option<usize> {
+    let of_stage = run.nodes.iter().enumerate().filter(|(_, node)| node.stage == stage);
+    of_stage.map(|(index, _)| run.ancestors(index).len()).max()
 }
 
 /// What a result is of: values of axes, method and its group.
@@ -154,11 +156,8 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         .collect();
     let rendering: Vec<usize> =
         ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
-    let by_field = |i: &usize| {
-        let mut parents = run.nodes[*i].inputs.values().filter_map(|input| input.node);
-        parents.any(|parent| run.nodes[parent].kind == "field")
-    };
-    let refining: Vec<usize> = rendering.iter().copied().filter(|i| !by_field(i)).collect();
+    let refining: Vec<usize> =
+        rendering.iter().copied().filter(|&i| !is_by_field(run, i)).collect();
     let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0; // of nothing it is -0
     let mut row = Row::new();
     for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)]
@@ -179,4 +178,10 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         }
     }
     Ok(row)
+}
+
+/// Whether a node was made of a field directly.
+fn is_by_field(run: &RunRecord, index: usize) -> bool {
+    let mut parents = run.nodes[index].inputs.values().filter_map(|input| input.node);
+    parents.any(|parent| run.nodes[parent].kind == "field")
 }

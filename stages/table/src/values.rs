@@ -19,12 +19,12 @@ pub(crate) fn distinct(rows: &[Row], keys: &[String]) -> Vec<Vec<String>> {
 
 /// The rows whose keys have these values.
 pub(crate) fn of(rows: &[Row], keys: &[String], values: &[String]) -> Vec<Row> {
-    let fits = |row: &&Row| {
+    let fitting = rows.iter().filter(|row| {
         keys.iter()
             .zip(values)
             .all(|(key, value)| row.get(key).map(plain).unwrap_or_default() == *value)
-    };
-    rows.iter().filter(fits).cloned().collect()
+    });
+    fitting.cloned().collect()
 }
 
 /// The mean of a value over the rows that have it.

@@ -282,11 +282,10 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         let params = params.resolve(&SceneFacts::of(&views, true));
         let mut supervision =
             train_ss::supervision(&input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
-        let ResolvedField::Grid { architecture, distortion, floater_loss, given } = &params.field
-        else {
+        let ResolvedField::Grid { architecture, regularisers, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
-        let training = params.grid_training(given, *distortion, *floater_loss);
+        let training = params.grid_training(given, regularisers);
         let mut trainer =
             Trainer::new(Field::new(*architecture, views.bounds, params.seed), training);
         let (start, mut samples) = (Instant::now(), 0);

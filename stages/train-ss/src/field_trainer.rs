@@ -49,7 +49,7 @@ pub(crate) fn start(
     device: &str,
 ) -> anyhow::Result<Box<dyn FieldTrainer>> {
     match &params.field {
-        ResolvedField::Grid { architecture, distortion, floater_loss, given } => {
+        ResolvedField::Grid { architecture, regularisers, given } => {
             let field = match from {
                 Some(weights) => {
                     let mut field =
@@ -59,7 +59,7 @@ pub(crate) fn start(
                 }
                 None => Field::new(*architecture, bounds, params.seed),
             };
-            let options = params.grid_training(given, *distortion, *floater_loss);
+            let options = params.grid_training(given, regularisers);
             if device != "cpu" {
                 return start_grid_on(device, &field, options);
             }
@@ -126,14 +126,8 @@ pub(crate) fn average(
         }
         #[cfg(feature = "torch")]
         FieldModel::Mlp(architecture) => {
-            let read = |path| {
-                anyhow::Ok(torch_field::Mlp::read(
-                    path,
-                    architecture,
-                    bounds,
-                    nets::device("cpu")?,
-                )?)
-            };
+            let device = nets::device("cpu")?;
+            let read = |path| torch_field::Mlp::read(path, architecture, bounds, device);
             let field = read(trained)?;
             field.average_with(&read(from)?)?;
             field.write(trained)?;

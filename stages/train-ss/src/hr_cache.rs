@@ -57,6 +57,13 @@ thread_local! {
     static ROWS: RefCell<Rows> = RefCell::default();
 }
 
+/// Where `side` HR pixels around an LR pixel's centre begin along an axis.
+fn first(at: usize, side: usize, hr: usize, lr: usize) -> usize {
+    let scale = hr as f64 / lr as f64;
+    let start = (at as f64 + 0.5).mul_add(scale, -0.5 * side as f64).round().max(0.0) as usize;
+    start.min(hr.saturating_sub(side))
+}
+
 /// LR pixels on each side of one whose residuals count.
 const NEAR: usize = 2 * HrCache::REACH + 1;
 
@@ -90,16 +97,9 @@ impl HrCache {
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
     fn block(&self, view: usize, x: usize, y: usize) -> [usize; 2] {
         let view = &self.views[view];
-        let first = |i: usize, at: usize, hr: usize, lr: usize| {
-            let scale = hr as f64 / lr as f64;
-            let start =
-                (at as f64 + 0.5).mul_add(scale, -0.5 * self.side[i] as f64).round().max(0.0)
-                    as usize;
-            start.min(hr.saturating_sub(self.side[i]))
-        };
         [
-            first(0, x, view.width, view.kernel.operator.x.outputs()),
-            first(1, y, view.height, view.kernel.operator.y.outputs()),
+            first(x, self.side[0], view.width, view.kernel.operator.x.outputs()),
+            first(y, self.side[1], view.height, view.kernel.operator.y.outputs()),
         ]
     }
 

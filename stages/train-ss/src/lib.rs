@@ -53,7 +53,7 @@ use init_field::InitField;
 use member::{Member, TrainingData};
 pub use params::{Combine, FieldParams, GridParams, MlpParams, Params, RateSchedule};
 pub use pixel_sampler::Order;
-pub use resolve::{Resolved, ResolvedField, SceneFacts};
+pub use resolve::{Resolved, ResolvedField, ResolvedRegularisers, SceneFacts};
 use setup::open_background;
 pub use setup::supervision;
 pub use supervision::{Supersampling, Supervision};
@@ -101,18 +101,18 @@ impl Stage for TrainSs {
             ("pose_refinement", json!(true)),
             ("exposure", json!(true)),
         ];
-        let rule = |(parameter, value)| {
+        let closed = closed.map(|(parameter, value)| {
             let message = open_background(parameter);
             Rule::new(&message)
                 .when("scene.background", json!({"const": "alpha"}))
                 .must(parameter, json!({"not": {"const": value}}))
-        };
+        });
         let importance = "parameter pixel_importance: an epoch goes through all pixels evenly; \
             choose order random";
         let evenly = Rule::new(importance)
             .when("order", json!({"const": "epochs"}))
             .must("pixel_importance", json!({"anyOf": [{"type": "null"}, {"maximum": 1}]}));
-        closed.map(rule).into_iter().chain([evenly]).collect()
+        closed.into_iter().chain([evenly]).collect()
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {

@@ -131,12 +131,15 @@ impl<'a> Member<'a> {
         Err(Failure::Numerical(format!("{said}, or let it start over: parameter restarts")).into())
     }
 
-    /// Its field and its log as the latest checkpoint has them, of whichever member that is.
+    /// Writes the weights of the latest checkpoint, whichever member it belongs to; its log.
     pub(crate) fn from_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let work = self.context.work().context("--from-checkpoint goes with --work")?;
         let mut trainer = self.start(&self.params, bounds)?;
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
-            Failure::BadInput(format!("--work {}: no whole checkpoint is there", work.display()))
+            Failure::BadInput(format!(
+                "--work {}: no complete checkpoint in it yet",
+                work.display()
+            ))
         })?;
         let log = curve.finish(trainer.steps(), trainer.rays_done());
         self.write_weights(trainer, bounds)?;

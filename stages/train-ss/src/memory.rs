@@ -48,15 +48,11 @@ impl MemoryNeed {
     ) -> Self {
         let mut need = Self { field: field(params, has_checkpoints), ..Self::default() };
         let packed = if views.background == Background::Opaque { 3 } else { 4 };
-        let size_of = |view: &View| {
-            let k = view.camera.intrinsics;
-            (k.width as usize, k.height as usize)
-        };
-        let needs_cache = options.needs_cache(views.views.iter().map(size_of));
+        let needs_cache = options.needs_cache(views.views.iter().map(image_size));
         for (view, is_reference) in
             views.views.iter().map(|v| (v, false)).chain(references.iter().map(|v| (v, true)))
         {
-            let size = size_of(view);
+            let size = image_size(view);
             let (pixels, hr) = ((size.0 * size.1) as u64, options.hr_size(size));
             let is_cached = needs_cache && !is_reference;
             let cached = if is_cached { (hr.0 * hr.1) as u64 } else { 0 };
@@ -111,6 +107,12 @@ impl MemoryNeed {
             }
         }
     }
+}
+
+/// Width and height of a view's image.
+fn image_size(view: &View) -> (usize, usize) {
+    let k = view.camera.intrinsics;
+    (k.width as usize, k.height as usize)
 }
 
 /// Memory of the field, its optimiser and its checkpoints.

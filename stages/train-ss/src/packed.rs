@@ -320,13 +320,16 @@ pub(crate) fn straight([r, g, b, a]: [f32; 4]) -> [u8; 4] {
     [of(r), of(g), of(b), to_u8(a)]
 }
 
+/// Pixels of a row.
+fn row_of(image: &Image, y: usize) -> impl Iterator<Item = &[f32]> {
+    let row = image.width * image.channels;
+    image.data[y * row..(y + 1) * row].chunks_exact(image.channels)
+}
+
 /// The bytes of an image, RGBA or RGB: 8-bit levels where they give every sample back.
 fn packed(image: &Image) -> (Samples, Vec<u8>) {
     let channels = image.channels;
-    let row_of = |y: usize| {
-        image.data[y * image.width * channels..(y + 1) * image.width * channels]
-            .chunks_exact(channels)
-    };
+    let row_of = |y: usize| row_of(image, y);
     let pixel = |p: &[f32]| [p[0], p[1], p[2], p.get(3).copied().unwrap_or(1.0)];
     let is_level = |p: &[f32]| premultiplied(straight(pixel(p))) == pixel(p);
     let rows = || (0..image.height).into_par_iter();

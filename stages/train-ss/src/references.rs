@@ -106,17 +106,14 @@ fn is_transparent(image: &Image) -> bool {
 /// too.
 fn alikeness(one: &Image, other: &Image) -> f64 {
     let channels = if is_transparent(one) || is_transparent(other) { 4 } else { 3 };
-    let samples = |image: &Image| -> Vec<f32> {
-        image
-            .data
-            .chunks_exact(image.channels)
-            .flat_map(|pixel| &pixel[..channels])
-            .copied()
-            .collect()
-    };
-    let (a, b) = (samples(one), samples(other));
+    let pairs = samples(one, channels).zip(samples(other, channels));
     let colours = (3 * one.width * one.height) as f64;
-    psnr_of(a.iter().zip(&b).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / colours)
+    psnr_of(pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / colours)
+}
+
+/// Samples of the first channels.
+fn samples(image: &Image, channels: usize) -> impl Iterator<Item = &f32> {
+    image.data.chunks_exact(image.channels).flat_map(move |pixel| &pixel[..channels])
 }
 
 #[cfg(test)]

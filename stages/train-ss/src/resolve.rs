@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use radiance::{Architecture, FieldModel, MlpArchitecture, TrainingOptions};
+use radiance::{Architecture, FieldModel, MlpArchitecture, Regularisers, TrainingOptions};
 use scene::{Background, Intrinsics, Space, View, Views};
 use serde_json::{Value, json};
 
@@ -64,14 +64,19 @@ impl SceneFacts {
 }
 
 fn pixels_across(views: &Views) -> f64 {
-    let across = |k: Intrinsics| match views.bounds.space {
+    let across = |view: &View| across(view.camera.intrinsics, views.bounds.space);
+    views.views.iter().map(across).fold(0.0, f64::max)
+}
+
+/// LR pixels across the field's cube, as one view sees it.
+fn across(k: Intrinsics, space: Space) -> f64 {
+    match space {
         // The cube is about what a view sees.
         Space::Box => f64::from(k.width),
         Space::Ndc(f) => (f.max[0] - f.min[0]).max(f.max[1] - f.min[1]) * k.fx,
         // Half of it is, and the shell around it.
         Space::Contraction => 2.0 * f64::from(k.width),
-    };
-    views.views.iter().map(|view| across(view.camera.intrinsics)).fold(0.0, f64::max)
+    }
 }
 
 /// Parameters with every default decided.
@@ -118,10 +123,8 @@ pub enum ResolvedField {
     Grid {
         /// Its shape.
         architecture: Architecture,
-        /// Weight of the distortion loss.
-        distortion: f64,
-        /// Weight of the floater loss.
-        floater_loss: f64,
+        /// What is asked of its rays beside their colours.
+        regularisers: ResolvedRegularisers,
         /// Its parameters as given.
         given: GridParams,
     },
@@ -134,6 +137,15 @@ pub enum ResolvedField {
         /// Their parameters as given.
         given: MlpParams,
     },
+}
+
+/// Weights of what is asked of a grid's rays, with every default decided.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ResolvedRegularisers {
+    /// Weight of the distortion loss.
+    pub distortion: f64,
+    /// Weight of the floater loss.
+    pub floater_loss: f64,
 }
 
 impl Params {
@@ -239,6 +251,15 @@ impl GridParams {
             steps,
         }
     }
+
+    fn regularisers(&self, scene: &SceneFacts) -> ResolvedRegularisers {
+        let is_open = scene.is_ndc() && scene.background == Background::Opaque;
+        let has_colour = matches!(scene.background, Background::White | Background::Black);
+        ResolvedRegularisers {
+            distortion: self.distortion.unwrap_or(if is_open { DISTORTION_IN_NDC } else { 0.0 }),
+            floater_loss: self.floater_loss.unwrap_or(if has_colour { FLOATER_LOSS } else { 0.0 }),
+        }
+    }
 }
 
 impl MlpParams {
@@ -271,24 +292,11 @@ impl MlpParams {
 impl FieldParams {
     fn resolve(&self, scene: &SceneFacts) -> ResolvedField {
         match self {
-            Self::Grid(grid) => {
-                let is_open = scene.is_ndc() && scene.background == Background::Opaque;
-                let has_colour = matches!(scene.background, Background::White | Background::Black);
-                ResolvedField::Grid {
-                    architecture: grid.architecture(scene),
-                    distortion: grid.distortion.unwrap_or(if is_open {
-                        DISTORTION_IN_NDC
-                    } else {
-                        0.0
-                    }),
-                    floater_loss: grid.floater_loss.unwrap_or(if has_colour {
-                        FLOATER_LOSS
-                    } else {
-                        0.0
-                    }),
-                    given: grid.clone(),
-                }
-            }
+            Self::Grid(grid) => ResolvedField::Grid {
+                architecture: grid.architecture(scene),
+                regularisers: grid.regularisers(scene),
+                given: grid.clone(),
+            },
             Self::Mlp(mlp) => ResolvedField::Mlp {
                 architecture: mlp.architecture(),
                 density_noise_std: mlp.density_noise_std.unwrap_or(if scene.is_ndc() {
@@ -315,10 +323,10 @@ impl Resolved {
             "supervision": self.supervision,
         });
         let own = match &self.field {
-            ResolvedField::Grid { architecture, distortion, floater_loss, .. } => json!({
-                "distortion": distortion,
+            ResolvedField::Grid { architecture, regularisers, .. } => json!({
+                "distortion": regularisers.distortion,
                 "finest_z": architecture.finest_z,
-                "floater_loss": floater_loss,
+                "floater_loss": regularisers.floater_loss,
                 "log2_hashmap_size": architecture.log2_entries,
                 "march_steps": architecture.steps,
                 "max_resolution": architecture.finest,
@@ -385,8 +393,7 @@ impl Resolved {
     pub fn grid_training(
         &self,
         grid: &GridParams,
-        distortion: f64,
-        floater_loss: f64,
+        regularisers: &ResolvedRegularisers,
     ) -> TrainingOptions {
         TrainingOptions {
             rays: self.rays,
@@ -398,8 +405,10 @@ impl Resolved {
             learning_rate_decay: grid.learning_rate_decay,
             warm_up: 100,
             ema_decay: grid.ema_decay as f32,
-            distortion: distortion as f32,
-            floater_loss: floater_loss as f32,
+            regularisers: Regularisers {
+                distortion: regularisers.distortion as f32,
+                floater_loss: regularisers.floater_loss as f32,
+            },
             network_decay: grid.network_decay as f32,
             roulette: ROULETTE,
             seed: self.seed,

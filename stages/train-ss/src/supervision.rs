@@ -128,9 +128,8 @@ impl Supersampling {
         let Some(moving) = self.moving.as_mut().filter(|moving| moving.are_due(done)) else {
             return Ok(());
         };
-        let exposure = |view: usize| {
-            self.exposures.as_ref().map_or([1.0; 3], |exposures| exposures.of(view).map(f32::recip))
-        };
+        let exposures = self.exposures.as_ref();
+        let exposure = |view: usize| exposures.map_or([1.0; 3], |e| e.of(view).map(f32::recip));
         moving
             .step(&*field()?, done, self.background.shown(), exposure)
             .map_err(fields::rendering_failure)?;
@@ -183,6 +182,11 @@ impl Supersampling {
             [self.background.shown(); 3]
         }
     }
+}
+
+/// Mean of a channel.
+fn mean(colours: &[[f32; 3]], c: usize) -> f32 {
+    colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
 }
 
 /// How often the sub-pixel rays along a side double before all are cast: as many stages has the
@@ -276,10 +280,7 @@ impl radiance::Supervisor for Supersampling {
             let sample = image.pixel(pixel);
             let photographed =
                 [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
-            let mean = |c: usize| {
-                colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
-            };
-            exposures.learn(index, photographed, [mean(0), mean(1), mean(2)]);
+            exposures.learn(index, photographed, [0, 1, 2].map(|c| mean(colours, c)));
         }
         let is_cached = self.side == self.full && index < self.lr_views;
         if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {

@@ -70,22 +70,20 @@ impl Block {
     fn read(weights: &Weights, name: &str, width: i64) -> Result<Self, WeightsError> {
         let kept = width / 4;
         let rest = width - kept;
-        let conv = |part: &str, outputs: i64, inputs: i64, size: i64| {
-            Conv::read(weights, &format!("{name}.{part}"), [outputs, inputs, size, size])
-        };
+        let conv = |part: &str, shape| Conv::read(weights, &format!("{name}.{part}"), shape);
         let [narrow, ..] = weights.shape::<4>(&format!("{name}.cca.conv_du.0.weight"))?;
         Ok(Self {
             layers: [
-                conv("c1", width, width, 3)?,
-                conv("c2", width, rest, 3)?,
-                conv("c3", width, rest, 3)?,
-                conv("c4", kept, rest, 3)?,
+                conv("c1", [width, width, 3, 3])?,
+                conv("c2", [width, rest, 3, 3])?,
+                conv("c3", [width, rest, 3, 3])?,
+                conv("c4", [kept, rest, 3, 3])?,
             ],
             attention: [
-                conv("cca.conv_du.0", narrow, 4 * kept, 1)?,
-                conv("cca.conv_du.2", 4 * kept, narrow, 1)?,
+                conv("cca.conv_du.0", [narrow, 4 * kept, 1, 1])?,
+                conv("cca.conv_du.2", [4 * kept, narrow, 1, 1])?,
             ],
-            fuse: conv("c5", width, 4 * kept, 1)?,
+            fuse: conv("c5", [width, 4 * kept, 1, 1])?,
             kept,
         })
     }

@@ -173,14 +173,12 @@ type Read = fn(&Weights) -> Result<Box<dyn Network>, nets::WeightsError>;
 
 /// A view and its HR camera.
 fn pair<'a>(view: &'a View, cameras: &'a Views) -> anyhow::Result<(&'a View, &'a Camera)> {
-    let camera = cameras.taken_by(&view.camera).map(|v| &v.camera);
-    let missing = || {
-        Failure::BadInput(format!(
-            "input cameras: no camera {} with that view's pose",
-            view.camera.name
-        ))
+    let Some(hr) = cameras.taken_by(&view.camera) else {
+        let name = &view.camera.name;
+        let missing = format!("input cameras: no camera {name} with that view's pose");
+        return Err(Failure::BadInput(missing).into());
     };
-    Ok((view, camera.ok_or_else(missing)?))
+    Ok((view, &hr.camera))
 }
 
 /// A network for each thread, none for what needs none.

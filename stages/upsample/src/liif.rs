@@ -80,15 +80,35 @@ struct Nearest {
 /// one side.
 fn nearest(from: i64, to: i64, side: f64) -> Vec<Nearest> {
     let (from_f, to_f) = (from as f64, to as f64);
-    let pixel = |i: i64| {
+    let pixels = (0..to).map(|i| {
         let place = -1.0 + (2 * i + 1) as f64 / to_f;
         let shifted = (place + side / from_f + SHIFT).clamp(-1.0 + SHIFT, 1.0 - SHIFT);
         let index =
             (((shifted + 1.0) * from_f - 1.0) / 2.0).round_ties_even().clamp(0.0, from_f - 1.0);
         let centre = -1.0 + (2.0 * index + 1.0) / from_f;
         Nearest { index: index as usize, offset: (place - centre) * from_f }
-    };
-    (0..to).map(pixel).collect()
+    });
+    pixels.collect()
+}
+
+/// What pixels take of the features at the corners around them: above and below, left and right.
+struct Corners {
+    down: [Vec<Nearest>; 2],
+    across: [Vec<Nearest>; 2],
+}
+
+impl Corners {
+    /// What pixel `p` takes down and across, at one of its corners.
+    fn of(&self, p: usize, v: usize, h: usize) -> (&Nearest, &Nearest) {
+        let columns = self.across[h].len();
+        (&self.down[v][p / columns], &self.across[h][p % columns])
+    }
+
+    /// Area between a pixel's centre and one of its corners.
+    fn area(&self, p: usize, v: usize, h: usize) -> f64 {
+        let (y, x) = self.of(p, v, h);
+        (y.offset * x.offset).abs() + LEAST_AREA
+    }
 }
 
 impl Network for Liif {
@@ -113,30 +133,24 @@ impl Network for Liif {
             .part(&Tensor::f_from_slice(&cell)?.f_reshape([1, 2])?, width + 2, width + 4)?
             .f_add(first.bias())?;
         let sides = [-1.0, 1.0];
-        let (down, across) = (
-            sides.map(|s| nearest(lr_rows, rows, s)),
-            sides.map(|s| nearest(lr_columns, columns, s)),
-        );
+        let corners = Corners {
+            down: sides.map(|s| nearest(lr_rows, rows, s)),
+            across: sides.map(|s| nearest(lr_columns, columns, s)),
+        };
         let mut chunks = Vec::new();
         for start in (0..(rows * columns) as usize).step_by(CHUNK) {
             let pixels = start..(start + CHUNK).min((rows * columns) as usize);
-            let place = |p: usize, v: usize, h: usize| {
-                (&down[v][p / columns as usize], &across[h][p % columns as usize])
-            };
-            let area = |p: usize, v: usize, h: usize| {
-                let (y, x) = place(p, v, h);
-                (y.offset * x.offset).abs() + LEAST_AREA
-            };
             let mut sum = None::<Tensor>;
             for (v, h) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                 let (mut index, mut offsets, mut share) = (Vec::new(), Vec::new(), Vec::new());
                 for p in pixels.clone() {
-                    let (y, x) = place(p, v, h);
+                    let (y, x) = corners.of(p, v, h);
                     index.push((y.index * lr_columns as usize + x.index) as i64);
                     offsets.extend([y.offset as f32, x.offset as f32]);
-                    let all = area(p, 0, 0) + area(p, 0, 1) + area(p, 1, 0) + area(p, 1, 1);
+                    let area = |v: usize, h: usize| corners.area(p, v, h);
+                    let all = area(0, 0) + area(0, 1) + area(1, 0) + area(1, 1);
                     // Nearer features weigh more: each gets the area on the other side.
-                    share.push((area(p, 1 - v, 1 - h) / all) as f32);
+                    share.push((area(1 - v, 1 - h) / all) as f32);
                 }
                 let count = index.len() as i64;
                 let offset = Tensor::f_from_slice(&offsets)?.f_reshape([count, 2])?;

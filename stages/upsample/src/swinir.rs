@@ -142,18 +142,13 @@ impl Group {
     ) -> Result<Self, WeightsError> {
         let name = |i: usize| format!("layers.{index}.residual_group.blocks.{i}");
         let blocks = count(weights, 0, |i| format!("{}.norm1.weight", name(i)));
-        // Windows of every other block are shifted by half a window.
-        let block = |i: usize| {
-            TransformerBlock::read(
-                weights,
-                &name(i),
-                width,
-                window,
-                if i % 2 == 1 { window / 2 } else { 0 },
-            )
-        };
+        let blocks = (0..blocks).map(|i| {
+            // Windows of every other block are shifted by half a window.
+            let shift = if i % 2 == 1 { window / 2 } else { 0 };
+            TransformerBlock::read(weights, &name(i), width, window, shift)
+        });
         Ok(Self {
-            blocks: (0..blocks).map(block).collect::<Result<_, _>>()?,
+            blocks: blocks.collect::<Result<_, _>>()?,
             after: Convs::read(weights, &format!("layers.{index}.conv"), width)?,
         })
     }
@@ -194,9 +189,7 @@ impl Convs {
 impl Head {
     /// The head that the weights are for, and how much it enlarges.
     fn read(weights: &Weights, width: i64) -> Result<(Self, i64), WeightsError> {
-        let conv = |name: &str, outputs: i64, inputs: i64| {
-            Conv::read(weights, name, [outputs, inputs, 3, 3])
-        };
+        let conv = |name: &str, outputs, inputs| Conv::read(weights, name, [outputs, inputs, 3, 3]);
         if !weights.has("conv_before_upsample.0.weight") {
             let scale = root(weights.shape::<4>("upsample.0.weight")?[0] / 3);
             return Ok((
@@ -263,21 +256,19 @@ impl TransformerBlock {
         let reach = 2 * window - 1;
         let table = weights.tensor(&table, &[reach * reach, heads])?;
         let [hidden, _] = weights.shape::<2>(&part("mlp.fc1.weight"))?;
-        let linear = |of: &str, outputs: i64, inputs: i64| {
-            Linear::read(weights, &part(of), [outputs, inputs])
-        };
+        let linear = |of: &str, shape| Linear::read(weights, &part(of), shape);
         Ok(Self {
             norms: [
                 LayerNorm::read(weights, &part("norm1"), width)?,
                 LayerNorm::read(weights, &part("norm2"), width)?,
             ],
-            qkv: linear("attn.qkv", 3 * width, width)?,
+            qkv: linear("attn.qkv", [3 * width, width])?,
             bias: table
                 .index_select(0, &relative(window))
                 .reshape([window * window, window * window, heads])
                 .permute([2, 0, 1]),
-            projection: linear("attn.proj", width, width)?,
-            layers: [linear("mlp.fc1", hidden, width)?, linear("mlp.fc2", width, hidden)?],
+            projection: linear("attn.proj", [width, width])?,
+            layers: [linear("mlp.fc1", [hidden, width])?, linear("mlp.fc2", [width, hidden])?],
             heads,
             shift,
         })
@@ -330,10 +321,9 @@ impl TransformerBlock {
 /// For each pair of places in a window, which entry of the table has their bias.
 fn relative(window: i64) -> Tensor {
     let places = || (0..window).flat_map(|y| (0..window).map(move |x| (y, x)));
-    let index = |(a, b): ((i64, i64), (i64, i64))| {
-        (a.0 - b.0 + window - 1) * (2 * window - 1) + a.1 - b.1 + window - 1
-    };
-    let all: Vec<i64> = places().flat_map(|a| places().map(move |b| index((a, b)))).collect();
+    let index = |y: i64, x: i64| (y + window - 1) * (2 * window - 1) + x + window - 1;
+    let all: Vec<i64> =
+        places().flat_map(|a| places().map(move |b| index(a.0 - b.0, a.1 - b.1))).collect();
     Tensor::from_slice(&all)
 }
 
@@ -345,13 +335,12 @@ fn far(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
     let (down, across, places) = (rows / window, columns / window, window * window);
     let mut mask = Vec::with_capacity((down * across * places * places) as usize);
     for w in 0..down * across {
-        let of = |p: i64| {
-            (
-                region(w / across * window + p / window, rows),
-                region(w % across * window + p % window, columns),
-            )
-        };
-        let regions: Vec<(i64, i64)> = (0..places).map(of).collect();
+        let regions: Vec<(i64, i64)> = (0..places)
+            .map(|p| {
+                let (y, x) = (w / across * window + p / window, w % across * window + p % window);
+                (region(y, rows), region(x, columns))
+            })
+            .collect();
         mask.extend(
             regions
                 .iter()

@@ -12,7 +12,7 @@ use pixels::{
     Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png,
 };
 use rayon::prelude::*;
-use scene::Views;
+use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -74,10 +74,8 @@ impl Stage for Video {
 /// Frames, and the film where that can be made.
 fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyhow::Result<()> {
     let views = Views::of_folder(folder)?;
-    let size = |i: usize| {
-        (views.views[i].camera.intrinsics.width, views.views[i].camera.intrinsics.height)
-    };
-    if (1..views.views.len()).any(|i| size(i) != size(0)) {
+    let size = |view: &View| (view.camera.intrinsics.width, view.camera.intrinsics.height);
+    if views.views.iter().any(|view| size(view) != size(&views.views[0])) {
         return Err(Failure::BadInput(
             "the views have several sizes; set size in render-depth".to_owned(),
         )
@@ -138,12 +136,12 @@ fn side_by_side(left: &Rgba8, right: &Rgba8) -> Rgba8 {
 /// With a last column and row twice where sizes are odd, which films can't have.
 fn even(image: &Rgba8) -> Rgba8 {
     let (width, height) = (image.width.next_multiple_of(2), image.height.next_multiple_of(2));
-    let pixel = |i: usize| {
+    let pixels = (0..width * height).flat_map(|i| {
         let (x, y) = ((i % width).min(image.width - 1), (i / width).min(image.height - 1));
         let at = 4 * (y * image.width + x);
         [image.data[at], image.data[at + 1], image.data[at + 2], image.data[at + 3]]
-    };
-    Rgba8::new(width, height, (0..width * height).flat_map(pixel).collect())
+    });
+    Rgba8::new(width, height, pixels.collect())
 }
 
 /// Makes the film by ffmpeg; without it, or where it fails, says so: the frames are there.

@@ -63,13 +63,13 @@ pub(crate) fn bake<S: Source>(
             let wanted: Vec<usize> =
                 (slot * VOXELS..(slot + 1) * VOXELS).filter(|&v| kept(v)).collect();
             let found = colours.of_brick(bricks.places()[slot], &wanted, &seen);
-            let voxel = |(v, (colour, view)): (usize, ([f32; 3], [f32; NUMBERS]))| Voxel {
+            let voxels = wanted.into_iter().zip(found).map(|(v, (colour, view))| Voxel {
                 place: bricks.place_of(v).map(|c| c as u16),
                 opacity: opacity[v],
                 colour,
                 view,
-            };
-            wanted.into_iter().zip(found).map(voxel).collect::<Vec<_>>()
+            });
+            voxels.collect::<Vec<_>>()
         })
         .collect();
     Volume { resolution, voxels }
@@ -115,18 +115,20 @@ fn opacities<S: Source>(sources: &[S], brick: [usize; 3], resolution: usize) -> 
 /// lets nothing through.
 fn opacity_of(samples: &[PointSample], resolution: usize) -> f32 {
     let length = 1.0 / (PLACES * resolution) as f32;
-    let along = |axis: u32| {
-        let step = PLACES.pow(axis);
-        let columns = (0..ALL_PLACES).filter(|i| (i / step).is_multiple_of(PLACES));
-        let stopped: f32 = columns
-            .map(|first| {
-                let depth: f32 = (0..PLACES).map(|k| samples[first + k * step].density).sum();
-                -(-depth * length).exp_m1()
-            })
-            .sum();
-        stopped / (PLACES * PLACES) as f32
-    };
-    (0..3).map(along).fold(0.0, f32::max)
+    (0..3).map(|axis| stopped_along(axis, samples, length)).fold(0.0, f32::max)
+}
+
+/// Share of the light along an axis that a voxel's samples stop, each over a length.
+fn stopped_along(axis: u32, samples: &[PointSample], length: f32) -> f32 {
+    let step = PLACES.pow(axis);
+    let columns = (0..ALL_PLACES).filter(|i| (i / step).is_multiple_of(PLACES));
+    let stopped: f32 = columns
+        .map(|first| {
+            let depth: f32 = (0..PLACES).map(|k| samples[first + k * step].density).sum();
+            -(-depth * length).exp_m1()
+        })
+        .sum();
+    stopped / (PLACES * PLACES) as f32
 }
 
 /// Cameras of each voxel and of those around it: what one sees of a voxel's neighbour it sees of

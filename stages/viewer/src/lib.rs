@@ -32,7 +32,7 @@ use artifact::{
     folders_of,
 };
 use base64::Engine as _;
-use pixels::{Filter, encode_png, resize_pillow};
+use pixels::{Filter, Rgba8, encode_png, read_premultiplied, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Space, Views};
 use schemars::JsonSchema;
@@ -173,34 +173,40 @@ fn read_fields(folder: &Path) -> anyhow::Result<(FieldFile, Vec<Field>)> {
 /// The training cameras, some of them with their photograph.
 fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result<Vec<PageCamera>> {
     let (count, most) = (views.views.len(), params.photographs as usize);
-    let camera = |(i, view): (usize, &scene::View)| {
+    let mut cameras = Vec::with_capacity(count);
+    for (i, view) in views.views.iter().enumerate() {
         // One in so many: where the share so far passes a whole number.
         let is_shown = (i + 1) * most / count > i * most / count;
         let photograph = match &view.image {
             Some(file) if is_shown => {
-                let image = pixels::read_premultiplied(&folder.join(file))?;
+                let image = read_premultiplied(&folder.join(file))?;
                 let image = image.over(views.background.shown()).to_rgba8();
-                let times = image.width.div_ceil(params.photograph_width as usize);
-                let less = |size: usize| size.div_ceil(times).max(1);
-                Some(if times < 2 {
-                    image
-                } else {
-                    resize_pillow(&image, less(image.width), less(image.height), Filter::Box)
-                })
+                Some(shrunk(image, params.photograph_width as usize))
             }
             _ => None,
         };
-        let data = |image: &pixels::Rgba8| {
-            let text = base64::engine::general_purpose::STANDARD.encode(encode_png(image));
-            format!("data:image/png;base64,{text}")
-        };
-        Ok(PageCamera {
+        cameras.push(PageCamera {
             name: view.camera.name.clone(),
             camera_to_world: view.camera.camera_to_world,
             intrinsics: view.camera.intrinsics,
-            photograph: photograph.as_ref().map(data),
+            photograph: photograph.as_ref().map(data_uri),
             photograph_size: photograph.map(|p| ImageSize { width: p.width, height: p.height }),
-        })
-    };
-    views.views.iter().enumerate().map(camera).collect()
+        });
+    }
+    Ok(cameras)
+}
+
+/// An image of at most a width, a whole number of times smaller.
+fn shrunk(image: Rgba8, most: usize) -> Rgba8 {
+    let times = image.width.div_ceil(most);
+    if times < 2 {
+        return image;
+    }
+    let less = |size: usize| size.div_ceil(times).max(1);
+    resize_pillow(&image, less(image.width), less(image.height), Filter::Box)
+}
+
+fn data_uri(image: &Rgba8) -> String {
+    let text = base64::engine::general_purpose::STANDARD.encode(encode_png(image));
+    format!("data:image/png;base64,{text}")
 }

@@ -24,15 +24,16 @@ pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
             in_box(bounds, place)
         })
         .collect();
-    let at = |mut values: Vec<f64>, share: f64| {
-        values.sort_by(f64::total_cmp);
-        values[((values.len() - 1) as f64 * share) as usize]
-    };
     // A floater or two, and what lies far behind, don't move a median.
     let centre =
-        DVec3::from([0, 1, 2].map(|axis| at(points.iter().map(|p| p[axis]).collect(), 0.5)));
-    let reach = at(points.iter().map(|p| p.distance(centre)).collect(), 0.9);
+        DVec3::from([0, 1, 2].map(|axis| quantile(points.iter().map(|p| p[axis]).collect(), 0.5)));
+    let reach = quantile(points.iter().map(|p| p.distance(centre)).collect(), 0.9);
     (centre, (2.0 * reach).max(f64::MIN_POSITIVE))
+}
+
+fn quantile(mut values: Vec<f64>, share: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[((values.len() - 1) as f64 * share) as usize]
 }
 
 /// The scene's up direction: level cameras have their x axes across it. Where these say too little,
@@ -57,17 +58,12 @@ pub(crate) fn up(cameras: &[&Camera]) -> DVec3 {
 /// one in their middle.
 pub(crate) fn start(cameras: &[&Camera], up: DVec3) -> usize {
     let middle = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
-    let one_way = common_direction(cameras.iter().copied()).is_some();
-    let off = |camera: &Camera| {
-        if one_way {
-            camera.centre().distance(middle)
-        } else {
-            (-camera.forward().dot(up) - FROM_ABOVE).abs()
-        }
+    let off: Vec<f64> = if common_direction(cameras.iter().copied()).is_some() {
+        cameras.iter().map(|camera| camera.centre().distance(middle)).collect()
+    } else {
+        cameras.iter().map(|camera| (-camera.forward().dot(up) - FROM_ABOVE).abs()).collect()
     };
-    (0..cameras.len())
-        .min_by(|&a, &b| off(cameras[a]).total_cmp(&off(cameras[b])))
-        .unwrap_or_default()
+    (0..cameras.len()).min_by(|&a, &b| off[a].total_cmp(&off[b])).unwrap_or_default()
 }
 
 #[cfg(test)]

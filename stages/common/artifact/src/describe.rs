@@ -38,8 +38,8 @@ pub struct Description {
     /// A sink that shows what there is, where some of it couldn't be made.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub partial: bool,
-    /// A stage that leaves checkpoints and, with `--from-checkpoint`, makes its output of the
-    /// latest.
+    /// Whether the stage accepts `--from-checkpoint`: then it writes its output from the latest
+    /// checkpoint.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub from_checkpoint: bool,
     /// What parameters and inputs must be together.

@@ -6,13 +6,14 @@ pub struct DeviceError(String);
 /// Checks what `--device` was given: `cpu`, `cuda` or `cuda:N`. Whether there is such a GPU is for
 /// who computes to say.
 pub fn check_device(name: &str) -> Result<(), DeviceError> {
-    let is_number = |index: &str| {
-        !index.is_empty() && index.len() <= 4 && index.bytes().all(|b| b.is_ascii_digit())
-    };
     if ["cpu", "cuda"].contains(&name) || name.strip_prefix("cuda:").is_some_and(is_number) {
         return Ok(());
     }
     Err(DeviceError(name.to_owned()))
+}
+
+fn is_number(index: &str) -> bool {
+    !index.is_empty() && index.len() <= 4 && index.bytes().all(|b| b.is_ascii_digit())
 }
 
 #[cfg(test)]

@@ -45,23 +45,25 @@ impl Description {
     /// The stage's parameters as people read them.
     pub fn documented(&self) -> Vec<ParameterSection> {
         let schema = &self.parameters;
-        let section = |variant, schema: &Value, names: &dyn Fn(&str) -> bool| ParameterSection {
-            variant,
-            parameters: parameters(schema, names),
-        };
         // A description is checked before it is used: two tags are an error there.
         let Some(tag) = Tag::find(schema).ok().flatten() else {
-            return vec![section(None, schema, &|_| true)];
+            return vec![ParameterSection::new(None, schema, &|_| true)];
         };
         let forms = tag.forms(schema);
         let is_common = |name: &str| schema["properties"].get(name).is_some();
-        let mut sections = vec![section(None, &forms[0], &is_common)];
+        let mut sections = vec![ParameterSection::new(None, &forms[0], &is_common)];
         for (variant, form) in tag.variants().zip(&forms) {
-            sections.push(section(Some(format!("{}: {variant}", tag.name())), form, &|name| {
-                !is_common(name)
-            }));
+            let choice = format!("{}: {variant}", tag.name());
+            sections.push(ParameterSection::new(Some(choice), form, &|name| !is_common(name)));
         }
         sections
+    }
+}
+
+impl ParameterSection {
+    /// Those of a schema's parameters whose names are wanted.
+    fn new(variant: Option<String>, schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Self {
+        Self { variant, parameters: parameters(schema, is_wanted) }
     }
 }
 
@@ -70,11 +72,13 @@ fn parameters(schema: &Value, is_wanted: &dyn Fn(&str) -> bool) -> Vec<Parameter
     let wanted = properties.filter(|(name, _)| is_wanted(name));
     let mut found: Vec<ParameterText> =
         wanted.map(|(name, property)| parameter(schema, name, property)).collect();
-    let place = |text: &ParameterText| {
-        GROUPS.iter().position(|group| *group == text.group).map_or(0, |at| at + 1)
-    };
     found.sort_by(|a, b| (place(a), &a.name).cmp(&(place(b), &b.name)));
     found
+}
+
+/// Where a parameter's group stands among all groups.
+fn place(text: &ParameterText) -> usize {
+    GROUPS.iter().position(|group| *group == text.group).map_or(0, |at| at + 1)
 }
 
 fn parameter(schema: &Value, name: &str, property: &Value) -> ParameterText {

@@ -52,6 +52,7 @@ mod lock;
 mod manifest;
 mod memory;
 mod nearest;
+mod objects;
 mod panics;
 mod parameters;
 mod parts;

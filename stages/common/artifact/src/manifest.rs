@@ -122,15 +122,14 @@ impl Manifest {
     /// The manifest of a folder inside the artifact, its kind `KIND/FOLDER`.
     pub fn subtree(&self, folder: &str) -> Self {
         let prefix = format!("{folder}/");
-        let inside = |f: &FileEntry| {
-            f.path
-                .strip_prefix(&prefix)
-                .map(|path| FileEntry { path: path.to_owned(), ..f.clone() })
-        };
+        let files = self.files.iter().filter_map(|file| {
+            let path = file.path.strip_prefix(&prefix)?.to_owned();
+            Some(FileEntry { path, ..file.clone() })
+        });
         Self {
             kind: format!("{}/{folder}", self.kind),
             schema: self.schema,
-            files: self.files.iter().filter_map(inside).collect(),
+            files: files.collect(),
         }
     }
 
@@ -195,13 +194,14 @@ pub fn list_files(folder: &Path) -> io::Result<Vec<(PathBuf, PathBuf)>> {
 
 /// Path, size and blake3 of files, sorted by path.
 pub fn hash_files(files: Vec<(String, PathBuf)>) -> io::Result<Vec<FileEntry>> {
-    let entry = |(path, file): (String, PathBuf)| -> io::Result<FileEntry> {
-        Ok(FileEntry { path, size: fs::metadata(&file)?.len(), blake3: hash_file(&file)? })
-    };
     let mut entries: Vec<FileEntry> =
-        files.into_par_iter().map(entry).collect::<io::Result<_>>()?;
+        files.into_par_iter().map(|(path, file)| entry(path, &file)).collect::<io::Result<_>>()?;
     entries.sort();
     Ok(entries)
+}
+
+fn entry(path: String, file: &Path) -> io::Result<FileEntry> {
+    Ok(FileEntry { path, size: fs::metadata(file)?.len(), blake3: hash_file(file)? })
 }
 
 /// A path inside an artifact as its manifest has it: parts with `/` between them, all UTF-8.

@@ -114,11 +114,11 @@ impl Schema {
     /// Names of the resolved parameters that are left to the scene.
     pub fn by_scene<'a>(&'a self, resolved: &'a Value) -> Vec<&'a str> {
         let form = self.form(resolved.as_object().unwrap_or(&Map::new()));
-        let is_open = |name: &&str| {
+        let open = form.names().filter(|name| {
             let default = form.property(name).and_then(|property| property.get(DEFAULT_KEYWORD));
             resolved[*name].is_null() && default.is_some_and(|default| default == BY_SCENE)
-        };
-        form.names().filter(is_open).collect()
+        });
+        open.collect()
     }
 
     /// The form that parameters select; the default's where they select none, or none that there
@@ -168,10 +168,11 @@ impl Form {
     }
 
     fn defaults(&self) -> Map<String, Value> {
-        let default = |(name, property): (&String, &Value)| {
-            Some((name.clone(), property.get("default")?.clone()))
-        };
-        self.properties().into_iter().flatten().filter_map(default).collect()
+        self.properties()
+            .into_iter()
+            .flatten()
+            .filter_map(|(name, property)| Some((name.clone(), property.get("default")?.clone())))
+            .collect()
     }
 
     fn canonical_value(&self, name: &str, value: &Value) -> Value {
@@ -185,18 +186,17 @@ impl Form {
     }
 
     fn problems(&self, resolved: &Value) -> Vec<ParameterProblem> {
-        let problem = |misfit: Misfit| {
-            let name = misfit.path.trim_start_matches('/').to_owned();
-            let problem = match self.choices(&name) {
-                Some(choices) => not_one_of(&misfit.value, &choices),
-                None => misfit.problem,
-            };
-            ParameterProblem {
-                name: if name.is_empty() { "(all)".to_owned() } else { name },
-                problem,
-            }
+        let misfits = self.validator.misfits(resolved).into_iter();
+        misfits.map(|misfit| self.problem(misfit)).collect()
+    }
+
+    fn problem(&self, misfit: Misfit) -> ParameterProblem {
+        let name = misfit.path.trim_start_matches('/').to_owned();
+        let problem = match self.choices(&name) {
+            Some(choices) => not_one_of(&misfit.value, &choices),
+            None => misfit.problem,
         };
-        self.validator.misfits(resolved).into_iter().map(problem).collect()
+        ParameterProblem { name: if name.is_empty() { "(all)".to_owned() } else { name }, problem }
     }
 
     /// The words a parameter may be, where it is a choice: the validator itself only says that no

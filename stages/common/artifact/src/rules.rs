@@ -105,19 +105,29 @@ impl Rule {
     }
 
     fn is_kept(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
-        let fits = |(name, schema): (&String, &Value)| {
-            let value = match name.split_once('.') {
-                Some((input, inner)) => {
-                    inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner))
-                }
-                None => parameters.get(name),
-            };
-            Some(Validator::new(schema).ok()?.is_valid(value?))
-        };
-        let applies = self.when.iter().all(|condition| fits(condition) == Some(true));
+        let applies = self
+            .when
+            .iter()
+            .all(|(name, schema)| fits(name, schema, parameters, inputs) == Some(true));
+        if !applies {
+            return true;
+        }
         let is_given = self.needs.iter().all(|input| inputs.contains_key(input));
-        !applies || (is_given && self.must.iter().all(|demand| fits(demand) != Some(false)))
+        is_given
+            && self
+                .must
+                .iter()
+                .all(|(name, schema)| fits(name, schema, parameters, inputs) != Some(false))
     }
+}
+
+/// Whether the value of a name fits a schema; nothing where the value isn't known.
+fn fits(name: &str, schema: &Value, parameters: &Value, inputs: &GivenInputs) -> Option<bool> {
+    let value = match name.split_once('.') {
+        Some((input, inner)) => inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner)),
+        None => parameters.get(name),
+    };
+    Some(Validator::new(schema).ok()?.is_valid(value?))
 }
 
 impl Description {

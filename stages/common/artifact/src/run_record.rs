@@ -152,12 +152,13 @@ pub fn folders_of(nodes: &[&RunNode]) -> Vec<String> {
     if nodes.len() == 1 {
         return vec![String::new()];
     }
-    let name = |node: &RunNode| -> String {
-        let text = if node.point.is_empty() { &node.stage } else { &node.point };
-        let plain = |c: char| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' };
-        text.replace(", ", "-").chars().map(plain).collect()
-    };
-    (1..).zip(nodes).map(|(number, node)| format!("{number}-{}/", name(node))).collect()
+    (1..).zip(nodes).map(|(number, node)| format!("{number}-{}/", folder_name(node))).collect()
+}
+
+fn folder_name(node: &RunNode) -> String {
+    let text = if node.point.is_empty() { &node.stage } else { &node.point };
+    let plain = |c: char| if c.is_alphanumeric() || "=.-_".contains(c) { c } else { '_' };
+    text.replace(", ", "-").chars().map(plain).collect()
 }
 
 impl RunRecord {

@@ -48,7 +48,7 @@ pub trait Stage {
     const SINK: bool = false;
     /// Whether it shows what there is of a run, some of which failed.
     const PARTIAL: bool = false;
-    /// Whether it can make its output from a checkpoint alone ([`Context::from_checkpoint`]).
+    /// Whether the stage accepts `--from-checkpoint` ([`Context::from_checkpoint`]).
     const FROM_CHECKPOINT: bool = false;
     /// Environment variables that change the result.
     const ENVIRONMENT: &'static [&'static str] = &[];
@@ -108,7 +108,7 @@ struct Arguments {
     /// Private folder that survives an interruption (checkpoints)
     #[arg(long, value_name = "DIR")]
     work: Option<PathBuf>,
-    /// Makes the output from the latest checkpoint in --work, and works no further
+    /// Write the output from the latest checkpoint in --work, and don't train on
     #[arg(long, requires = "work")]
     from_checkpoint: bool,
     /// Where to compute: cpu or cuda:N
@@ -265,8 +265,8 @@ impl Context {
         self.work.as_deref()
     }
 
-    /// Whether the latest checkpoint in [`Context::work`] is the output, and nothing is to be
-    /// learnt beyond it. Only where the stage says [`Stage::FROM_CHECKPOINT`].
+    /// Whether to write the output from the latest checkpoint in [`Context::work`], without further
+    /// training. False unless the stage sets [`Stage::FROM_CHECKPOINT`].
     pub fn from_checkpoint(&self) -> bool {
         self.from_checkpoint
     }
@@ -362,7 +362,8 @@ fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow:
         return Err(Failure::Usage(problem).into());
     }
     if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
-        let problem = format!("--from-checkpoint: {} makes nothing of a checkpoint", S::NAME);
+        let problem =
+            format!("--from-checkpoint: stage {} doesn't have this option; leave it out", S::NAME);
         return Err(Failure::Usage(problem).into());
     }
     let threads = match arguments.threads {

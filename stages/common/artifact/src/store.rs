@@ -290,13 +290,6 @@ impl Store {
         Ok(keys)
     }
 
-    /// Identities of all objects, sorted. Names that can't be an identity are somebody else's.
-    pub fn objects(&self) -> Result<Vec<String>, StoreError> {
-        let mut names = self.names("objects")?;
-        names.retain(|name| name.len() == 64 && name.bytes().all(|b| b.is_ascii_hexdigit()));
-        Ok(names)
-    }
-
     /// Keys of actions that haven't finished, sorted.
     pub fn partials(&self) -> Result<Vec<String>, StoreError> {
         self.names("partial")

@@ -81,25 +81,26 @@ impl Tag {
     /// A schema for each variant, with its parameters on the level of all others.
     pub(crate) fn forms(&self, schema: &Value) -> Vec<Value> {
         let choices: Vec<&str> = self.variants().collect();
-        let form = |variant: &Variant| {
-            let mut form = schema.clone();
-            let tag = &mut form["properties"][&self.name];
-            let mut own = json!({"enum": choices, "default": choices[0]});
-            for (keyword, value) in tag
-                .as_object()
-                .into_iter()
-                .flatten()
-                .filter(|(k, _)| !["$ref", "oneOf", "default"].contains(&k.as_str()))
-            {
-                own[keyword] = value.clone();
-            }
-            *tag = own;
-            if let Some(properties) = form["properties"].as_object_mut() {
-                properties.extend(variant.properties.clone());
-            }
-            form
-        };
-        self.variants.iter().map(form).collect()
+        self.variants.iter().map(|variant| self.form(schema, &choices, variant)).collect()
+    }
+
+    fn form(&self, schema: &Value, choices: &[&str], variant: &Variant) -> Value {
+        let mut form = schema.clone();
+        let tag = &mut form["properties"][&self.name];
+        let mut own = json!({"enum": choices, "default": choices[0]});
+        for (keyword, value) in tag
+            .as_object()
+            .into_iter()
+            .flatten()
+            .filter(|(k, _)| !["$ref", "oneOf", "default"].contains(&k.as_str()))
+        {
+            own[keyword] = value.clone();
+        }
+        *tag = own;
+        if let Some(properties) = form["properties"].as_object_mut() {
+            properties.extend(variant.properties.clone());
+        }
+        form
     }
 
     /// The number of the variant that parameters select; none where they leave it out or name none.

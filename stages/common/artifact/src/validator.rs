@@ -273,27 +273,30 @@ impl<'a> Check<'a> {
 
     /// `allOf`, `anyOf`, `oneOf`, `not`.
     fn combined(&mut self, keywords: &'a Map<String, Value>, value: &Value, depth: usize) {
-        let root = self.root;
-        let fits = |schema: &'a Value| {
-            let mut check = Check { root, path: Vec::new(), found: Vec::new() };
-            check.value(schema, value, depth + 1);
-            check.found.is_empty()
-        };
         let list = |keyword: &str| keywords.get(keyword).and_then(Value::as_array);
         for schema in list("allOf").into_iter().flatten() {
             self.value(schema, value, depth + 1);
         }
-        if list("anyOf").is_some_and(|schemas| !schemas.iter().any(fits)) {
+        let any = list("anyOf");
+        if any.is_some_and(|all| !all.iter().any(|schema| self.fits(schema, value, depth))) {
             self.misfit(value, format!("{value} fits none of the alternatives"));
         }
-        match list("oneOf").map(|schemas| schemas.iter().filter(|schema| fits(schema)).count()) {
+        let one = list("oneOf");
+        match one.map(|all| all.iter().filter(|one| self.fits(one, value, depth)).count()) {
             Some(0) => self.misfit(value, format!("{value} fits none of the alternatives")),
             None | Some(1) => {}
             Some(_) => self.misfit(value, format!("{value} fits several alternatives")),
         }
-        if keywords.get("not").is_some_and(fits) {
+        if keywords.get("not").is_some_and(|schema| self.fits(schema, value, depth)) {
             self.misfit(value, format!("{value} isn't allowed"));
         }
+    }
+
+    /// Whether the value at hand fits another schema.
+    fn fits(&self, schema: &'a Value, value: &Value, depth: usize) -> bool {
+        let mut check = Check { root: self.root, path: Vec::new(), found: Vec::new() };
+        check.value(schema, value, depth + 1);
+        check.found.is_empty()
     }
 }
 

@@ -1,7 +1,7 @@
 //! Numbers in the form that a schema gives them: what is equal is written alike, and so hashed
 //! alike.
 
-use serde_json::{Map, Number, Value};
+use serde_json::{Number, Value};
 
 /// A schema with what its references lead to.
 #[derive(Clone, Copy)]
@@ -30,19 +30,17 @@ impl<'a> Reader<'a> {
             }
             Value::Number(number) => as_integer(number).unwrap_or_else(|| value.clone()),
             Value::Array(items) => {
-                let read = |(index, item)| {
+                let items = items.iter().enumerate().map(|(index, item)| {
                     self.read_by(&self.inside(schemas, |s| item_schema(s, index)), item)
-                };
-                items.iter().enumerate().map(read).collect()
+                });
+                items.collect()
             }
             Value::Object(entries) => {
-                let read = |(name, entry): (&String, &Value)| {
-                    (
-                        name.clone(),
-                        self.read_by(&self.inside(schemas, |s| property_schema(s, name)), entry),
-                    )
-                };
-                Value::Object(entries.iter().map(read).collect::<Map<_, _>>())
+                let entries = entries.iter().map(|(name, entry)| {
+                    let inside = self.inside(schemas, |s| property_schema(s, name));
+                    (name.clone(), self.read_by(&inside, entry))
+                });
+                Value::Object(entries.collect())
             }
             _ => value.clone(),
         }
@@ -81,11 +79,11 @@ impl<'a> Reader<'a> {
         if let Some(words) = definition.get("enum").and_then(Value::as_array) {
             return Some(words.iter().map(|word| (word, "")).collect());
         }
-        let choice = |one: &'a Value| {
+        let choices = definition.get("oneOf")?.as_array()?.iter().map(|one| {
             let description = one.get("description").and_then(Value::as_str).unwrap_or_default();
             Some((one.get("const")?, description))
-        };
-        definition.get("oneOf")?.as_array()?.iter().map(choice).collect()
+        });
+        choices.collect()
     }
 
     /// The schema of a value that is there: without the null that stands for none, and behind its

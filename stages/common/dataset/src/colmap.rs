@@ -31,10 +31,9 @@ struct Image {
     points: Vec<u64>,
 }
 
-/// Folders below `sparse` that hold a model, by name; `None` where there is none.
-pub(crate) fn models(folder: &Path) -> Option<Vec<PathBuf>> {
-    let found = with_list(folder, "images");
-    (!found.is_empty()).then_some(found)
+/// Folders below `sparse` that hold a model, by name.
+pub(crate) fn models(folder: &Path) -> Vec<PathBuf> {
+    with_list(folder, "images")
 }
 
 /// The camera of the first model below `sparse`, where that has one alone. What images the model
@@ -60,8 +59,9 @@ fn with_list(folder: &Path, things: &str) -> Vec<PathBuf> {
 }
 
 /// Reads the model with most images, the first of several, and the images that it names.
-pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, DatasetError> {
-    let (path, mut model, mut notes) = largest_model(folder, models)?;
+pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
+    let models = models(folder);
+    let (path, mut model, mut notes) = largest_model(folder, &models)?;
     // By name: the order in which COLMAP happened to register them means nothing.
     model.images.sort_by(|a, b| a.name.cmp(&b.name));
     let list =
@@ -70,12 +70,7 @@ pub(crate) fn read(folder: &Path, models: &[PathBuf]) -> Result<Dataset, Dataset
         if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
     let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     for (index, image) in model.images.iter().enumerate() {
-        let of_frame = |reason: String| DatasetError::Frame {
-            path: list.clone(),
-            index,
-            file: image.name.clone(),
-            reason,
-        };
+        let of_frame = |reason: String| DatasetError::frame(&list, index, &image.name, reason);
         let file = relative_path(&image.name).map_err(|e| of_frame(e.to_string()))?;
         match find(&root.join(&file), "an image") {
             Found::File => {}
@@ -348,13 +343,10 @@ fn intrinsics(
     height: u64,
     parameters: &[f64],
 ) -> Result<Intrinsics, String> {
-    let size = |value: u64| {
-        u32::try_from(value)
-            .ok()
-            .filter(|v| *v > 0)
-            .ok_or_else(|| format!("its size is {width}×{height}"))
+    let side = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0);
+    let (Some(columns), Some(rows)) = (side(width), side(height)) else {
+        return Err(format!("its size is {width}×{height}"));
     };
-    let (columns, rows) = (size(width)?, size(height)?);
     let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) =
         match (model, parameters) {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], [0.0; 3], [0.0; 2]),

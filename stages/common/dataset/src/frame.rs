@@ -1,4 +1,5 @@
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use glam::{DMat3, DVec3};
@@ -71,38 +72,44 @@ pub(crate) fn pose_from_world_to_camera(rotation: DMat3, translation: DVec3) -> 
 /// Names for images, by their paths inside the data set: the files' names alone where those differ,
 /// else with their folders.
 pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, DatasetError> {
-    let text = |index: usize, part: Option<&std::ffi::OsStr>| {
-        // Names become files' names and are printed everywhere: no control characters.
-        part.and_then(|p| p.to_str()).map(|name| name.replace(char::is_control, "_")).ok_or_else(
-            || DatasetError::Frame {
-                path: list.to_path_buf(),
-                index,
-                file: shown(&paths[index]),
-                reason: "its name is not UTF-8; rename the file".to_owned(),
-            },
-        )
-    };
-    let stem = |(index, path): (usize, &PathBuf)| text(index, path.file_stem());
-    let short = paths.iter().enumerate().map(stem).collect::<Result<Vec<_>, _>>()?;
+    let short = each_name(list, paths, |path| text(path.file_stem()))?;
     if first_twice(&short).is_none() {
         return Ok(short);
     }
-    let joined = |(index, path): (usize, &PathBuf)| {
-        let whole = path.with_extension("");
-        let parts =
-            whole.iter().map(|part| text(index, Some(part))).collect::<Result<Vec<_>, _>>()?;
-        Ok(parts.join("_"))
-    };
-    let long = paths.iter().enumerate().map(joined).collect::<Result<Vec<_>, DatasetError>>()?;
+    let long = each_name(list, paths, name_with_folders)?;
     match first_twice(&long) {
         None => Ok(long),
-        Some(index) => Err(DatasetError::Frame {
-            path: list.to_path_buf(),
-            index,
-            file: shown(&paths[index]),
-            reason: format!("a second view named {:?}; file names must differ", short[index]),
-        }),
+        Some(index) => {
+            let reason = format!("a second view named {:?}; file names must differ", short[index]);
+            Err(DatasetError::frame(list, index, &shown(&paths[index]), reason))
+        }
     }
+}
+
+fn each_name(
+    list: &Path,
+    paths: &[PathBuf],
+    name: fn(&Path) -> Result<String, String>,
+) -> Result<Vec<String>, DatasetError> {
+    let mut names = Vec::with_capacity(paths.len());
+    for (index, path) in paths.iter().enumerate() {
+        let of_frame = |reason| DatasetError::frame(list, index, &shown(path), reason);
+        names.push(name(path).map_err(of_frame)?);
+    }
+    Ok(names)
+}
+
+fn name_with_folders(path: &Path) -> Result<String, String> {
+    let whole = path.with_extension("");
+    let parts = whole.iter().map(|part| text(Some(part))).collect::<Result<Vec<_>, _>>()?;
+    Ok(parts.join("_"))
+}
+
+/// A part of a path as text. Names become files' names and are printed everywhere: no control
+/// characters.
+fn text(part: Option<&OsStr>) -> Result<String, String> {
+    let name = part.and_then(OsStr::to_str).ok_or("its name is not UTF-8; rename the file")?;
+    Ok(name.replace(char::is_control, "_"))
 }
 
 /// The first that was there before.

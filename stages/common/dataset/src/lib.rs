@@ -1,17 +1,13 @@
-//! Posed photographs as folders have them. The form is found by looking: [`Dataset::read`] takes
+//! Reads folders of posed photographs. [`Dataset::read`] recognises a folder's [`Format`] by the
+//! folder's files; `FORMS` lists which format goes first.
 //!
-//! * **Blender** (NeRF's synthetic scenes): `transforms_train.json`, `transforms_test.json` if
-//!   there are test views, one angle for all, PNG;
-//! * **transforms** (instant-ngp, nerfstudio): `transforms.json`, intrinsics for all or for each,
-//!   lens distortion, masks;
-//! * **LLFF**: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …);
-//! * **COLMAP**: `sparse/0` and so on, binary or text, beside `images`; of several models the one
-//!   with most images.
+//! A new form is a module with its reader and, in this file, a variant of [`Format`] and an entry
+//! of `FORMS`. What readers share is in `found`, `frame`, `photograph` and `text`.
 //!
 //! A [`Frame`] has its camera in this project's conventions (OpenGL axes, pixels from the top left
-//! corner, scene units) and its lens's distortion; [`Frame::photograph`] reads its image, upright
-//! as its poses have it. [`Dataset::undistorted`] has images read as pinhole cameras would have
-//! taken them.
+//! corner, scene units) and its lens's distortion; [`Frame::photograph`] reads the
+//! image, and turns it as EXIF asks only where the camera's width and height require this. After
+//! [`Dataset::undistorted`], images are read with the lens distortion removed.
 //!
 //! Units: lengths are those of the poses; pixels count from the stored image's top left corner,
 //! whose first pixel has its centre at (0.5, 0.5). Everything a file says is checked: sizes before
@@ -62,24 +58,101 @@ pub struct Dataset {
 /// Forms of folders.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Format {
-    /// `transforms_train.json`, and `transforms_test.json` where some views are for testing.
+    /// NeRF's synthetic scenes: `transforms_train.json`, `transforms_test.json` if there are test
+    /// views, one angle for all, PNG.
     Blender,
-    /// `transforms.json`.
+    /// instant-ngp's and nerfstudio's: `transforms.json`, intrinsics for all or for each, lens
+    /// distortion, masks.
     Transforms,
-    /// `poses_bounds.npy`.
+    /// LLFF's: `poses_bounds.npy` beside `images` (or `images_4`, `images_8`, …).
     Llff,
-    /// `sparse/N`.
+    /// COLMAP's: `sparse/0` and so on, binary or text, beside `images`; of several models the one
+    /// with most images.
     Colmap,
+}
+
+/// What is known of a form.
+struct Form {
+    format: Format,
+    /// As `Display` has it.
+    name: &'static str,
+    /// What a folder that has it is called.
+    title: &'static str,
+    /// What a folder that has none should have.
+    sign: &'static str,
+    is_benchmark: bool,
+    is_present: fn(&Path) -> Result<bool, DatasetError>,
+    read: fn(&Path) -> Result<Dataset, DatasetError>,
+}
+
+/// The most explicit first: a folder often has what its poses were made from, too.
+const FORMS: &[Form] = &[
+    Form {
+        format: Format::Blender,
+        name: "blender",
+        title: "Blender's form (transforms_train.json)",
+        sign: "transforms_train.json (Blender)",
+        is_benchmark: true,
+        is_present: |folder| is_file(&folder.join("transforms_train.json")),
+        read: blender::read,
+    },
+    Form {
+        format: Format::Transforms,
+        name: "transforms",
+        title: "transforms.json (instant-ngp, nerfstudio)",
+        sign: "transforms.json (instant-ngp, nerfstudio)",
+        is_benchmark: false,
+        is_present: |folder| is_file(&folder.join("transforms.json")),
+        read: transforms::read,
+    },
+    Form {
+        format: Format::Llff,
+        name: "llff",
+        title: "LLFF (poses_bounds.npy)",
+        sign: "poses_bounds.npy (LLFF)",
+        is_benchmark: true,
+        is_present: |folder| is_file(&folder.join("poses_bounds.npy")),
+        read: llff::read,
+    },
+    Form {
+        format: Format::Colmap,
+        name: "colmap",
+        title: "COLMAP (sparse)",
+        sign: "sparse/0 (COLMAP)",
+        is_benchmark: false,
+        is_present: |folder| Ok(!colmap::models(folder).is_empty()),
+        read: colmap::read,
+    },
+];
+
+impl Format {
+    /// What to call it, with what it is found by: `COLMAP (sparse)`.
+    pub fn title(self) -> &'static str {
+        self.form().title
+    }
+
+    /// Whether benchmarks' scenes come so, whose images are HR truth rather than LR photographs.
+    pub fn is_benchmark(self) -> bool {
+        self.form().is_benchmark
+    }
+
+    fn form(self) -> &'static Form {
+        FORMS.iter().find(|form| form.format == self).expect("each format has an entry")
+    }
 }
 
 impl fmt::Display for Format {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Blender => "blender",
-            Self::Transforms => "transforms",
-            Self::Llff => "llff",
-            Self::Colmap => "colmap",
-        })
+        f.write_str(self.form().name)
+    }
+}
+
+/// What a folder should have one of, in words.
+fn signs() -> String {
+    let signs: Vec<&str> = FORMS.iter().map(|form| form.sign).collect();
+    match signs.split_last() {
+        Some((last, others)) => format!("{}, or {last}", others.join(", ")),
+        None => String::new(),
     }
 }
 
@@ -87,12 +160,7 @@ impl fmt::Display for Format {
 #[derive(Debug, thiserror::Error)]
 pub enum DatasetError {
     /// The folder has none of the forms.
-    #[error(
-        "{}: no data set; expected transforms_train.json (Blender), transforms.json (instant-ngp, \
-        nerfstudio), poses_bounds.npy \
-         (LLFF), or sparse/0 (COLMAP)",
-        shown(path)
-    )]
+    #[error("{}: no data set; expected {}", shown(path), signs())]
     Unknown {
         /// The folder.
         path: PathBuf,
@@ -147,23 +215,16 @@ impl DatasetError {
     fn format(path: &Path, reason: impl Into<String>) -> Self {
         Self::Format { path: path.to_path_buf(), reason: reason.into() }
     }
+
+    fn frame(path: &Path, index: usize, file: &str, reason: String) -> Self {
+        Self::Frame { path: path.to_path_buf(), index, file: file.to_owned(), reason }
+    }
 }
 
 impl Dataset {
     /// Reads a folder, whichever form it has. Images are looked at for their size alone.
     pub fn read(folder: &Path) -> Result<Self, DatasetError> {
-        // The most explicit form first: a folder often has what its poses were made from, too.
-        let mut set = if is_file(&folder.join("transforms_train.json"))? {
-            blender::read(folder)?
-        } else if is_file(&folder.join("transforms.json"))? {
-            transforms::read(folder)?
-        } else if is_file(&folder.join("poses_bounds.npy"))? {
-            llff::read(folder)?
-        } else if let Some(models) = colmap::models(folder) {
-            colmap::read(folder, &models)?
-        } else {
-            return Err(DatasetError::Unknown { path: folder.to_path_buf() });
-        };
+        let mut set = (form_of(folder)?.read)(folder)?;
         set.note_what_is_special();
         for note in &mut set.notes {
             *note = printable(note).into_owned();
@@ -254,11 +315,38 @@ impl Dataset {
     }
 }
 
+/// The first form that a folder has.
+fn form_of(folder: &Path) -> Result<&'static Form, DatasetError> {
+    for form in FORMS {
+        if (form.is_present)(folder)? {
+            return Ok(form);
+        }
+    }
+    Err(DatasetError::Unknown { path: folder.to_path_buf() })
+}
+
 /// Whether a file is there; something else in its place is refused.
 fn is_file(path: &Path) -> Result<bool, DatasetError> {
     match find(path, "a file") {
         Found::File => Ok(true),
         Found::Nothing(_) => Ok(false),
         Found::Other(reason) => Err(DatasetError::Place { reason }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn forms_differ_and_a_folder_of_none_is_told_them() {
+        let names: BTreeSet<String> = FORMS.iter().map(|form| form.format.to_string()).collect();
+        assert_eq!(names.len(), FORMS.len());
+        let message = Dataset::read("/nowhere".as_ref()).unwrap_err().to_string();
+        let words = "/nowhere: no data set; expected transforms_train.json (Blender), ";
+        assert!(message.starts_with(words), "{message}");
+        assert!(FORMS.iter().all(|form| message.contains(form.sign)), "{message}");
     }
 }

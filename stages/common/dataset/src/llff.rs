@@ -27,8 +27,7 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let mut frames = Vec::with_capacity(rows.len());
     for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
         let file = name.clone();
-        let of_frame =
-            |reason: String| DatasetError::Frame { path: path.clone(), index, file, reason };
+        let of_frame = |reason: String| DatasetError::frame(&path, index, &file, reason);
         let frame = look(&image)
             .map_err(|e| e.to_string())
             .and_then(|stored| frame(row, distortion, stored, name, image))
@@ -54,11 +53,7 @@ fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<Str
             return (Distortion::default(), Some(format!("lens distortion is not known: {e}")));
         }
     };
-    let is_theirs = |row: &[f64; NUMBERS]| {
-        let (width, focal) = (row[9], row[14]);
-        (camera.fx * width / (f64::from(camera.width) * focal) - 1.0).abs() < 1e-3
-    };
-    if rows.iter().all(is_theirs) {
+    if rows.iter().all(|row| has_focal_length_of(&camera, row)) {
         (camera.distortion, None)
     } else {
         let note = format!(
@@ -68,6 +63,12 @@ fn distortion(folder: &Path, rows: &[[f64; NUMBERS]]) -> (Distortion, Option<Str
         );
         (Distortion::default(), Some(note))
     }
+}
+
+/// Whether a photograph has a camera's focal length, each in parts of its width.
+fn has_focal_length_of(camera: &Intrinsics, row: &[f64; NUMBERS]) -> bool {
+    let (width, focal) = (row[9], row[14]);
+    (camera.fx * width / (f64::from(camera.width) * focal) - 1.0).abs() < 1e-3
 }
 
 fn frame(
@@ -81,13 +82,6 @@ fn frame(
     let (down, right, back, centre, inside) =
         (column(0), column(1), column(2), column(3), column(4));
     let [height, width, focal] = inside.to_array();
-    let whole = |value: f64, name: &str| {
-        if (1.0..=f64::from(u32::MAX)).contains(&value) {
-            Ok(value.round() as u32)
-        } else {
-            Err(format!("{name} is {value}"))
-        }
-    };
     let (width, height) = (whole(width, "width")?, whole(height, "height")?);
     let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
     let (taken_with, turned) =
@@ -108,6 +102,14 @@ fn frame(
         camera_to_world,
         depths: Some([near, far]),
     })
+}
+
+fn whole(value: f64, name: &str) -> Result<u32, String> {
+    if (1.0..=f64::from(u32::MAX)).contains(&value) {
+        Ok(value.round() as u32)
+    } else {
+        Err(format!("{name} is {value}"))
+    }
 }
 
 /// Images of a folder by name, and what is named like one but can't be read, in words.
@@ -169,35 +171,35 @@ fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let io = |source| DatasetError::Io { path: path.to_path_buf(), source };
     let mut bytes = Vec::new();
     std::fs::File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(io)?;
-    let bad = |reason: String| {
-        DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"))
-    };
     if brackets(&bytes) > MOST_BRACKETS {
-        return Err(bad("its header is nested".to_owned()));
+        return Err(no_array(path, "its header is nested"));
     }
-    let file = npyz::NpyFile::new(&bytes[..]).map_err(|e| bad(e.to_string()))?;
+    let file = npyz::NpyFile::new(&bytes[..]).map_err(|e| no_array(path, &e.to_string()))?;
     let shape = file.shape().to_vec();
     let rows = match shape[..] {
         // A claim of more numbers than there are bytes isn't believed.
         [rows, columns] if columns == NUMBERS as u64 && rows > 0 && rows <= bytes.len() as u64 => {
             rows as usize
         }
-        _ => return Err(bad(format!("its shape is {shape:?}"))),
+        _ => return Err(no_array(path, &format!("its shape is {shape:?}"))),
     };
     let by_columns = file.header().order() == npyz::Order::Fortran;
     let kind = file.dtype().descr();
     let numbers: Vec<f64> = if kind.contains("f8") {
-        file.into_vec().map_err(|e| bad(e.to_string()))?
+        file.into_vec().map_err(|e| no_array(path, &e.to_string()))?
     } else {
         let singles: Vec<f32> =
-            file.into_vec().map_err(|e| bad(format!("{e}; it holds {kind}")))?;
+            file.into_vec().map_err(|e| no_array(path, &format!("{e}; it holds {kind}")))?;
         singles.into_iter().map(f64::from).collect()
     };
-    let at = |row: usize, column: usize| {
-        if by_columns { column * rows + row } else { row * NUMBERS + column }
-    };
+    let (down, across) = if by_columns { (1, rows) } else { (NUMBERS, 1) };
+    let at = |row: usize, column: usize| row * down + column * across;
     let number = |row, column| numbers.get(at(row, column)).copied().unwrap_or(f64::NAN);
     Ok((0..rows).map(|row| std::array::from_fn(|column| number(row, column))).collect())
+}
+
+fn no_array(path: &Path, reason: &str) -> DatasetError {
+    DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"))
 }
 
 #[cfg(test)]

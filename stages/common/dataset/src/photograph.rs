@@ -1,7 +1,8 @@
 use std::fs::File;
 use std::io::BufReader;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use artifact::relative_path;
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
 use pixels::{
@@ -19,6 +20,16 @@ pub(crate) fn is_image_name(path: &Path) -> bool {
 
 pub(crate) fn is_exr(path: &Path) -> bool {
     path.extension().is_some_and(|e| e.eq_ignore_ascii_case("exr"))
+}
+
+/// The path inside the folder of an image that a file names. NeRF's files leave `.png` out.
+pub(crate) fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
+    let mut file = relative_path(text).map_err(|e| e.to_string())?;
+    if !is_image_name(&file) && !folder.join(&file).is_file() {
+        // `set_extension` would cut a name like `r.0`.
+        file.as_mut_os_string().push(".png");
+    }
+    Ok(file)
 }
 
 /// A PNG or JPEG whose header has been read, by what it is, whatever its name says.
@@ -76,19 +87,11 @@ fn is_sideways(turn: Orientation) -> bool {
 /// images as they are stored, so it is turned only where its shape fits no other way.
 pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
     let (width, height) = stored.size;
-    let fits = |(width, height): (u32, u32)| {
-        let (across, down) = (
-            f64::from(width) / f64::from(k.width.max(1)),
-            f64::from(height) / f64::from(k.height.max(1)),
-        );
-        // A smaller copy's sides are rounded.
-        (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
-    };
     if (k.width, k.height) == stored.size {
         Ok((k, false))
-    } else if fits((width, height)) {
+    } else if has_shape_of(&k, width, height) {
         Ok((k.resized(width, height), false))
-    } else if stored.is_sideways && fits((height, width)) {
+    } else if stored.is_sideways && has_shape_of(&k, height, width) {
         Ok((k.resized(height, width), true))
     } else {
         Err(format!(
@@ -96,6 +99,15 @@ pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool)
             k.width, k.height
         ))
     }
+}
+
+fn has_shape_of(k: &Intrinsics, width: u32, height: u32) -> bool {
+    let (across, down) = (
+        f64::from(width) / f64::from(k.width.max(1)),
+        f64::from(height) / f64::from(k.height.max(1)),
+    );
+    // A smaller copy's sides are rounded.
+    (across / down - 1.0).abs() <= 0.01 + 1.0 / f64::from(width.min(height).max(1))
 }
 
 /// The image as it is stored, or turned as its EXIF data ask.
@@ -118,25 +130,20 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
 /// An EXR's linear light, display-encoded.
 fn encoded(path: &Path) -> Result<Rgba8, PixelError> {
     let image = read_exr(path)?;
-    let missing = |name: &str| PixelError::Format {
-        path: path.to_path_buf(),
-        reason: format!("no channel {name}"),
-    };
-    let [r, g, b] = ["R", "G", "B"].map(|name| image.channel(name).ok_or_else(|| missing(name)));
+    let format = |reason: String| PixelError::Format { path: path.to_path_buf(), reason };
+    let [r, g, b] = ["R", "G", "B"]
+        .map(|name| image.channel(name).ok_or_else(|| format(format!("no channel {name}"))));
     let (r, g, b, a) = (r?, g?, b?, image.channel("A"));
-    let pixel = |i: usize| {
-        let alpha = a.map_or(1.0, |a| a[i]);
-        // EXR files keep premultiplied colours, ours straight ones.
-        let encode =
-            |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
-        let straight = |v: f32| if alpha > 0.0 { encode(v) } else { 0 };
-        [straight(r[i]), straight(g[i]), straight(b[i]), to_u8(alpha)]
-    };
-    Ok(Rgba8::new(
-        image.width,
-        image.height,
-        (0..image.width * image.height).flat_map(pixel).collect(),
-    ))
+    let pixels = (0..image.width * image.height)
+        .flat_map(|i| encoded_pixel([r[i], g[i], b[i]], a.map_or(1.0, |a| a[i])));
+    Ok(Rgba8::new(image.width, image.height, pixels.collect()))
+}
+
+/// EXR files keep premultiplied colours, ours straight ones.
+fn encoded_pixel(colour: [f32; 3], alpha: f32) -> [u8; 4] {
+    let encode = |v: f32| to_u8(srgb_from_linear(f64::from((v / alpha).clamp(0.0, 1.0))) as f32);
+    let [r, g, b] = colour.map(|v| if alpha > 0.0 { encode(v) } else { 0 });
+    [r, g, b, to_u8(alpha)]
 }
 
 impl Frame {
@@ -172,13 +179,11 @@ fn undistorted(image: &Rgba8, taken_with: &Intrinsics, pinhole: &Intrinsics) -> 
     for y in 0..image.height {
         for x in 0..image.width {
             let at = taken_with.source(pinhole, [x as f64 + 0.5, y as f64 + 0.5]);
-            let pixel = |column: usize, row: usize| {
+            let colour = sample_cubic((image.width, image.height), at, |column, row| {
                 let at = 4 * (row * image.width + column);
                 [0, 1, 2, 3].map(|c| f64::from(image.data[at + c]))
-            };
-            data.extend(
-                sample_cubic((image.width, image.height), at, pixel).map(|v| (v + 0.5) as u8),
-            );
+            });
+            data.extend(colour.map(|v| (v + 0.5) as u8));
         }
     }
     Rgba8::new(image.width, image.height, data)

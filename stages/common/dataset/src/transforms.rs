@@ -7,7 +7,7 @@ use serde::Deserialize;
 use crate::found::{Found, find};
 use crate::frame::names;
 use crate::number::{Number, words_as_text};
-use crate::photograph::{Stored, fitted, is_exr, look};
+use crate::photograph::{Stored, fitted, image_file, is_exr, look};
 use crate::text::read_text;
 use crate::{Dataset, DatasetError, Format, Frame, Split};
 
@@ -121,12 +121,7 @@ pub(crate) fn read_file(
     let (mut frames, mut files) = (Vec::new(), Vec::new());
     let (mut first_missing, mut missing) = (None, 0);
     for (index, entry) in transforms.frames.iter().enumerate() {
-        let of_frame = |reason: String| DatasetError::Frame {
-            path: path.to_path_buf(),
-            index,
-            file: entry.file_path.clone(),
-            reason,
-        };
+        let of_frame = |reason: String| DatasetError::frame(path, index, &entry.file_path, reason);
         let file = image_file(folder, &entry.file_path).map_err(of_frame)?;
         match find(&folder.join(&file), "an image") {
             Found::File => {}
@@ -161,13 +156,15 @@ pub(crate) fn read_file(
 /// The split by file names, where there is one for both. What is for validation is for testing
 /// where nothing else is.
 fn given_split(transforms: &Transforms, files: &[PathBuf]) -> Option<Split> {
-    let numbers = |names: &Vec<String>| -> Vec<usize> {
-        let named: Vec<PathBuf> = names.iter().filter_map(|n| relative_path(n).ok()).collect();
-        files.iter().enumerate().filter(|(_, f)| named.contains(f)).map(|(i, _)| i).collect()
-    };
-    let train = numbers(transforms.train_filenames.as_ref()?);
-    let test = numbers(transforms.test_filenames.as_ref().or(transforms.val_filenames.as_ref())?);
+    let test = transforms.test_filenames.as_ref().or(transforms.val_filenames.as_ref());
+    let train = numbers_of(transforms.train_filenames.as_ref()?, files);
+    let test = numbers_of(test?, files);
     (!train.is_empty() && !test.is_empty()).then_some(Split { train, test })
+}
+
+fn numbers_of(names: &[String], files: &[PathBuf]) -> Vec<usize> {
+    let named: Vec<PathBuf> = names.iter().filter_map(|n| relative_path(n).ok()).collect();
+    files.iter().enumerate().filter(|(_, f)| named.contains(f)).map(|(i, _)| i).collect()
 }
 
 /// Parses the JSON; where it fails on Python's `NaN` and `Infinity`, those are taken for numbers,
@@ -177,21 +174,6 @@ fn parse(text: &str) -> Result<Transforms, serde_json::Error> {
         Some(readable) => serde_json::from_str(&readable).map_err(|_| error),
         None => Err(error),
     })
-}
-
-/// The image's path inside the folder. NeRF's files leave `.png` out.
-fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
-    let mut file = relative_path(text).map_err(|e| e.to_string())?;
-    let known = ["png", "jpg", "jpeg", "exr"];
-    let has_one = file
-        .extension()
-        .and_then(|e| e.to_str())
-        .is_some_and(|e| known.contains(&e.to_ascii_lowercase().as_str()));
-    if !has_one && !folder.join(&file).is_file() {
-        // `set_extension` would cut a name like `r.0`.
-        file.as_mut_os_string().push(".png");
-    }
-    Ok(file)
 }
 
 fn read_frame(
@@ -211,17 +193,8 @@ fn read_frame(
         }
     }
     let image = folder.join(file);
-    let beside = |text: &Option<String>| -> Result<Option<PathBuf>, String> {
-        let Some(text) = text else { return Ok(None) };
-        let path = folder.join(relative_path(text).map_err(|e| e.to_string())?);
-        match find(&path, "an image") {
-            Found::File => Ok(Some(path)),
-            Found::Nothing(reason) | Found::Other(reason) => {
-                Err(format!("{reason}; remove the entry or restore the file"))
-            }
-        }
-    };
-    let (mask, depth) = (beside(&entry.mask_path)?, beside(&entry.depth_file_path)?);
+    let mask = image_beside(folder, entry.mask_path.as_deref())?;
+    let depth = image_beside(folder, entry.depth_file_path.as_deref())?;
     // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
     let depth = depth.filter(|path| is_exr(path));
     let (taken_with, turned) =
@@ -245,6 +218,18 @@ fn read_frame(
             | CameraError::Empty { .. }),
         ) => Err(e.to_string()),
         Err(e) => Err(format!("transform_matrix: {e}")),
+    }
+}
+
+/// The mask or depth that a frame names, if it names one.
+fn image_beside(folder: &Path, text: Option<&str>) -> Result<Option<PathBuf>, String> {
+    let Some(text) = text else { return Ok(None) };
+    let path = folder.join(relative_path(text).map_err(|e| e.to_string())?);
+    match find(&path, "an image") {
+        Found::File => Ok(Some(path)),
+        Found::Nothing(reason) | Found::Other(reason) => {
+            Err(format!("{reason}; remove the entry or restore the file"))
+        }
     }
 }
 
@@ -290,28 +275,8 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
         return Err("fisheye lenses are not supported; undistort the images first".to_owned());
     }
     // The size that the numbers are for; the stored image may be a smaller copy.
-    let whole = |value: Option<Number>, name: &str, stored: u32| match value {
-        None => Ok(stored),
-        Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(v)) => Err(format!("{name} is {v}; an image has at least one pixel")),
-    };
     let (width, height) =
         (whole(entry.w, "w", stored.size.0)?, whole(entry.h, "h", stored.size.1)?);
-    let focal = |length: Option<Number>, angle: Option<Number>, name: &str, size: u32| match (
-        length, angle,
-    ) {
-        (Some(Number(length)), _) => Ok(Some(length)),
-        (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
-            Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
-        }
-        (None, Some(Number(angle))) => {
-            let focal = 0.5 / (0.5 * angle).tan();
-            Err(format!(
-                "{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"
-            ))
-        }
-        (None, None) => Ok(None),
-    };
     let fx = focal(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
     let fy = focal(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
@@ -324,6 +289,36 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
         tangential: [entry.p1, entry.p2].map(|p| or(p, 0.0)),
     };
     fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)
+}
+
+fn whole(value: Option<Number>, name: &str, stored: u32) -> Result<u32, String> {
+    match value {
+        None => Ok(stored),
+        Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
+        Some(Number(v)) => Err(format!("{name} is {v}; an image has at least one pixel")),
+    }
+}
+
+/// The focal length in pixels, as it is given or from the angle of view across `size` pixels.
+fn focal(
+    length: Option<Number>,
+    angle: Option<Number>,
+    name: &str,
+    size: u32,
+) -> Result<Option<f64>, String> {
+    match (length, angle) {
+        (Some(Number(length)), _) => Ok(Some(length)),
+        (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
+            Ok(Some(0.5 * f64::from(size) / (0.5 * angle).tan()))
+        }
+        (None, Some(Number(angle))) => {
+            let focal = 0.5 / (0.5 * angle).tan();
+            Err(format!(
+                "{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"
+            ))
+        }
+        (None, None) => Ok(None),
+    }
 }
 
 #[cfg(test)]

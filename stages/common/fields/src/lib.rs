@@ -115,10 +115,12 @@ fn read_all(
         FieldModel::Mlp(architecture) => {
             let device = nets::device(device).map_err(|e| Failure::Usage(e.to_string()))?;
             nets::deterministic();
-            let read = |path: PathBuf| {
-                torch_field::Mlp::read(&path, architecture, file.bounds, device).bad_input("field")
-            };
-            paths.map(|path| Ok(Box::new(read(path)?) as Box<dyn RayField>)).collect()
+            paths
+                .map(|path| {
+                    let field = torch_field::Mlp::read(&path, architecture, file.bounds, device);
+                    Ok(Box::new(field.bad_input("field")?) as Box<dyn RayField>)
+                })
+                .collect()
         }
         #[cfg(not(feature = "torch"))]
         FieldModel::Mlp(_) => {

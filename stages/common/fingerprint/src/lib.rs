@@ -152,9 +152,6 @@ fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
         .flatten()
         .filter_map(Value::as_table)
         .collect();
-    let text = |package: &Table, key: &str| {
-        package.get(key).and_then(Value::as_str).unwrap_or_default().to_owned()
-    };
     let mut reached = BTreeSet::new();
     let mut waiting: Vec<String> = crates.values().flat_map(|c| c.dependencies.clone()).collect();
     let mut seen = BTreeSet::new();
@@ -184,6 +181,10 @@ fn locked(lock: &Table, crates: &BTreeMap<String, Crate>) -> BTreeSet<String> {
         }
     }
     reached
+}
+
+fn text(package: &Table, key: &str) -> String {
+    package.get(key).and_then(Value::as_str).unwrap_or_default().to_owned()
 }
 
 #[cfg(test)]

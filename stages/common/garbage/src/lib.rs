@@ -14,7 +14,7 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use artifact::{Closed, Record, Store, StoreError, label, unix_time};
+use artifact::{Closed, Record, Run, Store, StoreError, label, unix_time};
 use serde::Serialize;
 
 pub use roots::{Choice, Root};
@@ -37,11 +37,13 @@ pub fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, Store
     let outstanding = roots::outstanding(store)?;
     let roots = roots::roots(store, &contents, plan, choice, &runs, &outstanding)?;
     let kept = reach::reach(&contents, &roots);
-    let is_kept = |run: &artifact::Run| {
-        run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix())
-    };
-    let runs_to_go = runs.iter().filter(|run| !is_kept(run)).map(|run| run.id.clone()).collect();
+    let to_go = runs.iter().filter(|run| !is_kept(run, &outstanding, choice));
+    let runs_to_go = to_go.map(|run| run.id.clone()).collect();
     Ok(Verdict { contents, kept, runs_to_go })
+}
+
+fn is_kept(run: &Run, outstanding: &BTreeMap<String, String>, choice: Choice) -> bool {
+    run.in_progress || outstanding.contains_key(&run.id) || choice.is_recent(run.used_unix())
 }
 
 impl Verdict {
@@ -79,15 +81,17 @@ impl Verdict {
 
     /// Bytes that go, and bytes that stay.
     pub fn bytes(&self) -> (u64, u64) {
-        let sum = |stays: bool| {
-            let objects = self
-                .contents
-                .objects
-                .iter()
-                .filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
-            objects.map(|(_, bytes)| bytes).sum()
-        };
-        (sum(false), sum(true))
+        (self.bytes_of(false), self.bytes_of(true))
+    }
+
+    /// Bytes of what stays, or of what goes.
+    fn bytes_of(&self, stays: bool) -> u64 {
+        let objects = self
+            .contents
+            .objects
+            .iter()
+            .filter(|(id, _)| self.kept.objects.contains_key(*id) == stays);
+        objects.map(|(_, bytes)| bytes).sum()
     }
 
     /// Removes what goes: records first, so that none names an object that is gone. The store is

@@ -59,30 +59,24 @@ pub(crate) fn roots(
             roots.push(of_run(format!("a run {} used it", ago(run.used_unix())), run));
         }
     }
-    let one = |why: String, key: &String| Root {
-        why,
-        keys: BTreeSet::from([key.clone()]),
-        waiting: Vec::new(),
-        with_inputs: true,
-    };
-    roots.extend(
-        store.locked_keys()?.iter().map(|key| one("a stage is at work on it".to_owned(), key)),
-    );
+    let locked = store.locked_keys()?;
+    let at_work = "a stage is at work on it";
+    roots.extend(locked.iter().map(|key| of_action(at_work.to_owned(), key)));
     for (key, record) in
         contents.records.iter().filter(|(_, record)| choice.is_recent(record.started_unix))
     {
-        roots.push(one(format!("made {}", ago(record.started_unix)), key));
+        roots.push(of_action(format!("made {}", ago(record.started_unix)), key));
     }
     if !choice.drop_old {
         let old = contents.records.iter().filter(|(_, record)| record.has_old_key());
         roots.extend(old.map(|(key, _)| {
-            one("an older version of nerf-sr made it (--drop-old)".to_owned(), key)
+            of_action("an older version of nerf-sr made it (--drop-old)".to_owned(), key)
         }));
     }
     if !choice.drop_unfinished {
         let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));
         roots.extend(with_checkpoint.map(|key| {
-            one("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)
+            of_action("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)
         }));
     }
     Ok(roots)
@@ -91,19 +85,25 @@ pub(crate) fn roots(
 /// Submissions whose jobs haven't ended, with the reason. Where Slurm can't be asked, that is every
 /// one.
 pub(crate) fn outstanding(store: &Store) -> Result<BTreeMap<String, String>, StoreError> {
-    let all = |why: &str, ids: &mut dyn Iterator<Item = &str>| {
-        ids.map(|id| (id.to_owned(), why.to_owned())).collect()
-    };
     match Queue::look(&Slurm::default(), store.root()) {
-        Ok(queue) => Ok(all("a submitted job needs it", &mut queue.submissions().into_iter())),
+        Ok(queue) => Ok(all("a submitted job needs it", queue.submissions())),
         Err(error) => {
             let path = store.root().join("slurm");
             let submissions = slurm::all(store.root())
                 .map_err(|e| StoreError::Io { path, source: std::io::Error::other(e) })?;
             let why = format!("a submitted job may need it, for {error}");
-            Ok(all(&why, &mut submissions.iter().map(|(id, _)| id.as_str())))
+            Ok(all(&why, submissions.iter().map(|(id, _)| id.as_str())))
         }
     }
+}
+
+/// All of these submissions, with one reason.
+fn all<'a>(why: &str, ids: impl IntoIterator<Item = &'a str>) -> BTreeMap<String, String> {
+    ids.into_iter().map(|id| (id.to_owned(), why.to_owned())).collect()
+}
+
+fn of_action(why: String, key: &str) -> Root {
+    Root { why, keys: BTreeSet::from([key.to_owned()]), waiting: Vec::new(), with_inputs: true }
 }
 
 fn of_run(why: String, run: Run) -> Root {

@@ -59,14 +59,8 @@ impl Adam {
         counts: &[u64],
     ) -> Result<(), WeightsError> {
         let learnt = learnt(&network);
-        let moments = |kind: &'static str, of: &[Tensor]| {
-            let named = learnt
-                .iter()
-                .zip(of)
-                .map(move |((name, _), t)| (format!("{kind}.{name}"), t.shallow_clone()));
-            named.collect::<Vec<_>>()
-        };
-        let (first, second) = (moments("first", &self.first), moments("second", &self.second));
+        let (first, second) =
+            (moments(&learnt, "first", &self.first), moments(&learnt, "second", &self.second));
         let counts: Vec<i64> = counts.iter().chain([&self.updates]).map(|&c| c as i64).collect();
         let all: Vec<_> = network
             .into_iter()
@@ -85,15 +79,10 @@ impl Adam {
     ) -> Result<(Self, [u64; N]), WeightsError> {
         let weights = Weights::read(path)?;
         let (counts, updates) = counts(&weights)?;
-        let moments = |kind: &str| -> Result<Vec<Tensor>, WeightsError> {
-            let read = |(name, like): &(String, Tensor)| {
-                Ok(weights
-                    .tensor(&format!("{kind}.{name}"), &like.size())?
-                    .to_device(like.device()))
-            };
-            learnt(network).iter().map(read).collect()
-        };
-        let adam = Self { first: moments("first")?, second: moments("second")?, updates };
+        let learnt = learnt(network);
+        let (first, second) =
+            (read(&weights, "first", &learnt)?, read(&weights, "second", &learnt)?);
+        let adam = Self { first, second, updates };
         let saved = network
             .iter()
             .map(|(name, tensor)| weights.tensor(name, &tensor.size()))
@@ -116,6 +105,26 @@ const COUNTS: &str = "counts";
 fn counts<const N: usize>(weights: &Weights) -> Result<([u64; N], u64), WeightsError> {
     let all = weights.integers(COUNTS, N + 1)?;
     Ok((std::array::from_fn(|i| all[i] as u64), all[N] as u64))
+}
+
+/// Moments of a kind by the names of what is learnt.
+fn moments(learnt: &[(String, Tensor)], kind: &str, of: &[Tensor]) -> Vec<(String, Tensor)> {
+    let moments = learnt.iter().zip(of);
+    moments.map(|((name, _), t)| (format!("{kind}.{name}"), t.shallow_clone())).collect()
+}
+
+/// What [`moments`] named, on the devices of what is learnt.
+fn read(
+    weights: &Weights,
+    kind: &str,
+    learnt: &[(String, Tensor)],
+) -> Result<Vec<Tensor>, WeightsError> {
+    let mut moments = Vec::with_capacity(learnt.len());
+    for (name, like) in learnt {
+        let moment = weights.tensor(&format!("{kind}.{name}"), &like.size())?;
+        moments.push(moment.to_device(like.device()));
+    }
+    Ok(moments)
 }
 
 /// The tensors that are learnt.

@@ -41,14 +41,11 @@ impl PerceptualLoss {
         let caffe = weights.has("conv1_1.weight");
         let (mut blocks, mut inputs, mut index) = (Vec::new(), 3, 0);
         for (block, (outputs, (_, count))) in widths.into_iter().zip(BLOCKS).enumerate() {
-            let name = |i: usize| {
-                if caffe {
-                    format!("conv{}_{}", block + 1, i + 1)
-                } else {
-                    format!("features.{}", index + 2 * i)
-                }
+            let names: Vec<String> = if caffe {
+                (1..=count).map(|i| format!("conv{}_{i}", block + 1)).collect()
+            } else {
+                (0..count).map(|i| format!("features.{}", index + 2 * i)).collect()
             };
-            let names: Vec<String> = (0..count).map(name).collect();
             // The second one's features are compared.
             if block > 0 && !names[..2].iter().all(|name| weights.has(&format!("{name}.weight"))) {
                 break;

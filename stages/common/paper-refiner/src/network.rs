@@ -82,18 +82,15 @@ impl PaperRefiner {
         Self::build(width, |_, shape, part| {
             number += 1;
             let mut rng = CounterRng::new(seed, WEIGHTS, number);
-            let mut normal = || {
-                // Box and Muller; a uniform of 0 would be infinitely far.
-                let (u, v) = (1.0 - f64::from(rng.uniform()), f64::from(rng.uniform()));
-                (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
-            };
             let count = shape.iter().product::<i64>();
             let inputs = shape[1..].iter().product::<i64>() as f64;
             let values: Vec<f32> = match part {
                 LayerTensor::Kernel => {
-                    (0..count).map(|_| ((2.0 / inputs).sqrt() * normal()) as f32).collect()
+                    (0..count).map(|_| ((2.0 / inputs).sqrt() * normal(&mut rng)) as f32).collect()
                 }
-                LayerTensor::Scale => (0..count).map(|_| (1.0 + 0.02 * normal()) as f32).collect(),
+                LayerTensor::Scale => {
+                    (0..count).map(|_| (1.0 + 0.02 * normal(&mut rng)) as f32).collect()
+                }
                 LayerTensor::Variance => vec![1.0; count as usize],
                 LayerTensor::Bias | LayerTensor::Shift | LayerTensor::Mean => {
                     vec![0.0; count as usize]
@@ -132,48 +129,22 @@ impl PaperRefiner {
         width: u32,
         mut tensor: impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
     ) -> Result<Self, RefinementError> {
-        let mut layers = |name: &str, specs: &[Spec]| {
-            let channels =
-                |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
-            let layer = |(i, &(inputs, outputs, stride, normalised)): (usize,
-                &Spec)| -> Result<ConvLayer, RefinementError> {
-                let (inputs, outputs) = (channels(inputs), channels(outputs));
-                let mut of = |part: LayerTensor, shape: &[i64]| {
-                    let tensor = tensor(&format!("{name}.{i}.{}", part.name()), shape, part)?;
-                    Ok::<_, RefinementError>(if part.is_learnt() { tensor.set_requires_grad(true) } else { tensor })
-                };
-                let (kernel, bias) = (of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?,
-                    of(LayerTensor::Bias, &[outputs])?);
-                let norm = if normalised {
-                    Some(BatchNorm {
-                        scale: of(LayerTensor::Scale, &[outputs])?,
-                        shift: of(LayerTensor::Shift, &[outputs])?,
-                        mean: of(LayerTensor::Mean, &[outputs])?,
-                        variance: of(LayerTensor::Variance, &[outputs])?,
-                    })
-                } else {
-                    None
-                };
-                Ok(ConvLayer { kernel, bias, norm, stride })
-            };
-            specs.iter().enumerate().map(layer).collect::<Result<Vec<_>, _>>()
-        };
-        let (encoder, decoder) = (layers("encoder", &ENCODER)?, layers("decoder", &DECODER)?);
+        let encoder = layers("encoder", &ENCODER, width, &mut tensor)?;
+        let decoder = layers("decoder", &DECODER, width, &mut tensor)?;
         Ok(Self { encoder, decoder, width })
     }
 
     /// All tensors by name, running means among them.
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        let of = |name: &str, layers: &[ConvLayer]| -> Vec<(String, Tensor)> {
-            let layer = |(i, layer): (usize, &ConvLayer)| {
-                let tensors = layer.tensors().into_iter();
-                tensors
-                    .map(|(part, tensor)| (format!("{name}.{i}.{}", part.name()), tensor))
-                    .collect::<Vec<_>>()
-            };
-            layers.iter().enumerate().flat_map(layer).collect()
-        };
-        of("encoder", &self.encoder).into_iter().chain(of("decoder", &self.decoder)).collect()
+        let mut all = Vec::new();
+        for (name, layers) in [("encoder", &self.encoder), ("decoder", &self.decoder)] {
+            for (i, layer) in layers.iter().enumerate() {
+                for (part, tensor) in layer.tensors() {
+                    all.push((format!("{name}.{i}.{}", part.name()), tensor));
+                }
+            }
+        }
+        all
     }
 
     /// What is learnt.
@@ -215,19 +186,11 @@ impl PaperRefiner {
         let count = rendered.size()[0];
         let own = self.encode(rendered, training)?;
         let theirs = self.encode(references, training)?;
-        let best = |features: &Tensor| {
-            let [all, channels, rows, columns] = features.size()[..] else {
-                return Err(TchError::Shape("features have four dimensions".to_owned()));
-            };
-            features
-                .f_reshape([count, all / count.max(1), channels, rows, columns])?
-                .f_amax([1], false)
-        };
         let mut x = None::<Tensor>;
         // From the coarsest on, three layers a size; the last ends in colours.
         for (size, layers) in self.decoder.chunks_exact(3).enumerate() {
             let at = TAPS.len() - 1 - size;
-            let known = [own[at].shallow_clone(), best(&theirs[at])?];
+            let known = [own[at].shallow_clone(), best(&theirs[at], count)?];
             let mut y = Tensor::f_cat(&x.into_iter().chain(known).collect::<Vec<_>>(), 1)?;
             for (i, layer) in layers.iter().enumerate() {
                 let is_last = at == 0 && i == 2;
@@ -243,6 +206,60 @@ impl PaperRefiner {
         }
         x.ok_or_else(|| TchError::Shape("a decoder without layers".to_owned()))
     }
+}
+
+/// A standard normal draw (Box and Muller 1958).
+fn normal(rng: &mut CounterRng) -> f64 {
+    // A uniform of 0 would be infinitely far.
+    let (u, v) = (1.0 - f64::from(rng.uniform()), f64::from(rng.uniform()));
+    (-2.0 * u.ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+}
+
+/// Layers of tensors, which are had by name and shape; what is learnt takes gradients.
+fn layers(
+    name: &str,
+    specs: &[Spec],
+    width: u32,
+    tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
+) -> Result<Vec<ConvLayer>, RefinementError> {
+    let channels = |of: Option<i64>| of.map_or(COLOURS, |multiple| multiple * i64::from(width));
+    let mut layers = Vec::with_capacity(specs.len());
+    for (i, &(inputs, outputs, stride, normalised)) in specs.iter().enumerate() {
+        let (name, inputs, outputs) = (format!("{name}.{i}"), channels(inputs), channels(outputs));
+        let mut of = |part: LayerTensor, shape: &[i64]| layer_tensor(&name, part, shape, tensor);
+        let kernel = of(LayerTensor::Kernel, &[outputs, inputs, 3, 3])?;
+        let bias = of(LayerTensor::Bias, &[outputs])?;
+        let norm = if normalised {
+            Some(BatchNorm {
+                scale: of(LayerTensor::Scale, &[outputs])?,
+                shift: of(LayerTensor::Shift, &[outputs])?,
+                mean: of(LayerTensor::Mean, &[outputs])?,
+                variance: of(LayerTensor::Variance, &[outputs])?,
+            })
+        } else {
+            None
+        };
+        layers.push(ConvLayer { kernel, bias, norm, stride });
+    }
+    Ok(layers)
+}
+
+fn layer_tensor(
+    layer: &str,
+    part: LayerTensor,
+    shape: &[i64],
+    tensor: &mut impl FnMut(&str, &[i64], LayerTensor) -> Result<Tensor, RefinementError>,
+) -> Result<Tensor, RefinementError> {
+    let tensor = tensor(&format!("{layer}.{}", part.name()), shape, part)?;
+    Ok(if part.is_learnt() { tensor.set_requires_grad(true) } else { tensor })
+}
+
+/// The largest features of the references of each of `count` patches.
+fn best(features: &Tensor, count: i64) -> Result<Tensor, TchError> {
+    let [all, channels, rows, columns] = features.size()[..] else {
+        return Err(TchError::Shape("features have four dimensions".to_owned()));
+    };
+    features.f_reshape([count, all / count.max(1), channels, rows, columns])?.f_amax([1], false)
 }
 
 /// What a tensor of a layer is for.

@@ -50,32 +50,41 @@ impl PaperRefiner {
             .flat_map(|y| starts(view.width, overlap).into_iter().map(move |x| (x, y)))
             .map(|corner| (corner, self.share()))
             .collect();
-        let redraw = |(corner, network): (Corner, Self)| -> Result<(Corner, Vec<f32>), TchError> {
-            let own = patch(view, corner);
-            let mut others: Vec<Vec<f32>> = matches(rendered, references, corner, count)
-                .into_iter()
-                .map(|(r, at)| patch(&references[r].truth, at))
-                .collect();
-            if others.is_empty() {
-                others.push(own.clone());
-            }
-            let tensor = |patches: &[Vec<f32>]| {
-                let side = PATCH as i64;
-                Tensor::f_from_slice(&patches.concat())?
-                    .f_reshape([patches.len() as i64, side, side, COLOURS])?
-                    .f_permute([0, 3, 1, 2])
-            };
-            let drawn = no_grad(|| network.forward(&tensor(&[own])?, &tensor(&others)?, false))?;
-            Ok((
-                corner,
-                Vec::<f32>::try_from(
-                    &drawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?,
-                )?,
-            ))
-        };
-        let drawn = corners.into_par_iter().map(redraw).collect::<Result<Vec<_>, _>>()?;
+        let drawn = corners
+            .into_par_iter()
+            .map(|(corner, network)| network.redraw(rendered, corner, references, count))
+            .collect::<Result<Vec<_>, _>>()?;
         Ok(stitch(view.width, view.height, &drawn))
     }
+
+    /// A view's patch, redrawn beside at most `count` patches of references, in -1..1.
+    fn redraw(
+        &self,
+        rendered: &Rendered,
+        corner: Corner,
+        references: &[&KnownView],
+        count: usize,
+    ) -> Result<(Corner, Vec<f32>), TchError> {
+        let own = patch(&rendered.view, corner);
+        let mut others: Vec<Vec<f32>> = matches(rendered, references, corner, count)
+            .into_iter()
+            .map(|(r, at)| patch(&references[r].truth, at))
+            .collect();
+        if others.is_empty() {
+            others.push(own.clone());
+        }
+        let drawn = no_grad(|| self.forward(&tensor(&[own])?, &tensor(&others)?, false))?;
+        let drawn = drawn.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_view([-1])?;
+        Ok((corner, Vec::<f32>::try_from(&drawn)?))
+    }
+}
+
+/// Patches as a network takes them: count × 3 × rows × columns.
+fn tensor(patches: &[Vec<f32>]) -> Result<Tensor, TchError> {
+    let side = PATCH as i64;
+    Tensor::f_from_slice(&patches.concat())?
+        .f_reshape([patches.len() as i64, side, side, COLOURS])?
+        .f_permute([0, 3, 1, 2])
 }
 
 /// Where patches begin along an axis: the last one ends at the border.
@@ -117,15 +126,9 @@ fn matches(
         for (r, other) in surfaces.iter().enumerate() {
             let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };
             let truth = &references[r].truth;
-            // The pixel's centre is seen at `place`: its patch begins as far before it as it does
-            // here.
-            let corner = |place: f32, by: usize, size: usize| {
-                ((place - 0.5).round() as isize - by as isize).clamp(0, (size - PATCH) as isize)
-                    as usize
-            };
             let at = (
-                corner(visibility.place[0], dx, truth.width),
-                corner(visibility.place[1], dy, truth.height),
+                start(visibility.place[0], dx, truth.width),
+                start(visibility.place[1], dy, truth.height),
             );
             found.push((visibility.cosine.max(0.0) * visibility.detail.min(1.0), r, at));
         }
@@ -138,6 +141,12 @@ fn matches(
         .filter(|patch| taken.insert(*patch))
         .take(count)
         .collect()
+}
+
+/// Where a patch begins along an axis of a reference in which a pixel's centre is seen at `place`:
+/// as far before the pixel as here.
+fn start(place: f32, before: usize, size: usize) -> usize {
+    ((place - 0.5).round() as isize - before as isize).clamp(0, (size - PATCH) as isize) as usize
 }
 
 /// Patches in -1..1 as an image in 0..1: where they overlap, each weighs by how far it is from its

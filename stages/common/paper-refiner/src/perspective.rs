@@ -32,12 +32,10 @@ impl Perspective {
             (if x > 0.0 { x - dx } else { dx }, if y > 0.0 { y - dy } else { dy })
         });
         let Some(map) = homography(moved, corners) else { return Self::identity(width, height) };
-        let low = |of: fn(&(f64, f64)) -> f64| {
-            moved.iter().map(of).fold(f64::INFINITY, f64::min) as usize
-        };
-        let high =
-            |of: fn(&(f64, f64)) -> f64| moved.iter().map(of).fold(0.0, f64::max) as usize + 1;
-        Self { map, filled: [low(|p| p.0), low(|p| p.1), high(|p| p.0), high(|p| p.1)] }
+        let (xs, ys) = (moved.map(|p| p.0), moved.map(|p| p.1));
+        let low = |of: [f64; 4]| of.into_iter().fold(f64::INFINITY, f64::min) as usize;
+        let high = |of: [f64; 4]| of.into_iter().fold(0.0, f64::max) as usize + 1;
+        Self { map, filled: [low(xs), low(ys), high(xs), high(ys)] }
     }
 
     /// The warped image's colour at a pixel, bilinear; black outside.

@@ -80,13 +80,7 @@ impl Training for PaperTrainer {
                 TrainingPatch::new(&examples[number as usize], number, &self.options, &mut rng);
             drawn.append(&mut rendered, &mut truth, &mut others);
         }
-        let side = patch as i64;
-        let tensor = |samples: &[f32], count: usize| {
-            Tensor::f_from_slice(samples)?
-                .f_reshape([count as i64, side, side, COLOURS])?
-                .f_permute([0, 3, 1, 2])?
-                .f_contiguous()
-        };
+        let tensor = |samples: &[f32], count: usize| tensor(samples, count, patch);
         let (rendered, truth) = (tensor(&rendered, batch)?, tensor(&truth, batch)?);
         let found = self.network.forward(&rendered, &tensor(&others, batch * references)?, true)?;
         let (loss, error) = loss(&found, &truth, self.perceptual.as_ref())?;
@@ -107,6 +101,15 @@ impl Training for PaperTrainer {
         (self.adam, []) = Adam::resume(path, &self.network.named())?;
         Ok(())
     }
+}
+
+/// Square patches as a network takes them: count × 3 × rows × columns.
+fn tensor(samples: &[f32], count: usize, side: usize) -> Result<Tensor, TchError> {
+    let (count, side) = (count as i64, side as i64);
+    Tensor::f_from_slice(samples)?
+        .f_reshape([count, side, side, COLOURS])?
+        .f_permute([0, 3, 1, 2])?
+        .f_contiguous()
 }
 
 /// L1 of images in -1..1 and, where there is one, the perceptual loss; and the L1 alone.
@@ -153,19 +156,13 @@ impl<'a> TrainingPatch<'a> {
             Perspective::draw(width, height, &mut shape)
         };
         let [left, top, right, bottom] = warp.filled;
-        let within = |low: usize, high: usize, rng: &mut CounterRng| {
-            low + rng.below((high.max(low) - low + 1) as u64) as usize
-        };
         let last = |end: usize| end.saturating_sub(options.patch);
         let corner = (
             within(left.min(last(right)), last(right), rng),
             within(top.min(last(bottom)), last(bottom), rng),
         );
-        let near = |at: usize, size: usize, rng: &mut CounterRng| {
-            within(at.saturating_sub(WINDOW).min(last(size)), (at + WINDOW).min(last(size)), rng)
-        };
         let references = (0..options.references)
-            .map(|_| (near(corner.0, width, rng), near(corner.1, height, rng)))
+            .map(|_| (near(corner.0, last(width), rng), near(corner.1, last(height), rng)))
             .collect();
         Self { example, warp, patch: options.patch, corner, references }
     }
@@ -173,21 +170,34 @@ impl<'a> TrainingPatch<'a> {
     /// Appends the patch as rendered, as it should be, and its references, in -1..1.
     fn append(&self, rendered: &mut Vec<f32>, truth: &mut Vec<f32>, others: &mut Vec<f32>) {
         let signed = |colour: [f32; 3]| colour.map(|v| 2.0 * v - 1.0);
-        let places = |(x, y): (usize, usize)| {
-            (y..y + self.patch)
-                .flat_map(move |row| (x..x + self.patch).map(move |column| (column, row)))
-        };
-        for (x, y) in places(self.corner) {
+        for (x, y) in self.pixels(self.corner) {
             rendered.extend(signed(self.warp.colour(&self.example.rendered.view, x, y)));
             truth.extend(signed(self.warp.colour(&self.example.truth, x, y)));
         }
         let whole = Perspective::identity(self.example.truth.width, self.example.truth.height);
         for &corner in &self.references {
+            let reference = self.pixels(corner);
             others.extend(
-                places(corner).flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))),
+                reference.flat_map(|(x, y)| signed(whole.colour(&self.example.truth, x, y))),
             );
         }
     }
+
+    /// Pixels of the patch at a corner, row by row.
+    fn pixels(&self, (x, y): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
+        let patch = self.patch;
+        (y..y + patch).flat_map(move |row| (x..x + patch).map(move |column| (column, row)))
+    }
+}
+
+/// A draw from `low` to `high`, both included.
+fn within(low: usize, high: usize, rng: &mut CounterRng) -> usize {
+    low + rng.below((high.max(low) - low + 1) as u64) as usize
+}
+
+/// A draw from the window around a place, which ends at `last`.
+fn near(at: usize, last: usize, rng: &mut CounterRng) -> usize {
+    within(at.saturating_sub(WINDOW).min(last), (at + WINDOW).min(last), rng)
 }
 
 impl PaperTraining {

@@ -11,9 +11,6 @@ pub fn sample_cubic<const N: usize>(
     let (x, y) = (x - 0.5, y - 0.5);
     let (left, top) = (x.floor(), y.floor());
     let (across, down) = (catmull_rom(x - left), catmull_rom(y - top));
-    let place = |first: f64, k: usize, end: usize| {
-        ((first + k as f64 - 1.0).max(0.0) as usize).min(end - 1)
-    };
     let mut sum = [0.0; N];
     for (j, wy) in down.iter().enumerate() {
         let row = place(top, j, height);
@@ -23,6 +20,12 @@ pub fn sample_cubic<const N: usize>(
         }
     }
     sum
+}
+
+/// The `k`th of four samples along an axis with so many, of which `first` is the second.
+#[inline]
+fn place(first: f64, k: usize, end: usize) -> usize {
+    ((first + k as f64 - 1.0).max(0.0) as usize).min(end - 1)
 }
 
 /// Weights of the four samples around a place between the second and the third.
@@ -42,13 +45,13 @@ impl Image {
     ///
     /// # Panics
     /// With fewer channels.
-    pub fn colour_at(&self, [x, y]: [f32; 2]) -> [f32; 3] {
-        let pixel = |column: usize, row: usize| {
+    pub fn colour_at(&self, place: [f32; 2]) -> [f32; 3] {
+        let size = (self.width, self.height);
+        let colour = sample_cubic(size, place.map(f64::from), |column, row| {
             let at = (row * self.width + column) * self.channels;
             [0, 1, 2].map(|c| f64::from(self.data[at + c]))
-        };
-        sample_cubic((self.width, self.height), [f64::from(x), f64::from(y)], pixel)
-            .map(|v| (v as f32).clamp(0.0, 1.0))
+        });
+        colour.map(|v| (v as f32).clamp(0.0, 1.0))
     }
 }
 

@@ -68,22 +68,34 @@ impl Exposure {
 /// Means of both images' channel over blocks, of those blocks of which at least half is clipped in
 /// neither.
 fn block_means(right: &Image, seen: &Image, channel: usize, block: usize) -> Vec<[f64; 2]> {
-    let (width, height) = (seen.width, seen.height);
+    let mut means = Vec::new();
+    for y in (0..seen.height).step_by(block) {
+        for x in (0..seen.width).step_by(block) {
+            means.extend(block_mean([right, seen], channel, block, [x, y]));
+        }
+    }
+    means
+}
+
+/// Both images' means over the block whose top left corner is at a column and row.
+fn block_mean(
+    images: [&Image; 2],
+    channel: usize,
+    block: usize,
+    [x, y]: [usize; 2],
+) -> Option<[f64; 2]> {
+    let (width, height) = (images[1].width, images[1].height);
     let is_known = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
-    let starts = |size: usize| (0..size).step_by(block);
-    let mean = |(x, y): (usize, usize)| {
-        let (mut n, mut sum) = (0usize, [0.0f64; 2]);
-        for row in y..(y + block).min(height) {
-            for column in x..(x + block).min(width) {
-                let pair = [right, seen]
-                    .map(|image| image.data[(row * width + column) * image.channels + channel]);
-                if pair.into_iter().all(is_known) {
-                    n += 1;
-                    (0..2).for_each(|i| sum[i] += f64::from(pair[i]));
-                }
+    let (mut n, mut sum) = (0usize, [0.0f64; 2]);
+    for row in y..(y + block).min(height) {
+        for column in x..(x + block).min(width) {
+            let pair =
+                images.map(|image| image.data[(row * width + column) * image.channels + channel]);
+            if pair.into_iter().all(is_known) {
+                n += 1;
+                (0..2).for_each(|i| sum[i] += f64::from(pair[i]));
             }
         }
-        (2 * n >= block * block).then(|| sum.map(|s| s / n as f64))
-    };
-    starts(height).flat_map(|y| starts(width).map(move |x| (x, y))).filter_map(mean).collect()
+    }
+    (2 * n >= block * block).then(|| sum.map(|s| s / n as f64))
 }

@@ -40,13 +40,13 @@ pub fn common_range(ranges: impl IntoIterator<Item = (f32, f32)>) -> Option<(f32
 pub fn draw_depth(width: usize, z: &[f32], a: &[f32], (near, far): (f32, f32)) -> Rgba8 {
     let scale = |z: f32| if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z };
     let (low, high) = (scale(near), scale(far));
-    let pixel = |(z, a): (&f32, &f32)| {
+    let pixels = z.iter().zip(a).flat_map(|(z, a)| {
         let value = 1.0 - (scale(*z) - low) / (high - low).max(f32::MIN_POSITIVE);
         let heat = heat(Palette::Depth, 0.08 + 0.84 * value.clamp(0.0, 1.0));
         let over = |c: u8| (f32::from(c) * a + 255.0 * (1.0 - a)).round() as u8;
         [over(heat[0]), over(heat[1]), over(heat[2]), 255]
-    };
-    Rgba8::new(width, z.len() / width.max(1), z.iter().zip(a).flat_map(pixel).collect())
+    });
+    Rgba8::new(width, z.len() / width.max(1), pixels.collect())
 }
 
 #[cfg(test)]

@@ -82,16 +82,12 @@ impl Image {
 
     /// Grey or RGB as opaque 8-bit RGBA.
     pub fn to_rgba8(&self) -> Rgba8 {
-        let pixel = |p: &[f32]| match p {
+        let pixels = self.data.chunks_exact(self.channels).flat_map(|p| match p {
             [r, g, b, a] => [to_u8(*r), to_u8(*g), to_u8(*b), to_u8(*a)],
             [r, g, b] => [to_u8(*r), to_u8(*g), to_u8(*b), 255],
             _ => [to_u8(p[0]), to_u8(p[0]), to_u8(p[0]), 255],
-        };
-        Rgba8::new(
-            self.width,
-            self.height,
-            self.data.chunks_exact(self.channels).flat_map(pixel).collect(),
-        )
+        });
+        Rgba8::new(self.width, self.height, pixels.collect())
     }
 }
 

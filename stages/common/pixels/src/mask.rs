@@ -1,3 +1,4 @@
+use std::ops::Range;
 use std::path::Path;
 
 use crate::{Image, PixelError, Rgba8, read_png};
@@ -17,8 +18,6 @@ pub struct Mask {
 impl Mask {
     /// From an image: what is dark or transparent there doesn't count.
     pub fn of(image: &Rgba8) -> Self {
-        let is_bright =
-            |p: &[u8]| p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128;
         Self {
             width: image.width,
             height: image.height,
@@ -49,23 +48,20 @@ impl Mask {
     /// under so many pixels around it, which its kernel reads.
     #[must_use]
     pub fn resized(&self, (width, height): (usize, usize), around: usize) -> Self {
-        // Columns or rows under the pixels around one.
-        let under = |at: usize, to: usize, from: usize| {
-            let (first, end) = (at.saturating_sub(around), (at + 1 + around).min(to));
-            first * from / to..(end * from).div_ceil(to)
-        };
         // Across first: `around` may be wide.
         let mut narrow = vec![true; width * self.height];
         for (row, line) in
             narrow.chunks_exact_mut(width.max(1)).zip(self.counts.chunks_exact(self.width.max(1)))
         {
             row.iter_mut().enumerate().for_each(|(x, counts)| {
-                *counts = line[under(x, width, self.width)].iter().all(|c| *c);
+                *counts = line[under(x, around, width, self.width)].iter().all(|c| *c);
             });
         }
-        let pixel =
-            |i: usize| under(i / width, height, self.height).all(|y| narrow[y * width + i % width]);
-        Self { width, height, counts: (0..width * height).map(pixel).collect() }
+        let counts = (0..width * height).map(|i| {
+            let mut rows = under(i / width, around, height, self.height);
+            rows.all(|y| narrow[y * width + i % width])
+        });
+        Self { width, height, counts: counts.collect() }
     }
 
     /// Share of the pixels that count.
@@ -94,6 +90,16 @@ impl Mask {
             }
         }
     }
+}
+
+fn is_bright(p: &[u8]) -> bool {
+    p[..3].iter().map(|&v| u16::from(v)).sum::<u16>() >= 3 * 128 && p[3] >= 128
+}
+
+/// Of `from` columns or rows, those under the pixels around one of `to`.
+fn under(at: usize, around: usize, to: usize, from: usize) -> Range<usize> {
+    let (first, end) = (at.saturating_sub(around), (at + 1 + around).min(to));
+    first * from / to..(end * from).div_ceil(to)
 }
 
 #[cfg(test)]

@@ -62,12 +62,8 @@ impl AxisTaps {
     pub fn inverse(&self, reach: usize) -> Self {
         let (n, scale) = (self.outputs(), self.inputs as f64 / self.outputs() as f64);
         // Gram matrix: banded, since a run overlaps few others.
-        let dot = |a: usize, b: usize| -> f64 {
-            let (first, weights) = self.run(a);
-            (first..).zip(weights).map(|(i, &w)| f64::from(w) * f64::from(self.weight(b, i))).sum()
-        };
-        let band =
-            (1..n).take_while(|d| (0..n - d).any(|a| dot(a, a + d) != 0.0)).last().unwrap_or(0);
+        let overlap = |d: usize| (0..n - d).any(|a| self.dot(a, a + d) != 0.0);
+        let band = (1..n).take_while(|d| overlap(*d)).last().unwrap_or(0);
         // Lower Cholesky factor, row by row: column a - band + k of row a is factor[a][k].
         let mut factor = vec![vec![0.0; band + 1]; n];
         for a in 0..n {
@@ -77,7 +73,7 @@ impl AxisTaps {
                     .filter(|k| k + band >= b)
                     .map(|k| factor[a][k + band - a] * factor[b][k + band - b])
                     .sum();
-                let rest = scale * dot(b, a) - product;
+                let rest = scale * self.dot(b, a) - product;
                 factor[a][b + band - a] =
                     if a == b { (rest + RIDGE).sqrt() } else { rest / factor[b][band] };
             }
@@ -103,15 +99,20 @@ impl AxisTaps {
             firsts.push(first);
             // Beyond 2·reach nothing of z is left, and no run comes here from farther away.
             let near = q.saturating_sub(4 * reach)..(q + 4 * reach + 1).min(n);
-            let weight = |i: usize| {
+            weights.extend((first..first + length).map(|i| {
                 let apart = ((i as f64 + 0.5) / scale - (q as f64 + 0.5)).abs();
                 let within = f64::from(u8::from(apart <= reach as f64));
                 (within * near.clone().map(|a| z[a] * f64::from(self.weight(a, i))).sum::<f64>())
                     as f32
-            };
-            weights.extend((first..first + length).map(weight));
+            }));
         }
         Self { inputs: self.inputs, length, firsts, weights }
+    }
+
+    /// Product of two outputs' weights.
+    fn dot(&self, a: usize, b: usize) -> f64 {
+        let (first, weights) = self.run(a);
+        (first..).zip(weights).map(|(i, &w)| f64::from(w) * f64::from(self.weight(b, i))).sum()
     }
 }
 

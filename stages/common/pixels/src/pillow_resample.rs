@@ -92,13 +92,14 @@ pub(crate) fn coefficients(input: usize, output: usize, filter: Filter) -> Vec<(
 }
 
 fn taps(input: usize, output: usize, filter: Filter) -> Vec<Taps> {
-    let fixed = |w: f64| {
-        let w = w * f64::from(1 << PRECISION_BITS);
-        (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
-    };
     let runs = coefficients(input, output, filter).into_iter();
     runs.map(|(first, weights)| Taps { first, weights: weights.into_iter().map(fixed).collect() })
         .collect()
+}
+
+fn fixed(weight: f64) -> i32 {
+    let w = weight * f64::from(1 << PRECISION_BITS);
+    (if w < 0.0 { w - 0.5 } else { w + 0.5 }) as i32
 }
 
 fn clip(accumulated: i32) -> u8 {

@@ -178,14 +178,9 @@ impl Scope<'_> {
         name: &str,
         value: &Value,
     ) -> Result<Setting, PlanError> {
-        let in_file = |error: PlanError| match error {
-            PlanError::Usage(problem) => {
-                let problem = problem.trim_start_matches(kind.flag()).trim_start();
-                PlanError::Pipeline(self.pipeline.error_in_experiment(name, problem))
-            }
-            other => other,
-        };
-        let (stage, name) = self.owner(kind, name, &value.to_string()).map_err(in_file)?;
+        let (stage, name) = self
+            .owner(kind, name, &value.to_string())
+            .map_err(|error| self.in_file(kind, name, error))?;
         let program = self.programs.require(&stage)?;
         let value = if kind == Kind::Parameter {
             program.schema.canonical_value(&name, value)
@@ -195,6 +190,17 @@ impl Scope<'_> {
         Ok(Setting { stage, kind, name, value })
     }
 
+    /// An error about what the command line could say, as one about a name in an experiment's file.
+    fn in_file(&self, kind: Kind, name: &str, error: PlanError) -> PlanError {
+        match error {
+            PlanError::Usage(problem) => {
+                let problem = problem.trim_start_matches(kind.flag()).trim_start();
+                PlanError::Pipeline(self.pipeline.error_in_experiment(name, problem))
+            }
+            other => other,
+        }
+    }
+
     fn axis(&self, kind: Kind, text: &str, notes: &mut Vec<String>) -> Result<Axis, PlanError> {
         let given = format!("{} {text}", kind.flag());
         let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
@@ -202,26 +208,24 @@ impl Scope<'_> {
             text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
         let (stage, name) = self.owner(kind, name, text)?;
         let program = self.programs.require(&stage)?;
-        let value = |(text, value): (&str, Value)| AxisValue {
-            text: text.to_owned(),
-            settings: vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }],
-        };
-        let values: Vec<AxisValue> = match kind {
+        let values: Vec<(&str, Value)> = match kind {
             Kind::Parameter => {
                 let given = arguments::values(text).map_err(usage)?.into_iter();
                 given
-                    .map(|(text, given)| {
-                        value((text, program.schema.canonical_value(&name, &given)))
-                    })
+                    .map(|(text, given)| (text, program.schema.canonical_value(&name, &given)))
                     .collect()
             }
             Kind::Input => arguments::folders(text)
                 .map_err(usage)?
                 .into_iter()
-                .map(|text| value((text, folder(text))))
+                .map(|text| (text, folder(text)))
                 .collect(),
         };
-        let values = each_once(values, |again, first| {
+        let values = values.into_iter().map(|(text, value)| AxisValue {
+            text: text.to_owned(),
+            settings: vec![Setting { stage: stage.clone(), kind, name: name.clone(), value }],
+        });
+        let values = each_once(values.collect(), |again, first| {
             notes.push(format!("{given}: {again} is {first} again; it is made once"));
         });
         if program.description.sink && kind == Kind::Input {
@@ -250,16 +254,9 @@ impl Scope<'_> {
         if let Some((stage, own)) = stated {
             return self.stated_owner(kind, (stage, own), value);
         }
-        let has = |stage: &str| {
-            self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name))
-        };
-        let follows = |stage: &str| {
-            let block = &self.pipeline.stages[stage];
-            let is_own = || kind.is_given(self.programs.get(stage), block, name);
-            block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !is_own())
-        };
+        let stages = self.pipeline.stages.keys();
         let with_name: Vec<&String> =
-            self.pipeline.stages.keys().filter(|s| has(s) && !follows(s)).collect();
+            stages.filter(|s| self.has(s, kind, name) && !self.follows(s, kind, name)).collect();
         let meant: Vec<&String> =
             with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
         // A stage that is needed had the name, and another one has it.
@@ -281,6 +278,17 @@ impl Scope<'_> {
                 Err(PlanError::Usage(problem))
             }
         }
+    }
+
+    fn has(&self, stage: &str, kind: Kind, name: &str) -> bool {
+        self.programs.get(stage).is_some_and(|program| kind.names(program).contains(&name))
+    }
+
+    /// Whether a block extends another, and has that name's value from there.
+    fn follows(&self, stage: &str, kind: Kind, name: &str) -> bool {
+        let block = &self.pipeline.stages[stage];
+        let is_own = || kind.is_given(self.programs.get(stage), block, name);
+        block.extends.as_ref().is_some_and(|other| self.needed.contains(other) || !is_own())
     }
 
     /// The stage that is named itself, which must have such a parameter or input.

@@ -71,22 +71,9 @@ impl<'a> Expansion<'a> {
         order: &[String],
         targets: &[String],
     ) -> Result<Plan, PlanError> {
-        let is_sink =
-            |stage: &str| self.programs.get(stage).is_some_and(|program| program.description.sink);
-        let sources = |stage: &str| match is_sink(stage) {
-            true => {
-                shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect()
-            }
-            // An input replaced from the command line needs nothing.
-            false => self
-                .block_inputs(stage)
-                .filter_map(|(_, source)| source.stage())
-                .map(str::to_owned)
-                .collect(),
-        };
-        let wanted = closure(targets, sources);
+        let wanted = closure(targets, |stage| self.sources(stage));
         let of_targets: Vec<&str> =
-            wanted.iter().map(String::as_str).filter(|stage| is_sink(stage)).collect();
+            wanted.iter().map(String::as_str).filter(|stage| self.is_sink(stage)).collect();
         check_shown(self.pipeline, &of_targets, self.choice)?;
         let mut sinks = Vec::new();
         for stage in order.iter().filter(|s| wanted.contains(*s)) {
@@ -97,6 +84,25 @@ impl<'a> Expansion<'a> {
             }
         }
         Ok(Plan { nodes: self.nodes, sinks, notes: self.notes, ..Plan::default() })
+    }
+
+    fn is_sink(&self, stage: &str) -> bool {
+        self.programs.get(stage).is_some_and(|program| program.description.sink)
+    }
+
+    /// The stages that one needs, or that it shows where it is a sink.
+    fn sources(&self, stage: &str) -> Vec<String> {
+        match self.is_sink(stage) {
+            true => {
+                shown(self.pipeline, stage, self.choice).into_iter().map(str::to_owned).collect()
+            }
+            // An input replaced from the command line needs nothing.
+            false => self
+                .block_inputs(stage)
+                .filter_map(|(_, source)| source.stage())
+                .map(str::to_owned)
+                .collect(),
+        }
     }
 
     /// A sink, with all points of what it shows.
@@ -129,14 +135,9 @@ impl<'a> Expansion<'a> {
             .inputs
             .iter()
             .map(|(name, source)| (name.as_str(), Source::of(source)));
-        let is_set = |axis: &Axis, name: &str| {
-            let sets =
-                |set: &Setting| set.stage == stage && set.kind == Kind::Input && set.name == name;
-            axis.values.iter().all(|value| value.settings.iter().any(sets))
-        };
         let replaced: Vec<bool> = inputs
             .clone()
-            .map(|(name, _)| self.axes.iter().any(|axis| is_set(axis, name)))
+            .map(|(name, _)| self.axes.iter().any(|axis| replaces(axis, stage, name)))
             .collect();
         inputs.zip(replaced).filter(|(_, is_replaced)| !is_replaced).map(|(input, _)| input)
     }
@@ -155,11 +156,11 @@ impl<'a> Expansion<'a> {
         stage: &'b str,
         point: &'b Point,
     ) -> impl Iterator<Item = &'b Setting> {
-        let of_axis = move |(index, axis): (usize, &'b Axis)| {
+        let settings = self.axes.iter().enumerate().flat_map(move |(index, axis)| {
             // A stage that an axis doesn't reach has no value of it; a sink has the only one.
             &axis.values[point.get(&index).copied().unwrap_or(0)].settings
-        };
-        self.axes.iter().enumerate().flat_map(of_axis).filter(move |set| self.sets(set, stage))
+        });
+        settings.filter(move |set| self.sets(set, stage))
     }
 
     fn add_stage(&mut self, stage: &str, program: &Arc<StageProgram>) -> Result<(), PlanError> {
@@ -235,12 +236,9 @@ impl<'a> Expansion<'a> {
                 );
                 return Err(PlanError::Usage(problem));
             }
-            let with = |point: &Point, value| {
-                point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect()
-            };
             points = points
                 .iter()
-                .flat_map(|point| (0..values).map(move |value| with(point, value)))
+                .flat_map(|point| (0..values).map(move |value| with(point, axis, value)))
                 .collect();
         }
         Ok(points)
@@ -327,6 +325,19 @@ impl<'a> Expansion<'a> {
             .resolve(&given)
             .map_err(|problems| PlanError::Usage(format!("stage {stage}: {}", problems[0])))
     }
+}
+
+/// Whether each value of an axis sets an input of a stage.
+fn replaces(axis: &Axis, stage: &str, input: &str) -> bool {
+    axis.values.iter().all(|value| {
+        let mut settings = value.settings.iter();
+        settings.any(|set| set.stage == stage && set.kind == Kind::Input && set.name == input)
+    })
+}
+
+/// A point with a further value.
+fn with(point: &Point, axis: usize, value: usize) -> Point {
+    point.iter().map(|(a, v)| (*a, *v)).chain([(axis, value)]).collect()
 }
 
 /// Whether a point has all values of another one.

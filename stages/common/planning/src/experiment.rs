@@ -76,11 +76,6 @@ pub struct Selection {
 impl Experiment {
     /// Takes what a file that extends this one's says.
     pub fn change(&mut self, by: &Self) {
-        let take = |mine: &mut Vec<String>, by: &Vec<String>| {
-            if !by.is_empty() {
-                mine.clone_from(by);
-            }
-        };
         take(&mut self.folders, &by.folders);
         take(&mut self.scenes, &by.scenes);
         take(&mut self.protocols, &by.protocols);
@@ -116,5 +111,12 @@ impl Experiment {
     pub(crate) fn data(&self, choice: &Selection) -> PathBuf {
         let stated = self.data.as_ref().map(PathBuf::from);
         choice.data.clone().or(stated).unwrap_or_else(|| PathBuf::from("."))
+    }
+}
+
+/// Takes another list, unless it is empty.
+fn take(mine: &mut Vec<String>, by: &[String]) {
+    if !by.is_empty() {
+        *mine = by.to_vec();
     }
 }

@@ -54,15 +54,17 @@ impl Asked<'_> {
             &self.choice.scenes
         };
         let common = self.inputs(&self.experiment.inputs)?;
-        let scene = |name: &String| {
-            let mut settings = common.clone();
-            if name != DEMO {
-                let own = self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?;
-                settings.extend(self.alike(&own));
-            }
-            Ok(AxisValue { text: name.clone(), settings })
-        };
-        names.iter().map(scene).collect()
+        names.iter().map(|name| self.scene(name, &common)).collect()
+    }
+
+    /// A scene with its data set, besides what all of them have.
+    fn scene(&self, name: &str, common: &[Setting]) -> Result<AxisValue, PlanError> {
+        let mut settings = common.to_vec();
+        if name != DEMO {
+            let own = self.scope.setting(Kind::Input, "dataset", &self.scene_folder(name)?)?;
+            settings.extend(self.alike(&own));
+        }
+        Ok(AxisValue { text: name.to_owned(), settings })
     }
 
     /// That input of a block, and those of other blocks that come from the same source.
@@ -122,10 +124,10 @@ impl Asked<'_> {
         } else {
             &self.choice.protocols
         };
-        let protocol = |name: &String| {
+        let protocols = names.iter().map(|name| {
             Ok(AxisValue { text: name.clone(), settings: self.parameters(&self.preset(name)?)? })
-        };
-        names.iter().map(protocol).collect()
+        });
+        protocols.collect()
     }
 
     /// A preset's parameters over those of `every`; those of `other` with the width and the scale
@@ -159,38 +161,35 @@ impl Asked<'_> {
     }
 
     fn variants(&self) -> Result<Vec<AxisValue>, PlanError> {
-        let all = &self.experiment.variants;
+        let (all, chosen) = (&self.experiment.variants, &self.choice.variants);
         let known = |name: &str| known_names(name, all.iter().map(|variant| variant.name.as_str()));
-        if let Some(name) = self
-            .choice
-            .variants
-            .iter()
-            .find(|name| !all.iter().any(|variant| variant.name == **name))
+        if let Some(name) =
+            chosen.iter().find(|name| !all.iter().any(|variant| variant.name == **name))
         {
             return Err(PlanError::Usage(format!("no variant {name:?}; {}", known(name))));
         }
-        let is_wanted = |variant: &&Variant| {
-            self.choice.variants.is_empty() || self.choice.variants.contains(&variant.name)
-        };
-        let wanted = all.iter().filter(is_wanted).take(self.choice.first.unwrap_or(usize::MAX));
-        let variant = |variant: &Variant| {
-            let settings =
-                [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
-            Ok(AxisValue { text: variant.name.clone(), settings })
-        };
-        wanted.map(variant).collect()
+        let wanted =
+            all.iter().filter(|variant| chosen.is_empty() || chosen.contains(&variant.name));
+        let first = wanted.take(self.choice.first.unwrap_or(usize::MAX));
+        first.map(|variant| self.variant(variant)).collect()
+    }
+
+    fn variant(&self, variant: &Variant) -> Result<AxisValue, PlanError> {
+        let settings =
+            [self.parameters(&variant.parameters)?, self.inputs(&variant.inputs)?].concat();
+        Ok(AxisValue { text: variant.name.clone(), settings })
     }
 
     /// A parameter with several values.
     fn sweep(&self, name: &str, values: &[Value]) -> Result<Axis, PlanError> {
-        let value = |value: &Value| {
+        let values = values.iter().map(|value| {
             let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
             Ok(AxisValue {
                 text,
                 settings: vec![self.scope.setting(Kind::Parameter, name, value)?],
             })
-        };
-        let values = values.iter().map(value).collect::<Result<Vec<_>, PlanError>>()?;
+        });
+        let values = values.collect::<Result<Vec<_>, PlanError>>()?;
         let name = values
             .first()
             .and_then(|value| value.settings.first())

@@ -123,10 +123,7 @@ impl File {
     /// The file of its bytes. Duplicate keys, unknown keys and types are refused here, with their
     /// line.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
-        let fail = |line: Option<usize>, problem: String| PipelineError {
-            place: place(path, line),
-            problem,
-        };
+        let fail = |line, problem| PipelineError { place: place(path, line), problem };
         let text = yaml_lines::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
         let located =
             |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
@@ -138,16 +135,13 @@ impl File {
             })?;
         let mut document = serde_yaml::Value::Mapping(mapping);
         let merged = yaml_lines::merge(&mut document).map_err(located)?;
-        let line_of = |keys: &[String]| {
-            yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>())
-        };
         if let Some((keys, problem)) = problem_of(&document) {
-            return Err(fail(line_of(&keys), problem));
+            return Err(fail(line_of(text, &keys), problem));
         }
         let written: PipelineFile = if merged {
             serde_path_to_error::deserialize(document).map_err(|e| {
                 let keys: Vec<String> = e.path().iter().map(ToString::to_string).collect();
-                fail(line_of(&keys), format!("{}: {}", keys.join("."), e.inner()))
+                fail(line_of(text, &keys), format!("{}: {}", keys.join("."), e.inner()))
             })?
         } else {
             serde_yaml::from_str(text).map_err(located)?
@@ -222,6 +216,11 @@ fn problem_of_name(name: &str) -> Option<&'static str> {
 fn without_line(error: &serde_yaml::Error) -> String {
     let text = error.to_string();
     text.rsplit_once(" at line ").map_or(text.clone(), |(problem, _)| problem.to_owned())
+}
+
+/// The line of a key, through nested mappings.
+fn line_of(text: &str, keys: &[String]) -> Option<usize> {
+    yaml_lines::line_of(text, &keys.iter().map(String::as_str).collect::<Vec<_>>())
 }
 
 /// File and, where known, line.

@@ -20,10 +20,11 @@ pub(crate) fn shown<'a>(pipeline: &'a Pipeline, sink: &str, choice: &Selection) 
         .iter()
         .filter_map(|(name, source)| Some((name, Source::of(source).stage()?)));
     let wanted = if choice.show.is_empty() { &pipeline.experiment.show } else { &choice.show };
-    let is_wanted = |(name, stage): &(&String, &str)| {
-        wanted.iter().any(|wanted| wanted == *name || wanted == stage)
-    };
-    let chosen: Vec<&str> = inputs.clone().filter(is_wanted).map(|(_, stage)| stage).collect();
+    let chosen: Vec<&str> = inputs
+        .clone()
+        .filter(|(name, stage)| wanted.iter().any(|wanted| wanted == *name || wanted == stage))
+        .map(|(_, stage)| stage)
+        .collect();
     // A file's own choice needn't be meant for this sink.
     let shows_all = choice.show.is_empty() && chosen.is_empty();
     if shows_all { inputs.map(|(_, stage)| stage).collect() } else { chosen }

@@ -147,15 +147,24 @@ impl Node {
         &self,
         number: impl Fn(usize) -> Option<usize>,
     ) -> BTreeMap<String, RunInput> {
-        let source = |from: &Origin| match from {
-            Origin::Node { index, subtree } => {
+        self.inputs
+            .iter()
+            .map(|input| (input.name.clone(), input.from.run_input(&number)))
+            .collect()
+    }
+}
+
+impl Origin {
+    /// As a record names it.
+    fn run_input(&self, number: impl Fn(usize) -> Option<usize>) -> RunInput {
+        match self {
+            Self::Node { index, subtree } => {
                 RunInput { node: number(*index), subtree: subtree.clone(), folder: None }
             }
-            Origin::Folder(folder) => {
+            Self::Folder(folder) => {
                 RunInput { folder: Some(folder.clone()), ..RunInput::default() }
             }
-        };
-        self.inputs.iter().map(|input| (input.name.clone(), source(&input.from))).collect()
+        }
     }
 }
 

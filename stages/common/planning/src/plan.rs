@@ -54,11 +54,7 @@ impl Plan {
                 states.push(State::Waits { on: on.into_iter().collect() });
                 continue;
             }
-            let outputs = |index: usize| match &states[index] {
-                State::Cached(record) => record.output.clone(),
-                _ => unreachable!("a node whose parents aren't cached waits"),
-            };
-            let hashes = input_hashes(node, store, outputs)?;
+            let hashes = input_hashes(node, store, |index| cached_output(&states[index]))?;
             let key_parts = key::parts(node, &hashes, self.device(&node.stage));
             states.push(match store.hit(&hash_json(&key_parts)) {
                 Some(record) => State::Cached(Box::new(record)),
@@ -66,6 +62,13 @@ impl Plan {
             });
         }
         Ok(states)
+    }
+}
+
+fn cached_output(state: &State) -> String {
+    match state {
+        State::Cached(record) => record.output.clone(),
+        _ => unreachable!("a node whose parents aren't cached waits"),
     }
 }
 
@@ -116,7 +119,20 @@ pub fn input_hashes(
     store: &Store,
     output_of: impl Fn(usize) -> String,
 ) -> Result<Vec<(String, String)>, PlanError> {
-    let hash = |input: &NodeInput| match &input.from {
+    let hashes = node
+        .inputs
+        .iter()
+        .map(|input| Ok((input.name.clone(), input_hash(node, store, input, &output_of)?)));
+    hashes.collect()
+}
+
+fn input_hash(
+    node: &Node,
+    store: &Store,
+    input: &NodeInput,
+    output_of: impl Fn(usize) -> String,
+) -> Result<String, PlanError> {
+    match &input.from {
         Origin::Node { index, subtree: None } => Ok(output_of(*index)),
         Origin::Node { index, subtree: Some(folder) } => {
             let manifest =
@@ -124,8 +140,7 @@ pub fn input_hashes(
             Ok(manifest.subtree(folder).identity())
         }
         Origin::Folder(folder) => source_hash(store, node, &input.name, folder),
-    };
-    node.inputs.iter().map(|input| Ok((input.name.clone(), hash(input)?))).collect()
+    }
 }
 
 /// Content hash of a folder outside the store, an input of a node.

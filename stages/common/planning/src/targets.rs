@@ -18,15 +18,14 @@ pub fn find(pipeline: &Pipeline, targets: &[String]) -> Result<(Pipeline, Vec<St
         } else {
             on_shelf(pipeline, target)?
         };
-        let apart = |problem: String| {
-            PlanError::Usage(format!(
-                "{target} can't be made together with {}: {problem}; make it by itself",
-                blocks.join(", ")
-            ))
-        };
         all = Some(match all {
             None => found,
-            Some(all) => all.joined(found).map_err(apart)?,
+            Some(all) => all.joined(found).map_err(|problem| {
+                PlanError::Usage(format!(
+                    "{target} can't be made together with {}: {problem}; make it by itself",
+                    blocks.join(", ")
+                ))
+            })?,
         });
         blocks.extend(named);
     }

@@ -68,6 +68,13 @@ struct Telling {
     gradient: [[f32; 2]; 3],
 }
 
+impl Telling {
+    /// Its centre in the image.
+    fn centre(&self) -> [f64; 2] {
+        [self.x as f64 + 0.5, self.y as f64 + 0.5]
+    }
+}
+
 /// Smaller levels have too little to go by.
 const SMALLEST: usize = 12;
 /// At most so many pixels of a level are rendered, spread over all that tell something.
@@ -88,7 +95,7 @@ impl Pyramid {
         let size =
             |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
         let is_large = |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= SMALLEST);
-        let level = |level: u32| {
+        let levels = (0..=smaller).take_while(is_large).map(|level| {
             let [width, height] = size(level);
             let shrink = Resampling::new(
                 Filter::Box,
@@ -96,8 +103,8 @@ impl Pyramid {
                 (width, height),
             );
             PyramidLevel::new(&shrink.apply(photograph))
-        };
-        Self { levels: (0..=smaller).take_while(is_large).map(level).collect() }
+        });
+        Self { levels: levels.collect() }
     }
 
     /// How many levels lie below the image itself.
@@ -109,24 +116,26 @@ impl Pyramid {
 impl PyramidLevel {
     fn new(image: &Image) -> Self {
         let (width, height) = (image.width, image.height);
-        let colour = |x: usize, y: usize| [0, 1, 2].map(|c| image.data[(y * width + x) * 3 + c]);
         let inner = |n: usize| 1..n.saturating_sub(1);
-        let telling = |(x, y): (usize, usize)| {
-            let [left, right, up, down] =
-                [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
-            let gradient = [0, 1, 2].map(|c| [0.5 * (right[c] - left[c]), 0.5 * (down[c] - up[c])]);
-            let pixel = Telling { x, y, colour: colour(x, y), gradient };
-            let numbers = gradient.as_flattened();
-            let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
-            (is_known && numbers.iter().any(|g| g.abs() > STEEP)).then_some(pixel)
-        };
         let all: Vec<Telling> = inner(height)
             .flat_map(|y| inner(width).map(move |x| (x, y)))
-            .filter_map(telling)
+            .filter_map(|(x, y)| telling(image, x, y))
             .collect();
         let every = all.len().div_ceil(MOST).max(1);
         Self { width, height, telling: all.into_iter().step_by(every).collect() }
     }
+}
+
+/// A pixel within the border, where it tells something.
+fn telling(image: &Image, x: usize, y: usize) -> Option<Telling> {
+    let colour = |x: usize, y: usize| [0, 1, 2].map(|c| image.data[(y * image.width + x) * 3 + c]);
+    let [left, right, up, down] =
+        [colour(x - 1, y), colour(x + 1, y), colour(x, y - 1), colour(x, y + 1)];
+    let gradient = [0, 1, 2].map(|c| [0.5 * (right[c] - left[c]), 0.5 * (down[c] - up[c])]);
+    let pixel = Telling { x, y, colour: colour(x, y), gradient };
+    let numbers = gradient.as_flattened();
+    let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
+    (is_known && numbers.iter().any(|g| g.abs() > STEEP)).then_some(pixel)
 }
 
 /// How to refine.
@@ -214,9 +223,7 @@ impl Equations {
         options: &Options,
     ) -> Result<Self, RenderError> {
         let camera = camera.resized(level.width as u32, level.height as u32);
-        let cast = |pixel: &Telling| {
-            cast(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], options.background)
-        };
+        let cast = |pixel: &Telling| cast(&camera, pixel.centre(), options.background);
         let rays: Vec<Ray> = level.telling.iter().map(|pixel| cast(pixel).1).collect();
         let rendered = field.render(&rays)?;
         let depths: Vec<Option<f64>> = (level.telling.iter().zip(&rendered))
@@ -244,8 +251,7 @@ impl Equations {
             sums.error += errors.iter().map(|e| huber(*e)).sum::<f64>();
             let Some(depth) = *depth else { continue };
             sums.pixels += 1;
-            let motion =
-                image_motion(&camera, [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5], depth, unit);
+            let motion = image_motion(&camera, pixel.centre(), depth, unit);
             for (c, error) in errors.into_iter().enumerate() {
                 let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
                 // What is seen would have to move by the opposite of the error over the gradient.
@@ -407,9 +413,6 @@ pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
     });
     let back = DQuat::from_scaled_axis(-share * turns.sum::<DVec3>());
     let middle = |cameras: &[Camera]| share * cameras.iter().map(Camera::centre).sum::<DVec3>();
-    let spread = |cameras: &[Camera], middle: DVec3| {
-        cameras.iter().map(|c| c.centre().distance_squared(middle)).sum::<f64>()
-    };
     let (now, before) = (middle(cameras), middle(were));
     let (wide, was_wide) = (spread(cameras, now), spread(were, before));
     let narrower = if wide > 0.0 && was_wide > 0.0 { (was_wide / wide).sqrt() } else { 1.0 };
@@ -420,6 +423,11 @@ pub fn take_back_common_motion(cameras: &mut [Camera], were: &[Camera]) {
             before + narrower * (back * (camera.centre() - now)),
         );
     }
+}
+
+/// How far cameras are from a place: the sum of squares.
+fn spread(cameras: &[Camera], place: DVec3) -> f64 {
+    cameras.iter().map(|c| c.centre().distance_squared(place)).sum::<f64>()
 }
 
 #[cfg(test)]

@@ -95,14 +95,11 @@ fn errors(
     background: f32,
 ) -> Result<Vec<f64>, RenderError> {
     let (camera, k) = (shot.camera, &shot.camera.intrinsics);
-    let is_inside = |x: f64, y: f64| {
-        (0.0..f64::from(k.width)).contains(&x) && (0.0..f64::from(k.height)).contains(&y)
-    };
-    let looked_at = |place: &Place| {
-        camera.project(place.at).map(|(x, y, _)| [x, y]).filter(|[x, y]| is_inside(*x, *y))
-    };
+    let (width, height) = (f64::from(k.width), f64::from(k.height));
+    let is_inside = |[x, y]: &[f64; 2]| (0.0..width).contains(x) && (0.0..height).contains(y);
+    let place_in = |at: DVec3| camera.project(at).map(|(x, y, _)| [x, y]).filter(is_inside);
     let (inside, at): (Vec<&Place>, Vec<[f64; 2]>) =
-        places.iter().filter_map(|place| Some((place, looked_at(place)?))).unzip();
+        places.iter().filter_map(|place| Some((place, place_in(place.at)?))).unzip();
     let rays: Vec<_> = at.iter().map(|&at| cast(camera, at, background).1).collect();
     let mut found = Vec::with_capacity(3 * rays.len());
     for ((place, [x, y]), seen) in inside.into_iter().zip(at).zip(field.render(&rays)?) {

@@ -45,54 +45,6 @@ pub(crate) fn optical_depth_gradients(
     }
 }
 
-/// Weights of what is asked of rays beside their colours, for one ray.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Regularisers {
-    /// Of the distortion loss.
-    pub(crate) distortion: f32,
-    /// Of the floater loss: T·Σ_i w_i·[`likeness`]_i, without a gradient by the colours, which
-    /// would make floaters darker instead of thinner, or by the ray's transmittance T. What stops a
-    /// ray is paint of the background's colour, no floater: it would become thin and darker, and
-    /// look the same.
-    pub(crate) floater_loss: f32,
-}
-
-/// How far apart colours at most are for matter to pass for the background.
-pub const LIKE_BACKGROUND: f32 = 0.1;
-
-/// How much matter passes for the background it lies before: 1 where it has its colour, 0 from
-/// [`LIKE_BACKGROUND`] on. Whether it is there no image tells that sees it before the background
-/// alone.
-pub(crate) fn likeness(colour: [f32; 3], background: [f32; 3]) -> f32 {
-    let squared: f32 = colour.iter().zip(background).map(|(c, b)| (c - b) * (c - b)).sum();
-    (1.0 - squared / (LIKE_BACKGROUND * LIKE_BACKGROUND)).max(0.0)
-}
-
-/// Adds to `shade`, the gradient of a loss by each weight of a ray, that of the distortion loss
-/// (Barron et al. 2022, "Mip-NeRF 360", eq. 15) times `factor`: Σ_ij w_i·w_j·|t_i - t_j| +
-/// ⅓·step·Σ_i w_i². It draws a ray's weights together. `t` rises.
-pub(crate) fn add_distortion_gradients(
-    t: &[f32],
-    weight: &[f32],
-    step: f32,
-    factor: f32,
-    shade: &mut [f32],
-) {
-    let whole: f32 = weight.iter().sum();
-    // Measured from the mean, so that nothing cancels.
-    let mean = weight.iter().zip(t).map(|(w, t)| w * t).sum::<f32>() / whole.max(f32::MIN_POSITIVE);
-    let (mut before, mut moment) = (0.0, 0.0);
-    for ((shade, &w), &t) in shade.iter_mut().zip(weight).zip(t) {
-        let t = t - mean;
-        // Σ_j w_j·|t - t_j|: what lies before with +, what lies behind with -; all moments add up
-        // to 0.
-        let apart = t * (2.0 * before + w - whole) - (2.0 * moment + w * t);
-        *shade += 2.0 * factor * (apart + step * w / 3.0);
-        before += w;
-        moment += w * t;
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -149,33 +101,6 @@ mod tests {
                 let numeric = (up - loss(&wide)) / (2.0 * h);
                 prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}",
                     gradient[i]);
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn distortion_gradients_equal_f64_differences(
-            samples in prop::collection::vec((0.001f32..0.2, 1e-4f32..0.5), 1..40),
-            factor in 0.01f32..2.0,
-        ) {
-            let mut t: Vec<f32> = samples.iter().map(|(gap, _)| *gap).collect();
-            (1..t.len()).for_each(|i| t[i] += t[i - 1]);
-            let weight: Vec<f32> = samples.iter().map(|(_, w)| *w).collect();
-            let mut shade = vec![0.0; t.len()];
-            add_distortion_gradients(&t, &weight, 0.003, factor, &mut shade);
-            let exact = |i: usize| -> f64 {
-                let apart: f64 = (0..t.len()).map(|j| f64::from(weight[j]) * (f64::from(t[i]) - f64::from(t[j])).abs()).sum();
-                2.0 * f64::from(factor) * (apart + 0.003 / 3.0 * f64::from(weight[i]))
-            };
-            // Distances are differences of f32 numbers: known to a few parts in 10^7 of how far
-            // along the ray they lie.
-            let whole: f32 = weight.iter().sum();
-            let rounding = 4e-7 * f64::from(factor * whole * t[t.len() - 1]);
-            let largest = (0..t.len()).map(exact).fold(1e-3, f64::max);
-            for i in 0..t.len() {
-                let error = (f64::from(shade[i]) - exact(i)).abs();
-                prop_assert!(error < 1e-5 * largest + rounding, "{i}: {} {}", shade[i], exact(i));
             }
         }
     }

@@ -52,7 +52,8 @@ impl Level {
 pub(crate) fn levels(architecture: &Architecture) -> Vec<Level> {
     let Architecture { levels: count, coarsest, finest, finest_z, log2_entries, .. } =
         *architecture;
-    let ratio = (f64::from(finest) / f64::from(coarsest)).powf(1.0 / f64::from(count.max(2) - 1));
+    let steps = f64::from(count.max(2) - 1);
+    let ratio = libm::pow(f64::from(finest) / f64::from(coarsest), 1.0 / steps);
     let mut offset = 0;
     (0..count)
         .map(|i| {

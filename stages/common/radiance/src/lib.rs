@@ -9,6 +9,7 @@
 //! * [`Tally`], [`Occupancy`], [`NormalizedRay`]: what a training of the same field elsewhere
 //!   (`torch-field`) shares: how far it has come, where there may be something, how rays run
 //!   through the unit cube.
+//! * [`regularisers`]: what a training asks of rays beside their colours.
 //! * [`spec`]: the constants that the libtorch twin shares.
 //! * [`Passes`]: one forward and backward pass alone, for benchmarks.
 //! * [`PointSample`]: what a field holds at a place, for whoever bakes it into something else.
@@ -52,6 +53,7 @@ mod ranges;
 mod ray;
 #[cfg(test)]
 mod reference;
+pub mod regularisers;
 mod render;
 mod samples;
 mod shading;
@@ -64,7 +66,6 @@ mod tensors;
 mod trainer;
 
 pub use architecture::Architecture;
-pub use composite::LIKE_BACKGROUND;
 pub use field::Field;
 pub use field_file::{
     FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
@@ -74,6 +75,7 @@ pub use passes::Passes;
 pub use points::PointSample;
 pub use ranges::OutOfRange;
 pub use ray::{NormalizedRay, Ray, RayMap, clip};
+pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use simd::{Family, set_family};
 pub use spherical::spherical_harmonics;

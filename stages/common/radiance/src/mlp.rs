@@ -232,15 +232,19 @@ pub(crate) struct Layers {
 impl Layers {
     pub(crate) fn new(features: usize, hidden: usize) -> Self {
         let mut offset = 0;
-        let mut layer = |inputs, outputs| {
+        let [a, b, c, d, e] = [
+            (features, hidden),
+            (hidden, DENSITY_OUTPUTS),
+            (VIEW_INPUTS, hidden),
+            (hidden, hidden),
+            (hidden, 3),
+        ]
+        .map(|(inputs, outputs)| {
             let layer = Layer { inputs, outputs, offset };
             offset += inputs * outputs;
             layer
-        };
-        Self {
-            density: [layer(features, hidden), layer(hidden, DENSITY_OUTPUTS)],
-            view: [layer(VIEW_INPUTS, hidden), layer(hidden, hidden), layer(hidden, 3)],
-        }
+        });
+        Self { density: [a, b], view: [c, d, e] }
     }
 
     pub(crate) fn all(&self) -> [Layer; 5] {

@@ -109,15 +109,17 @@ impl Occupancy {
     /// Limits it to the cells that are occupied and those around them: for a training that goes on
     /// where the rest is known to be empty.
     pub(crate) fn limit_to_occupied(&mut self) {
-        let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
-        let kept = |cell: usize| {
-            let [x, y, z] = corner(cell);
-            around(z).any(|k| {
-                around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k))))
-            })
-        };
-        let mask = (0..CELLS).into_par_iter().map(kept).collect();
+        let mask = (0..CELLS).into_par_iter().map(|cell| self.is_near_occupied(cell)).collect();
         self.limit_to(mask);
+    }
+
+    /// Whether a cell or one around it is occupied.
+    fn is_near_occupied(&self, cell: usize) -> bool {
+        let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
+        let [x, y, z] = corner(cell);
+        around(z).any(|k| {
+            around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k))))
+        })
     }
 
     /// Limits it to cells, besides what limits it already; all that is left may be occupied.
@@ -134,20 +136,19 @@ impl Occupancy {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
+        let cells = (0..CELLS as u32).into_par_iter();
+        cells.filter(|&cell| self.is_looked_at(cell as usize, step)).collect()
+    }
+
+    /// Whether to look at a cell at a step that looks at some.
+    fn is_looked_at(&self, cell: usize, step: u64) -> bool {
         let turn = (step / EVERY) as usize;
-        let is_looked_at = |&cell: &u32| {
-            let cell = cell as usize;
-            let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-            let [.., z] = corner(cell);
-            let turns = if step <= WARM_UP || self.is_occupied(cell) {
-                OCCUPIED_TURNS
-            } else {
-                EMPTY_TURNS
-            };
-            let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
-            allowed && wanted
-        };
-        (0..CELLS as u32).into_par_iter().filter(is_looked_at).collect()
+        let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
+        let [.., z] = corner(cell);
+        let turns =
+            if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
+        let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
+        allowed && wanted
     }
 
     /// Where in a cell to look at that step, in the unit cube.
@@ -173,14 +174,14 @@ impl Occupancy {
         // is denser than the mean.
         let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
         let allowed = |cell: usize| self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-        let held = |(cell, &density): (usize, &f32)| match density {
+        let held = self.density.iter().enumerate().map(|(cell, &density)| match density {
             _ if !allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
             d if d < empty => Cell::Empty,
             d if d < thin => Cell::Thin,
             _ => Cell::Dense,
-        };
-        let held: Vec<Cell> = self.density.iter().enumerate().map(held).collect();
+        });
+        let held: Vec<Cell> = held.collect();
         self.set(|cell| held[cell]);
     }
 

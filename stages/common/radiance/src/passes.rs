@@ -1,9 +1,9 @@
 use crate::chunk::CHUNK_RAYS;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
-use crate::composite::Regularisers;
 use crate::field::Field;
 use crate::occupancy::Strides;
 use crate::ray::{Ray, clip};
+use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 

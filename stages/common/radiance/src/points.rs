@@ -31,12 +31,11 @@ impl Field {
     /// Whether some cell of the occupancy between two corners of the unit cube may hold something.
     pub fn may_hold(&self, low: [f32; 3], high: [f32; 3]) -> bool {
         let (from, to) = (cell_of(low), cell_of(high));
-        let row = |y: usize, z: usize| {
-            (from[0]..=to[0]).any(|x| {
-                self.occupancy.is_occupied(x + OCCUPANCY_CELLS * (y + OCCUPANCY_CELLS * z))
-            })
-        };
-        (from[2]..=to[2]).any(|z| (from[1]..=to[1]).any(|y| row(y, z)))
+        let cell = |x: usize, y: usize, z: usize| x + OCCUPANCY_CELLS * (y + OCCUPANCY_CELLS * z);
+        (from[2]..=to[2]).any(|z| {
+            (from[1]..=to[1])
+                .any(|y| (from[0]..=to[0]).any(|x| self.occupancy.is_occupied(cell(x, y, z))))
+        })
     }
 
     /// What the field holds at some places of the unit cube, as rays would find it. In this thread.

@@ -5,12 +5,12 @@ use scene::Bounds;
 
 use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
-use crate::composite::{Regularisers, likeness};
 use crate::field::Field;
 use crate::grid::{Level, scatter};
 use crate::mlp::{Layer, drain_lanes};
 use crate::occupancy::{Cell, March, Marched, Strides, march};
 use crate::ray::{NormalizedRay, Ray, clip};
+use crate::regularisers::{Regularisers, likeness};
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::simd::LANES;
 use crate::spec::{

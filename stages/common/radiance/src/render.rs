@@ -3,7 +3,8 @@ use rayon::prelude::*;
 use crate::chunk::{CHUNK_RAYS, Chunk};
 use crate::field::Field;
 use crate::occupancy::Strides;
-use crate::ray::{Ray, clip};
+use crate::ray::{NormalizedRay, Ray, clip};
+use crate::samples::RaySum;
 
 /// What a ray sees.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -65,27 +66,27 @@ impl Field {
             .map_init(Chunk::default, |chunk, rays| {
                 let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
                 chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
-                let pixel = |(i, ray): (usize, &Ray)| {
-                    let sum = &chunk.sums[i];
-                    let far = if clipped[i].leave > clipped[i].enter {
-                        clipped[i].distance(clipped[i].leave)
-                    } else {
-                        self.bounds.far as f32
-                    };
-                    let opacity = 1.0 - sum.transmittance;
-                    Pixel {
-                        colour: std::array::from_fn(|c| {
-                            sum.transmittance.mul_add(ray.background[c], sum.colour[c])
-                        }),
-                        premultiplied: sum.colour,
-                        opacity,
-                        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
-                        median_depth: sum.median.map_or(far, |t| clipped[i].distance(t)),
-                    }
-                };
-                rays.iter().enumerate().map(pixel).collect::<Vec<_>>()
+                let far = self.bounds.far as f32;
+                let rays = rays.iter().enumerate();
+                rays.map(|(i, ray)| pixel(ray, &clipped[i], &chunk.sums[i], far))
+                    .collect::<Vec<_>>()
             })
             .flatten_iter()
             .collect()
+    }
+}
+
+/// What a ray sees; the far end where it misses the cube.
+fn pixel(ray: &Ray, clipped: &NormalizedRay, sum: &RaySum, far: f32) -> Pixel {
+    let far = if clipped.leave > clipped.enter { clipped.distance(clipped.leave) } else { far };
+    let opacity = 1.0 - sum.transmittance;
+    Pixel {
+        colour: std::array::from_fn(|c| {
+            sum.transmittance.mul_add(ray.background[c], sum.colour[c])
+        }),
+        premultiplied: sum.colour,
+        opacity,
+        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
+        median_depth: sum.median.map_or(far, |t| clipped.distance(t)),
     }
 }

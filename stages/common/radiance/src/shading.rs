@@ -2,12 +2,13 @@
 //! composited along a ray, one small network makes of them and the direction what is added to the
 //! raw colours of all the ray's samples. So colours cost a network a ray.
 
-use crate::composite::{Regularisers, add_distortion_gradients, likeness, optical_depth_gradients};
+use crate::composite::optical_depth_gradients;
 use crate::field::Field;
 use crate::math::sigmoid;
 use crate::mlp::Layers;
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
+use crate::regularisers::{LossGradients, Regularisers, ShadedRay};
 use crate::samples::{Counted, RaySum, Samples, fit};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
@@ -42,6 +43,7 @@ pub(crate) struct RayGradients<'a> {
     /// By the colour over the background.
     pub(crate) colours: &'a [[f32; 3]],
     pub(crate) backgrounds: &'a [[f32; 3]],
+    /// Their weights for one ray.
     pub(crate) regularisers: Regularisers,
 }
 
@@ -217,16 +219,19 @@ pub(crate) fn view_network<'a>(
 ) -> &'a mut [f32] {
     let Layers { view, .. } = field.layers;
     let [hidden1, hidden2] = hidden;
-    let run = |layer: Layer, x: &[f32], y: &mut [f32], after| {
-        multiply(&field.network[layer.range()], x, y, layer.inputs, layer.outputs, n, after);
-    };
     let hidden1 = fit(hidden1, view[0].outputs * n);
-    run(view[0], input, hidden1, After::Relu);
+    run(field, view[0], input, hidden1, n, After::Relu);
     let hidden2 = fit(hidden2, view[1].outputs * n);
-    run(view[1], hidden1, hidden2, After::Relu);
+    run(field, view[1], hidden1, hidden2, n, After::Relu);
     let added = fit(added, view[2].outputs * n);
-    run(view[2], hidden2, added, After::Linear);
+    run(field, view[2], hidden2, added, n, After::Linear);
     added
+}
+
+/// Runs a layer on `n` columns.
+#[inline]
+fn run(field: &Field, layer: Layer, x: &[f32], y: &mut [f32], n: usize, after: After<'_>) {
+    multiply(&field.network[layer.range()], x, y, layer.inputs, layer.outputs, n, after);
 }
 
 impl AlongRay {
@@ -296,6 +301,8 @@ impl Shading {
         gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
         let along = &mut self.along;
         along.fit(counted.longest());
+        let step = field.step();
+        let channels: [&[f32]; 3] = std::array::from_fn(|c| &colour[c * m..(c + 1) * m]);
         for (column, &r) in counted.rays.iter().enumerate() {
             let (g, background) = (towards.colours[r as usize], towards.backgrounds[r as usize]);
             let (places, transmittance) = (counted.of_ray(r), sums[r as usize].transmittance);
@@ -303,30 +310,18 @@ impl Shading {
             let mut composited = [0.0; DENSITY_OUTPUTS];
             (0..VIEW_FEATURES).for_each(|f| composited[VIEW_FEATURE + f] = b[f * n + column]);
             gradients_along(samples, counted, places, colour, m, g, &composited, along, gradients);
-            let floater = towards.regularisers.floater_loss * transmittance;
-            if floater > 0.0 {
-                for (by_weight, &k) in along.by_weight.iter_mut().zip(places) {
-                    let colour = std::array::from_fn(|c| colour[c * m + k as usize]);
-                    *by_weight = floater.mul_add(likeness(colour, background), *by_weight);
-                }
-            }
-            let (t, weight, by_weight) =
-                (&along.t[..len], &along.weight[..len], &mut along.by_weight[..len]);
-            if towards.regularisers.distortion > 0.0 {
-                add_distortion_gradients(
-                    t,
-                    weight,
-                    field.step(),
-                    towards.regularisers.distortion,
-                    by_weight,
-                );
-            }
-            let behind = transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>();
+            let (t, weight) = (&along.t[..len], &along.weight[..len]);
+            let ray = ShadedRay { t, weight, step, channels, places, transmittance, background };
+            let mut loss = LossGradients {
+                by_weight: &mut along.by_weight[..len],
+                behind: transmittance * (0..3).map(|c| g[c] * background[c]).sum::<f32>(),
+            };
+            towards.regularisers.add_gradients(&ray, &mut loss);
             optical_depth_gradients(
-                by_weight,
+                loss.by_weight,
                 &along.transmittance[..len],
                 weight,
-                behind,
+                loss.behind,
                 &mut along.by_depth[..len],
             );
             for (&k, &by_depth) in places.iter().zip(&along.by_depth) {

@@ -74,17 +74,19 @@ struct Moments {
     network: Vec<f32>,
 }
 
+impl Moments {
+    fn zeros(field: &Field) -> Self {
+        Self { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] }
+    }
+}
+
 impl Trainer {
     /// Starts from a field.
     pub fn new(field: Field, options: TrainingOptions) -> Self {
-        let zeros = || Moments {
-            grid: vec![0.0; field.grid.len()],
-            network: vec![0.0; field.network.len()],
-        };
         Self {
-            first: zeros(),
-            second: zeros(),
-            gradients: zeros(),
+            first: Moments::zeros(&field),
+            second: Moments::zeros(&field),
+            gradients: Moments::zeros(&field),
             average: None,
             touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
             touched_network: vec![0; field.network.len().div_ceil(LANES)],
@@ -300,6 +302,7 @@ mod tests {
     use super::*;
     use crate::architecture::Architecture;
     use crate::ray::Ray;
+    use crate::regularisers::Regularisers;
     use counter_rng::CounterRng;
     use scene::Bounds;
 
@@ -359,8 +362,7 @@ mod tests {
                 learning_rate_decay: 0.25,
                 warm_up: 5,
                 ema_decay: 0.0,
-                distortion: 0.0,
-                floater_loss,
+                regularisers: Regularisers { floater_loss, ..Regularisers::default() },
                 network_decay: 0.0,
                 roulette: 1.0,
                 seed: 9,

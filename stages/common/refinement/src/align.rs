@@ -1,3 +1,5 @@
+use pixels::Image;
+
 use crate::channels::INPUTS;
 use crate::sums::Sums;
 use crate::view::{KnownView, Rendered};
@@ -15,31 +17,53 @@ pub(crate) fn align(
     reference: &KnownView,
     first_row: usize,
 ) -> Vec<WarpedPixel> {
-    let view = &rendered.view;
-    let width = view.width;
-    let pixel =
-        |x: usize, y: usize| &view.data[(y * width + x) * INPUTS..(y * width + x + 1) * INPUTS];
-    let slope = |x: usize, y: usize, c: usize| {
-        let (left, right) = (x.saturating_sub(1), (x + 1).min(width - 1));
-        let (top, bottom) = (y.saturating_sub(1), (y + 1).min(view.height - 1));
+    let rows = WarpedRows { warped, view: &rendered.view, first_row };
+    let terms: Vec<[f64; 6]> = (0..warped.len()).map(|i| rows.terms(i)).collect();
+    let sums = Sums::new(rows.view.width, &terms);
+    (0..warped.len()).map(|i| rows.moved(i, &sums, reference)).collect()
+}
+
+/// What a reference shows of rows of a view from one on.
+struct WarpedRows<'a> {
+    warped: &'a [WarpedPixel],
+    view: &'a Image,
+    first_row: usize,
+}
+
+impl WarpedRows<'_> {
+    /// A pixel of the view.
+    fn pixel(&self, x: usize, y: usize) -> &[f32] {
+        let at = y * self.view.width + x;
+        &self.view.data[at * INPUTS..(at + 1) * INPUTS]
+    }
+
+    /// How a channel of the view rises across and down.
+    fn slope(&self, x: usize, y: usize, c: usize) -> (f64, f64) {
+        let (left, right) = (x.saturating_sub(1), (x + 1).min(self.view.width - 1));
+        let (top, bottom) = (y.saturating_sub(1), (y + 1).min(self.view.height - 1));
         let per = |far: f32, near: f32, pixels: usize| f64::from(far - near) / pixels.max(1) as f64;
         (
-            per(pixel(right, y)[c], pixel(left, y)[c], right - left),
-            per(pixel(x, bottom)[c], pixel(x, top)[c], bottom - top),
+            per(self.pixel(right, y)[c], self.pixel(left, y)[c], right - left),
+            per(self.pixel(x, bottom)[c], self.pixel(x, top)[c], bottom - top),
         )
-    };
-    let terms = |(i, own): (usize, &WarpedPixel)| {
+    }
+
+    /// What a pixel adds to the normal equations of those around it.
+    fn terms(&self, i: usize) -> [f64; 6] {
+        let (own, width) = (&self.warped[i], self.view.width);
         let mut terms = [0.0; 6];
         for c in (0..3).filter(|_| own.confidence > 0.0) {
-            let (x, y) = slope(i % width, first_row + i / width, c);
+            let (x, y) = self.slope(i % width, self.first_row + i / width, c);
             let (apart, lacks) = (f64::from(own.difference[c]), f64::from(own.lacking[c]));
             let of_channel = [x * x, x * y, y * y, x * apart, y * apart, lacks * lacks];
             terms.iter_mut().zip(of_channel).for_each(|(sum, term)| *sum += term);
         }
         terms
-    };
-    let sums = Sums::new(width, &warped.iter().enumerate().map(terms).collect::<Vec<_>>());
-    let moved = |(i, own): (usize, &WarpedPixel)| {
+    }
+
+    /// What the reference shows of a pixel where it fits best.
+    fn moved(&self, i: usize, sums: &Sums<6>, reference: &KnownView) -> WarpedPixel {
+        let (warped, own, width) = (self.warped, &self.warped[i], self.view.width);
         if own.confidence <= 0.0 {
             return *own;
         }
@@ -64,23 +88,24 @@ pub(crate) fn align(
         let place = std::array::from_fn(|k| {
             own.place[k] + (share * (dx * across[k] + dy * down[k])) as f32
         });
-        WarpedPixel::new(reference, place, own.visibility, pixel(x, first_row + y))
-    };
-    warped.iter().enumerate().map(moved).collect()
+        WarpedPixel::new(reference, place, own.visibility, self.pixel(x, self.first_row + y))
+    }
 }
 
 /// How far what a reference shows moves in it from one pixel to the next: the shorter of the steps
 /// from the one before and to the one after, for the other may lead over an edge; 0 where neither
 /// is shown.
 fn step(before: Option<&WarpedPixel>, own: &WarpedPixel, after: Option<&WarpedPixel>) -> [f64; 2] {
-    let between = |from: &WarpedPixel, to: &WarpedPixel| {
-        let is_shown = from.confidence > 0.0 && to.confidence > 0.0;
-        is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
-    };
     let steps = [
         after.and_then(|after| between(own, after)),
         before.and_then(|before| between(before, own)),
     ];
     let length = |[x, y]: &[f64; 2]| x.hypot(*y);
     steps.into_iter().flatten().min_by(|a, b| length(a).total_cmp(&length(b))).unwrap_or([0.0; 2])
+}
+
+/// The step from one pixel to another, where both are shown.
+fn between(from: &WarpedPixel, to: &WarpedPixel) -> Option<[f64; 2]> {
+    let is_shown = from.confidence > 0.0 && to.confidence > 0.0;
+    is_shown.then(|| [0, 1].map(|k| f64::from(to.place[k] - from.place[k])))
 }

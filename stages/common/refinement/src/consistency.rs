@@ -34,9 +34,8 @@ impl<'a> LrObservations<'a> {
         let photograph =
             view.read_photograph(self.input).bad_input(format!("photograph {}", camera.name))?;
         let k = &camera.intrinsics;
-        let is_smaller = |p: &Photograph| {
-            p.image.width <= k.width as usize && p.image.height <= k.height as usize
-        };
+        let (width, height) = (k.width as usize, k.height as usize);
+        let is_smaller = |p: &Photograph| p.image.width <= width && p.image.height <= height;
         Ok(photograph.filter(is_smaller).map(|p| p.over(self.views.background.shown())))
     }
 

@@ -35,9 +35,6 @@ impl Square {
 
     /// An image's samples at a place in the square; beyond the border, those at the border.
     pub(crate) fn of(self, image: &Image, column: usize, row: usize) -> &[f32] {
-        let clamped = |start: isize, by: usize, size: usize| {
-            (start + by as isize).clamp(0, size as isize - 1) as usize
-        };
         let (column, row) =
             (clamped(self.x, column, image.width), clamped(self.y, row, image.height));
         let at = row * image.width + column;
@@ -68,6 +65,11 @@ impl Square {
         let shape = [count, height, width, depth].map(|d| d as i64);
         Tensor::f_from_slice(samples)?.f_reshape(shape)?.f_permute([0, 3, 1, 2])
     }
+}
+
+/// So many pixels after `start` along an axis, but not beyond its ends.
+fn clamped(start: isize, by: usize, size: usize) -> usize {
+    (start + by as isize).clamp(0, size as isize - 1) as usize
 }
 
 /// One of the eight ways to lay a square of pixels: turned by right angles, mirrored.

@@ -161,20 +161,21 @@ impl Refiner {
 
     /// What to add to the colours of squares, from the squares grown by [`Refiner::reach`].
     pub(crate) fn forward(&self, input: &Tensor) -> Result<Tensor, TchError> {
-        let layer = |x: &Tensor, i: usize| {
-            let kernel = self.parameters[2 * i].f_permute([0, 3, 1, 2])?;
-            x.f_conv2d(&kernel, Some(&self.parameters[2 * i + 1]), 1, 0, 1, 1)
-        };
-        let mut x = layer(input, 0)?;
+        let mut x = self.layer(input, 0)?;
         for block in 0..self.architecture.blocks as usize {
-            let inner = layer(&x, 1 + 2 * block)?.f_relu()?;
+            let inner = self.layer(&x, 1 + 2 * block)?.f_relu()?;
             let [_, _, height, width] = x.size()[..] else {
                 unreachable!("a convolution's output has four dimensions")
             };
             let middle = x.f_narrow(2, 2, height - 4)?.f_narrow(3, 2, width - 4)?;
-            x = middle.f_add(&layer(&inner, 2 + 2 * block)?)?;
+            x = middle.f_add(&self.layer(&inner, 2 + 2 * block)?)?;
         }
-        layer(&x, 1 + 2 * self.architecture.blocks as usize)
+        self.layer(&x, 1 + 2 * self.architecture.blocks as usize)
+    }
+
+    fn layer(&self, x: &Tensor, i: usize) -> Result<Tensor, TchError> {
+        let kernel = self.parameters[2 * i].f_permute([0, 3, 1, 2])?;
+        x.f_conv2d(&kernel, Some(&self.parameters[2 * i + 1]), 1, 0, 1, 1)
     }
 
     /// The view with `strength` times what the network adds; a reference-based network takes it
@@ -276,13 +277,13 @@ fn kernel_shape(inputs: usize, outputs: usize) -> [i64; 4] {
 
 /// Names and shapes of the parameters.
 fn shapes(architecture: RefinerArchitecture) -> Vec<(String, Vec<i64>)> {
-    let both = |(name, inputs, outputs): (String, usize, usize)| {
+    let shapes = layers(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
         [
             (format!("{name}.kernel"), kernel_shape(inputs, outputs).to_vec()),
             (format!("{name}.bias"), vec![outputs as i64]),
         ]
-    };
-    layers(architecture).into_iter().flat_map(both).collect()
+    });
+    shapes.collect()
 }
 
 #[cfg(test)]

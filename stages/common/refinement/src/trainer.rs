@@ -74,25 +74,30 @@ impl Pool {
         guidance: Guidance,
         examples: &[KnownView],
     ) -> Self {
-        let view = |i: u64| {
-            let mut rng = CounterRng::new(options.seed, POOLS, round * POOL + i);
-            let mut draw = || rng.below(examples.len() as u64) as usize;
-            let (chosen, drawn): (usize, Vec<usize>) =
-                (draw(), (0..options.references).map(|_| draw()).collect());
-            let alone = rng.below(ALONE) == 0;
-            // A view is no reference for itself.
-            let others = drawn
-                .iter()
-                .filter(|other| !alone && **other != chosen)
-                .map(|other| &examples[*other]);
-            (
-                chosen,
-                with_references(&examples[chosen].rendered, &others.collect::<Vec<_>>(), guidance)
-                    .view,
-            )
-        };
+        let view = |i: u64| drawn_view(round * POOL + i, options, guidance, examples);
         Self { round, views: (0..POOL).map(view).collect() }
     }
+}
+
+/// The drawn example of that number, with what drawn references know of it.
+fn drawn_view(
+    number: u64,
+    options: &RefinerTraining,
+    guidance: Guidance,
+    examples: &[KnownView],
+) -> (usize, Image) {
+    let mut rng = CounterRng::new(options.seed, POOLS, number);
+    let mut draw = || rng.below(examples.len() as u64) as usize;
+    let (chosen, drawn): (usize, Vec<usize>) =
+        (draw(), (0..options.references).map(|_| draw()).collect());
+    let alone = rng.below(ALONE) == 0;
+    // A view is no reference for itself.
+    let others: Vec<&KnownView> = drawn
+        .iter()
+        .filter(|other| !alone && **other != chosen)
+        .map(|other| &examples[*other])
+        .collect();
+    (chosen, with_references(&examples[chosen].rendered, &others, guidance).view)
 }
 
 /// Shards of a step: fixed, so that sums have one order at any thread count.
@@ -329,22 +334,12 @@ impl<'a> TrainingSquare<'a> {
     /// The square with that number.
     fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, SQUARES, number);
-        let mut place = || {
-            let subject = subjects[rng.below(subjects.len() as u64) as usize];
-            // On even pixels, as the folds of whole views lie.
-            let mut start = |size: usize| {
-                (rng.below((size.saturating_sub(options.square) / FOLD + 1) as u64) as usize * FOLD)
-                    as isize
-            };
-            let (x, y) = (start(subject.view.width), start(subject.view.height));
-            (subject, Square { x, y, size: (options.square, options.square) })
-        };
-        let mut placed = place();
+        let mut placed = place(subjects, options.square, &mut rng);
         for _ in 0..REDRAWS {
             if contrast(placed.0.truth, placed.1) >= CONTRAST {
                 break;
             }
-            placed = place();
+            placed = place(subjects, options.square, &mut rng);
         }
         let (subject, square) = placed;
         let turn = Turn::ALL[rng.below(Turn::ALL.len() as u64) as usize];
@@ -383,6 +378,18 @@ impl<'a> TrainingSquare<'a> {
             lacks.extend(self.order.map(|c| self.gain * (wanted[c] - seen[c])));
         });
     }
+}
+
+/// A drawn square, of so many pixels along its side, of a drawn view.
+fn place<'a>(subjects: &[Subject<'a>], side: usize, rng: &mut CounterRng) -> (Subject<'a>, Square) {
+    let subject = subjects[rng.below(subjects.len() as u64) as usize];
+    let (x, y) = (start(subject.view.width, side, rng), start(subject.view.height, side, rng));
+    (subject, Square { x, y, size: (side, side) })
+}
+
+/// Where a drawn square begins along an axis: on even pixels, as the folds of whole views lie.
+fn start(size: usize, side: usize, rng: &mut CounterRng) -> isize {
+    (rng.below((size.saturating_sub(side) / FOLD + 1) as u64) as usize * FOLD) as isize
 }
 
 /// Range of the green in a square of the truth.

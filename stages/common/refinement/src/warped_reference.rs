@@ -103,11 +103,11 @@ impl ReferenceFeatures {
             }
             uses.push(of_use);
         }
-        let known = |(sum, lacks, weights, confidence): ([f32; 3], [f32; 3], f32, f32)| {
+        let known = sums.into_iter().map(|(sum, lacks, weights, confidence)| {
             let ([r, g, b], [x, y, z]) = (sum.map(|v| v / weights), lacks.map(|v| v / weights));
             if weights > 0.0 { [r, g, b, confidence, x, y, z] } else { [0.0; KNOWN] }
-        };
-        Self { known: sums.into_iter().map(known).collect(), uses }
+        });
+        Self { known: known.collect(), uses }
     }
 }
 
@@ -124,46 +124,22 @@ fn warp(
     // What is looked at around a pixel was itself moved by what lies around it.
     let around = if guidance.alignment { 2 * AROUND } else { AROUND };
     let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
-    let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
-    let show = |column: usize, row: usize| {
-        let visibility = if guidance.occlusion {
-            surface.visibility(column, row, &theirs)
-        } else {
-            surface.visibility_through(column, row, theirs.camera)
-        };
-        let Some(visibility) = visibility else { return WarpedPixel::default() };
-        let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
-        WarpedPixel::new(
-            reference,
-            visibility.place,
-            well,
-            &rendered.view.data[(row * width + column) * INPUTS..],
-        )
-    };
-    let mut warped: Vec<WarpedPixel> = near
-        .clone()
-        .flat_map(|row| (0..width).map(move |column| (column, row)))
-        .map(|(c, r)| show(c, r))
-        .collect();
+    let mut warped = shown(rendered, reference, near.clone(), guidance.occlusion);
     if guidance.alignment {
         warped = align(&warped, rendered, reference, near.start);
     }
-    let terms = |pixel: &WarpedPixel| {
+    let terms = warped.iter().map(|pixel| {
         let [r, g, b] = pixel.difference.map(f64::from);
         if pixel.confidence > 0.0 { [r, g, b, 1.0] } else { [0.0; 4] }
-    };
-    let sums = Sums::new(width, &warped.iter().map(terms).collect::<Vec<_>>());
-    let mean = |x: usize, y: usize| {
-        let [r, g, b, count] = sums.around(x, y);
-        [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
-    };
+    });
+    let sums = Sums::new(width, &terms.collect::<Vec<_>>());
     let mut all = Vec::with_capacity(width * rows.len());
     let neighbours = Neighbours { warped: &warped, width };
     for y in rows.start - near.start..rows.end - near.start {
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
-                let apart = mean(x, y) / DIFFERENT;
+                let apart = mean_difference(&sums, x, y) / DIFFERENT;
                 let jumped = neighbours.jumped(x, y);
                 own.confidence *= (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (JUMP * JUMP));
             }
@@ -171,6 +147,39 @@ fn warp(
         }
     }
     all
+}
+
+/// What a reference shows of rows where geometry puts them.
+fn shown(
+    rendered: &Rendered,
+    reference: &KnownView,
+    rows: Range<usize>,
+    occlusion: bool,
+) -> Vec<WarpedPixel> {
+    let width = rendered.view.width;
+    let (surface, theirs) = (rendered.surface(), reference.rendered.surface());
+    let mut shown = Vec::with_capacity(width * rows.len());
+    for (column, row) in rows.flat_map(|row| (0..width).map(move |column| (column, row))) {
+        let visibility = if occlusion {
+            surface.visibility(column, row, &theirs)
+        } else {
+            surface.visibility_through(column, row, theirs.camera)
+        };
+        let Some(visibility) = visibility else {
+            shown.push(WarpedPixel::default());
+            continue;
+        };
+        let well = visibility.cosine.max(0.0) * visibility.detail.min(1.0);
+        let pixel = &rendered.view.data[(row * width + column) * INPUTS..];
+        shown.push(WarpedPixel::new(reference, visibility.place, well, pixel));
+    }
+    shown
+}
+
+/// How large the mean difference around a pixel is.
+fn mean_difference(sums: &Sums<4>, x: usize, y: usize) -> f32 {
+    let [r, g, b, count] = sums.around(x, y);
+    [r, g, b].map(|sum| (sum / count.max(1.0)).powi(2)).iter().sum::<f64>().sqrt() as f32
 }
 
 /// Where neighbouring pixels were found in a reference.
@@ -190,13 +199,16 @@ impl Neighbours<'_> {
     /// above and below.
     fn jumped(&self, x: usize, y: usize) -> f32 {
         let own = self.warped[y * self.width + x].place;
-        let apart = |a: Option<[f32; 2]>, b: Option<[f32; 2]>| {
-            let (Some(a), Some(b)) = (a, b) else { return 0.0 };
-            (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
-        };
-        apart(self.place(x, y, -1, 0), self.place(x, y, 1, 0))
-            + apart(self.place(x, y, 0, -1), self.place(x, y, 0, 1))
+        apart(own, self.place(x, y, -1, 0), self.place(x, y, 1, 0))
+            + apart(own, self.place(x, y, 0, -1), self.place(x, y, 0, 1))
     }
+}
+
+/// How far the steps to a place from a neighbour and on to another are from equal, squared; 0 where
+/// one of those isn't there.
+fn apart(own: [f32; 2], a: Option<[f32; 2]>, b: Option<[f32; 2]>) -> f32 {
+    let (Some(a), Some(b)) = (a, b) else { return 0.0 };
+    (0..2).map(|i| (a[i] + b[i] - 2.0 * own[i]).powi(2)).sum::<f32>()
 }
 
 /// A view with what references know of it, as a reference-based refiner takes it: with its
@@ -208,24 +220,33 @@ pub fn with_references(
 ) -> ConditionedView {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
-    let band = |(i, out): (usize, &mut [f32])| {
-        let rows = i * BAND..(i * BAND + BAND).min(height);
-        let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
-        let pixels = rendered.view.data[rows.start * width * INPUTS..]
-            .chunks_exact(INPUTS)
-            .zip(&features.known);
-        for (out, (pixel, known)) in out.chunks_exact_mut(REFERENCE_INPUTS).zip(pixels) {
-            out[..INPUTS].copy_from_slice(pixel);
-            out[INPUTS..].copy_from_slice(known);
-        }
-        features.uses
-    };
+    let bands = data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate();
     let uses: Vec<Vec<Use>> =
-        data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate().map(band).collect();
+        bands.map(|(i, out)| condition(out, i * BAND, rendered, references, guidance)).collect();
     let mut sums = vec![Use::default(); references.len()];
     uses.iter()
         .for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
     ConditionedView { view: Image::new(width, height, REFERENCE_INPUTS, data), uses: sums }
+}
+
+/// Fills a band of a conditioned view from its first row on; what references were of use for.
+fn condition(
+    out: &mut [f32],
+    first: usize,
+    rendered: &Rendered,
+    references: &[&KnownView],
+    guidance: Guidance,
+) -> Vec<Use> {
+    let Image { width, height, .. } = rendered.view;
+    let rows = first..(first + BAND).min(height);
+    let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
+    let pixels =
+        rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&features.known);
+    for (out, (pixel, known)) in out.chunks_exact_mut(REFERENCE_INPUTS).zip(pixels) {
+        out[..INPUTS].copy_from_slice(pixel);
+        out[INPUTS..].copy_from_slice(known);
+    }
+    features.uses
 }
 
 /// Rows of a view that are looked at together: memory is bounded, whatever its size.

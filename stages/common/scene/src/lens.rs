@@ -100,12 +100,13 @@ impl Distortion {
     fn can_undo(&self, seen: [f64; 2]) -> bool {
         let at = self.undistort(seen);
         let [u, v] = self.distort(at);
-        let in_order = |i: u32| {
-            let share = f64::from(i) / 16.0;
-            let [a, b, c] = self.slope([share * at[0], share * at[1]]);
-            a > 0.0 && a * c > b * b
-        };
-        (u - seen[0]).abs().max((v - seen[1]).abs()) < EXACT && (0..=16).all(in_order)
+        let is_found = (u - seen[0]).abs().max((v - seen[1]).abs()) < EXACT;
+        is_found
+            && (0..=16u32).all(|i| {
+                let share = f64::from(i) / 16.0;
+                let [a, b, c] = self.slope([share * at[0], share * at[1]]);
+                a > 0.0 && a * c > b * b
+            })
     }
 }
 
@@ -160,12 +161,9 @@ impl Intrinsics {
     /// Where in this camera's image what another, at the same place, sees at a position.
     pub fn source(&self, other: &Self, at: [f64; 2]) -> [f64; 2] {
         let [x, y] = other.undistort(at);
-        let along = |v: f64, from: f64, focal: f64, to: f64, to_focal: f64| {
-            to_focal.mul_add((v - from) / focal, to)
-        };
         self.distort([
-            along(x, other.cx, other.fx, self.cx, self.fx),
-            along(y, other.cy, other.fy, self.cy, self.fy),
+            self.fx.mul_add((x - other.cx) / other.fx, self.cx),
+            self.fy.mul_add((y - other.cy) / other.fy, self.cy),
         ])
     }
 
@@ -193,28 +191,32 @@ impl Intrinsics {
 
     /// Whether the whole border of a pinhole image lies inside this camera's, and in order.
     fn sees_all_of(&self, pinhole: &Self) -> bool {
-        let (width, height) = (f64::from(self.width), f64::from(self.height));
-        let inside = |[x, y]: [f64; 2]| {
-            let slack = 1e-6;
-            (-slack..=width + slack).contains(&x) && (-slack..=height + slack).contains(&y)
-        };
-        let in_order = |[x, y]: [f64; 2]| {
-            // From the principal point outwards, what is seen must move outwards, too.
-            let mut last = -1.0;
-            (0..=16).all(|i| {
-                let share = f64::from(i) / 16.0;
-                let at = |from: f64, to: f64| share.mul_add(to - from, from);
-                let [u, v] = self.source(pinhole, [at(pinhole.cx, x), at(pinhole.cy, y)]);
-                let radius = (u - self.cx).hypot(v - self.cy);
-                let grows = radius > last;
-                last = radius;
-                grows
-            })
-        };
         // Of a bent image's border, as many places as of its own.
         Self { distortion: self.distortion, ..*pinhole }
             .border()
-            .all(|at| inside(self.source(pinhole, at)) && in_order(at))
+            .all(|at| self.holds(self.source(pinhole, at)) && self.keeps_order(pinhole, at))
+    }
+
+    /// Whether a position lies in the image, or beside it by no more than a rounding error.
+    fn holds(&self, [x, y]: [f64; 2]) -> bool {
+        let (width, height) = (f64::from(self.width), f64::from(self.height));
+        let slack = 1e-6;
+        (-slack..=width + slack).contains(&x) && (-slack..=height + slack).contains(&y)
+    }
+
+    /// Whether on the way from a pinhole's principal point out to a position, what is seen moves
+    /// outwards, too.
+    fn keeps_order(&self, pinhole: &Self, [x, y]: [f64; 2]) -> bool {
+        let mut last = -1.0;
+        (0..=16).all(|i| {
+            let share = f64::from(i) / 16.0;
+            let at = |from: f64, to: f64| share.mul_add(to - from, from);
+            let [u, v] = self.source(pinhole, [at(pinhole.cx, x), at(pinhole.cy, y)]);
+            let radius = (u - self.cx).hypot(v - self.cy);
+            let grows = radius > last;
+            last = radius;
+            grows
+        })
     }
 }
 

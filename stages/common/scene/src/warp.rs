@@ -98,17 +98,10 @@ impl Surface<'_> {
     fn shows(&self, point: DVec3, [x, y]: [f64; 2], (other, place): (&Camera, [f64; 2])) -> bool {
         let (width, height) =
             (self.camera.intrinsics.width as usize, self.camera.intrinsics.height as usize);
-        let around = |v: f64, size: usize| {
-            let low = (v - 0.5).floor().max(0.0) as usize;
-            [low.min(size - 1), (low + 1).min(size - 1)]
-        };
         let way = point - self.camera.centre();
         let depth = way.dot(self.camera.forward());
-        let is_there = |own: f64| {
-            let seen = || other.project(self.camera.centre() + way * (own / depth));
-            (own - depth).abs() <= SAME * depth
-                || seen().is_some_and(|(u, v, _)| (u - place[0]).hypot(v - place[1]) <= SAME_PLACE)
-        };
+        let moved = |own: f64| self.camera.centre() + way * (own / depth);
+        let is_there = |own: f64| is_near(own, depth) || sees_at(other, moved(own), place);
         around(y, height).into_iter().any(|row| {
             around(x, width).into_iter().any(|column| {
                 let i = row * width + column;
@@ -116,6 +109,20 @@ impl Surface<'_> {
             })
         })
     }
+}
+
+/// The pixels to either side of a position along one axis.
+fn around(v: f64, size: usize) -> [usize; 2] {
+    let low = (v - 0.5).floor().max(0.0) as usize;
+    [low.min(size - 1), (low + 1).min(size - 1)]
+}
+
+fn is_near(own: f64, depth: f64) -> bool {
+    (own - depth).abs() <= SAME * depth
+}
+
+fn sees_at(camera: &Camera, point: DVec3, [x, y]: [f64; 2]) -> bool {
+    camera.project(point).is_some_and(|(u, v, _)| (u - x).hypot(v - y) <= SAME_PLACE)
 }
 
 #[cfg(test)]

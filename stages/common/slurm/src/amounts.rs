@@ -39,15 +39,18 @@ impl FromStr for Memory {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let problem = || {
-            format!("{text:?} is no amount of memory; write a number with M, G or T, such as 8G")
-        };
+        let problem = || no_memory(text);
         let (count, last) = split_unit(text).ok_or_else(problem)?;
         let unit = MEMORY_UNITS.iter().find(|(unit, _)| *unit == last).ok_or_else(problem)?.1;
         let mib = count.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
         // Slurm takes 0 as all there is.
         mib.filter(|&mib| mib > 0).map(|mib| Self { mib }).ok_or_else(problem)
     }
+}
+
+/// What is wrong with a text that is no amount of memory.
+fn no_memory(text: &str) -> String {
+    format!("{text:?} is no amount of memory; write a number with M, G or T, such as 8G")
 }
 
 impl FromStr for Period {

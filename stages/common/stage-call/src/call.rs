@@ -54,7 +54,7 @@ pub struct Call<'a> {
     pub output: &'a Path,
     /// `--work`; none for a sink.
     pub work: Option<&'a Path>,
-    /// `--from-checkpoint`: the output is what the checkpoint in `work` has learnt.
+    /// `--from-checkpoint`: the stage writes its output from the latest checkpoint in `work`.
     pub from_checkpoint: bool,
     /// `--device`.
     pub device: &'a str,
@@ -75,7 +75,8 @@ pub struct StageFailure {
 }
 
 impl StageFailure {
-    fn at(path: &Path, error: &std::io::Error) -> Self {
+    /// A file that can't be read or written.
+    pub fn at(path: &Path, error: &std::io::Error) -> Self {
         Self { code: 1, message: format!("{}: {error}", path.display()) }
     }
 }

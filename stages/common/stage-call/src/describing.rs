@@ -27,24 +27,16 @@ pub type Answers = BTreeMap<PathBuf, Result<Description, String>>;
 
 /// Asks programs, as many at once as there are cores.
 pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
-    let is_stopped = || stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
+    let is_stopped = &|| stop.is_some_and(|stop| stop.load(Ordering::Relaxed));
     let threads =
         std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(paths.len());
-    let next = AtomicUsize::new(0);
+    let next = &AtomicUsize::new(0);
     let (sender, receiver) = mpsc::channel();
-    let work = |sender: mpsc::Sender<(PathBuf, Result<Description, String>)>| {
-        while let Some(path) =
-            paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped())
-        {
-            // The receiver lives as long as the scope.
-            sender.send((path.clone(), ask(path, LONGEST, &is_stopped))).ok();
-        }
-    };
     let mut answers = Answers::new();
     std::thread::scope(|scope| {
         for _ in 0..threads {
             let sender = sender.clone();
-            scope.spawn(|| work(sender));
+            scope.spawn(move || ask_in_turn(paths, next, is_stopped, &sender));
         }
         drop(sender);
         let mut patience = SILENCE;
@@ -60,6 +52,20 @@ pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, 
         }
     });
     if is_stopped() { Err(Interrupted) } else { Ok(answers) }
+}
+
+/// Asks one program after the other, until all are asked or the asking is stopped.
+fn ask_in_turn(
+    paths: &[PathBuf],
+    next: &AtomicUsize,
+    is_stopped: &dyn Fn() -> bool,
+    sender: &mpsc::Sender<(PathBuf, Result<Description, String>)>,
+) {
+    while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped())
+    {
+        // The receiver lives as long as the scope.
+        sender.send((path.clone(), ask(path, LONGEST, is_stopped))).ok();
+    }
 }
 
 /// A program's answer, or what is wrong with it.

@@ -42,8 +42,8 @@ impl Display {
         }
     }
 
-    /// Shows a picture above the bars, where there are bars. `draw` is given the terminal's size,
-    /// columns and rows, and returns lines with escape sequences.
+    /// Shows a picture above the bars; does nothing where stderr isn't a terminal. `draw` takes the
+    /// terminal's columns and rows and returns text with escape sequences.
     pub fn picture(&self, draw: impl FnOnce(u16, u16) -> String) {
         if let Some(bars) = &self.bars {
             let (rows, columns) = console::Term::stderr().size();

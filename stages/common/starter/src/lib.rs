@@ -16,17 +16,15 @@
 //! ```
 
 mod pictures;
-mod targets;
 
 use std::fs;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use artifact::counted;
-use dataset::{Dataset, DatasetError, Format, Frame};
+use dataset::{Dataset, DatasetError, Frame};
 
 use pictures::Pictures;
-use targets::TARGETS;
 
 /// Widest images, in pixels, that keep their size.
 pub const LARGEST: u32 = 800;
@@ -34,6 +32,8 @@ pub const LARGEST: u32 = 800;
 const SCALE: u32 = 2;
 /// Rays of the training.
 const RAYS: u64 = 20_000_000;
+/// The shipped further targets, `pipelines/` of the repository: file names and texts.
+const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
 
 /// A pipeline for a data set, not written yet.
 #[derive(Clone, Debug)]
@@ -143,9 +143,6 @@ impl Starter {
 
 /// The data's folder as a pipeline file in `home` names it: relative where the data lie below.
 fn named(folder: &Path, home: &Path) -> Result<String, StarterError> {
-    let absolute = |path: &Path| {
-        path.canonicalize().map_err(|source| StarterError::Io { file: path.to_path_buf(), source })
-    };
     let (data, home) = (absolute(folder)?, absolute(home)?);
     if home.starts_with(&data) {
         return Err(StarterError::Inside { folder: folder.to_path_buf() });
@@ -160,14 +157,12 @@ fn named(folder: &Path, home: &Path) -> Result<String, StarterError> {
     Ok(if text.chars().all(plain) { text.to_owned() } else { serde_json::json!(text).to_string() })
 }
 
+fn absolute(path: &Path) -> Result<PathBuf, StarterError> {
+    path.canonicalize().map_err(|source| StarterError::Io { file: path.to_path_buf(), source })
+}
+
 /// A data set's form, and number and size of its photographs, in words.
 fn found(set: &Dataset) -> String {
-    let form = match set.format {
-        Format::Blender => "Blender's form (transforms_train.json)",
-        Format::Transforms => "transforms.json (instant-ngp, nerfstudio)",
-        Format::Llff => "LLFF (poses_bounds.npy)",
-        Format::Colmap => "COLMAP (sparse)",
-    };
     let sizes = || set.frames.iter().map(Frame::intrinsics);
     let size = sizes().next().map(|size| format!("{}×{}", size.width, size.height));
     let alike =
@@ -176,7 +171,7 @@ fn found(set: &Dataset) -> String {
         Some(size) if alike => format!(" of {size}"),
         _ => " of several sizes".to_owned(),
     };
-    format!("{form}: {}{of}", counted(set.frames.len(), "photograph"))
+    format!("{}: {}{of}", set.format.title(), counted(set.frames.len(), "photograph"))
 }
 
 fn text(set: &Dataset, found: &str, dataset: &str) -> String {
@@ -206,7 +201,6 @@ fn text(set: &Dataset, found: &str, dataset: &str) -> String {
 /// The parameters that say where LR images come from.
 fn images(set: &Dataset) -> String {
     let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
-    let benchmark = matches!(set.format, Format::Blender | Format::Llff);
     if width > LARGEST {
         let (lr, hr) = (LARGEST / SCALE, LARGEST);
         format!(
@@ -214,7 +208,7 @@ fn images(set: &Dataset) -> String {
             scored, and a CPU is done in minutes\n      \
             # lr_source: photographs # instead of lr_width: trains on the photographs as they are"
         )
-    } else if benchmark {
+    } else if set.format.is_benchmark() {
         "      lr_source: downscaled # LR images are made from these; `photographs` trains on them as \
         they are"
             .to_owned()

@@ -1,4 +1,4 @@
-use dataset::Split;
+use dataset::{Format, Split};
 use scene::Intrinsics;
 
 use super::*;
@@ -55,5 +55,6 @@ fn no_target_is_missing() {
         .map(|entry| entry.unwrap().file_name().into_string().unwrap())
         .collect();
     names.sort();
-    assert_eq!(names, TARGETS.map(|(name, _)| name));
+    let targets: Vec<&str> = TARGETS.iter().map(|(name, _)| *name).collect();
+    assert_eq!(names, targets);
 }

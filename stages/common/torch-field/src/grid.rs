@@ -7,7 +7,7 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
-use crate::mlp::host;
+use crate::mlp::{host, matrix};
 use crate::ray_maps::{RayMaps, fused};
 
 /// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same
@@ -36,6 +36,16 @@ pub(crate) struct TorchLevel {
     pub(crate) first: i64,
     pub(crate) entries: i64,
     hashed: bool,
+}
+
+impl TorchLevel {
+    /// Fraction of a cell and the cell of positions in the unit cube (n × 3) along an axis: n each.
+    fn along(&self, positions: &Tensor, axis: usize) -> Result<(Tensor, Tensor), TchError> {
+        let cells = self.resolution[axis] as f64;
+        let at = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
+        let cell = at.f_floor()?.f_clamp_max(cells - 1.0)?;
+        Ok((at.f_sub(&cell)?, cell.f_to_kind(Kind::Int64)?))
+    }
 }
 
 /// Samples of n rays, of at most `count` steps each.
@@ -76,19 +86,20 @@ pub(crate) struct GridSeen {
 
 fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
     let (coarsest, finest) = (f64::from(architecture.coarsest), f64::from(architecture.finest));
-    let ratio = (finest / coarsest).powf(1.0 / f64::from(architecture.levels.max(2) - 1));
+    let ratio = libm::pow(finest / coarsest, 1.0 / f64::from(architecture.levels.max(2) - 1));
+    let mut levels = Vec::with_capacity(architecture.levels as usize);
     let mut first = 0;
-    let level = |i: u32| {
+    for i in 0..architecture.levels {
         let cells = (coarsest * ratio.powi(i as i32)).round() as i64;
         let resolution = [cells, cells, cells.min(i64::from(architecture.finest_z))];
         let bricks = resolution.map(|n| n / 2 + 1);
         let vertices = bricks.iter().product::<i64>() * BRICK as i64;
         let hashed = vertices > 1 << architecture.log2_entries;
         let entries = if hashed { 1 << architecture.log2_entries } else { vertices };
+        levels.push(TorchLevel { resolution, bricks, first, entries, hashed });
         first += entries;
-        TorchLevel { resolution, bricks, first: first - entries, entries, hashed }
-    };
-    (0..architecture.levels).map(level).collect()
+    }
+    levels
 }
 
 /// Outputs of the density network.
@@ -131,23 +142,38 @@ fn harmonics(direction: &Tensor) -> Result<Tensor, TchError> {
     )
 }
 
+/// Numbers as a matrix on a device, which takes gradients.
+fn learnable(numbers: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
+    Ok(matrix(numbers, shape, device)?.set_requires_grad(true))
+}
+
+/// Optical depths up to the ends of steps, and the steps' transmittances and weights (rays × count
+/// each), where the samples `kept` have the optical depths `density`.
+fn optical(
+    density: &Tensor,
+    kept: &Tensor,
+    rays: i64,
+    count: i64,
+) -> Result<[Tensor; 3], TchError> {
+    let nothing = Tensor::f_zeros([rays * count], (Kind::Float, density.device()))?;
+    let tau = nothing.f_index_put(&[Some(kept)], density, false)?.f_reshape([rays, count])?;
+    let through = tau.f_cumsum(1, None::<Kind>)?;
+    let transmittance = through.f_sub(&tau)?.f_neg()?.f_exp()?;
+    let weights = transmittance.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
+    Ok([through, transmittance, weights])
+}
+
 impl TorchGrid {
     /// A field's numbers on a device.
     pub fn new(field: &Field, device: Device) -> Result<Self, TorchFieldError> {
         let (grid, network, occupancy) = field.parts();
         let levels = levels(&field.architecture);
         let entries: i64 = levels.iter().map(|l| l.entries).sum();
-        let own = |numbers: &[f32], shape: [i64; 2]| -> Result<Tensor, TchError> {
-            Ok(Tensor::f_from_slice(numbers)?
-                .f_reshape(shape)?
-                .f_to_device(device)?
-                .set_requires_grad(true))
-        };
         let mut first = 0;
         let mut layers = Vec::with_capacity(5);
         for (inputs, outputs) in layer_shapes(&field.architecture) {
             let numbers = (inputs * outputs) as usize;
-            layers.push(own(&network[first..first + numbers], [inputs, outputs])?);
+            layers.push(learnable(&network[first..first + numbers], [inputs, outputs], device)?);
             first += numbers;
         }
         let mut made = Self {
@@ -155,7 +181,7 @@ impl TorchGrid {
             bounds: field.bounds,
             device,
             levels,
-            table: own(grid, [entries, FEATURES as i64])?,
+            table: learnable(grid, [entries, FEATURES as i64], device)?,
             layers: layers.try_into().expect("five layers"),
             cells: Tensor::new(),
         };
@@ -196,13 +222,7 @@ impl TorchGrid {
         let mut features = Vec::with_capacity(self.levels.len());
         let positions = positions.f_clamp(0.0, 1.0)?;
         for level in &self.levels {
-            // Fraction of a cell and the cell, axis by axis.
-            let along = |axis: usize| -> Result<(Tensor, Tensor), TchError> {
-                let cells = level.resolution[axis] as f64;
-                let at = positions.i((.., axis as i64)).f_mul_scalar(cells)?;
-                let cell = at.f_floor()?.f_clamp_max(cells - 1.0)?;
-                Ok((at.f_sub(&cell)?, cell.f_to_kind(Kind::Int64)?))
-            };
+            let along = |axis: usize| level.along(&positions, axis);
             let axes = [along(0)?, along(1)?, along(2)?];
             let mut sum: Option<Tensor> = None;
             for corner in 0..8i64 {
@@ -266,14 +286,7 @@ impl TorchGrid {
         let outputs = self.outputs(&positions)?;
         let density =
             outputs.i((.., 0)).f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?.f_mul(&length)?;
-        let optical = |density: &Tensor| -> Result<[Tensor; 3], TchError> {
-            let nothing = Tensor::f_zeros([n * count], (Kind::Float, self.device))?;
-            let tau = nothing.f_index_put(&[Some(&kept)], density, false)?.f_reshape([n, count])?;
-            let through = tau.f_cumsum(1, None::<Kind>)?;
-            let transmittance = through.f_sub(&tau)?.f_neg()?.f_exp()?;
-            let weights = transmittance.f_mul(&tau.f_neg()?.f_expm1()?.f_neg()?)?;
-            Ok([through, transmittance, weights])
-        };
+        let optical = |density: &Tensor| optical(density, &kept, n, count);
         // What counts is found first; the rest gets no gradient.
         let counted = no_grad(|| -> Result<Tensor, TchError> {
             let [_, transmittance, weights] = optical(&density)?;
@@ -402,7 +415,7 @@ impl TorchGrid {
             (host(&seen.premultiplied)?, host(&seen.transmittance)?);
         let (hits, leave) =
             (host(&seen.maps.hits()?)?, host(&seen.maps.distances(&seen.maps.leave)?)?);
-        let pixel = |(i, ray): (usize, &Ray)| {
+        let pixels = rays.iter().enumerate().map(|(i, ray)| {
             let own: [f32; 3] = std::array::from_fn(|c| premultiplied[3 * i + c]);
             let far = if hits[i] > 0.0 { leave[i] } else { self.bounds.far as f32 };
             Pixel {
@@ -414,8 +427,8 @@ impl TorchGrid {
                 depth: if weight[i] > 1e-4 { distance[i] / weight[i] } else { far },
                 median_depth: if is_half[i] > 0.0 { median[i] } else { far },
             }
-        };
-        Ok(rays.iter().enumerate().map(pixel).collect())
+        });
+        Ok(pixels.collect())
     }
 }
 

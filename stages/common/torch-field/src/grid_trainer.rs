@@ -1,14 +1,13 @@
 use std::ops::Range;
 use std::path::Path;
 
-use radiance::{
-    Field, LIKE_BACKGROUND, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions,
-};
-use tch::{Device, Kind, TchError, Tensor, no_grad};
+use radiance::{Field, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
+use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
-use crate::grid::{GridSeen, TorchGrid};
+use crate::grid::TorchGrid;
 use crate::mlp::host;
+use crate::regularisers::add_regularisers;
 use crate::step::Step;
 
 /// Trains a [`radiance::Field`] as [`radiance::Trainer`] does, by libtorch's operations and
@@ -50,13 +49,7 @@ impl GridTrainer {
         device: Device,
     ) -> Result<Self, TorchFieldError> {
         let grid = TorchGrid::new(field, device)?;
-        let zeros = || {
-            grid.parameters()
-                .iter()
-                .map(|p| p.f_detach()?.f_zeros_like())
-                .collect::<Result<Vec<_>, TchError>>()
-        };
-        let (first, second) = (zeros()?, zeros()?);
+        let (first, second) = (zeros(&grid.parameters())?, zeros(&grid.parameters())?);
         Ok(Self {
             occupancy: field.parts().2.clone(),
             samples_per_ray: field.architecture.full_ray(),
@@ -157,15 +150,14 @@ impl GridTrainer {
         let colour =
             seen.transmittance.f_unsqueeze(-1)?.f_mul(&backgrounds)?.f_add(&seen.premultiplied)?;
         let judged = step.loss_and_gradient(supervision, &range, &colour)?;
-        let mut towards = judged.towards;
-        if self.options.distortion > 0.0 {
-            let share = f64::from(self.options.distortion) / (step.bundles * step.bundle) as f64;
-            towards = towards.f_add(&distortion(&seen, self.grid.step())?.f_mul_scalar(share)?)?;
-        }
-        if self.options.floater_loss > 0.0 {
-            let share = f64::from(self.options.floater_loss) / (step.bundles * step.bundle) as f64;
-            towards = towards.f_add(&floater_loss(&seen, &backgrounds)?.f_mul_scalar(share)?)?;
-        }
+        let towards = add_regularisers(
+            judged.towards,
+            &self.options.regularisers,
+            &seen,
+            &backgrounds,
+            self.grid.step(),
+            step.bundles * step.bundle,
+        )?;
         let gradients = if towards.requires_grad() {
             Tensor::f_run_backward(&[towards], &self.grid.parameters(), false, false)?
         } else {
@@ -245,10 +237,6 @@ impl GridTrainer {
 
     /// Writes all that a resumed training needs. The caller makes it atomic.
     pub fn write_checkpoint(&self, path: &Path) -> Result<(), TorchFieldError> {
-        let named = |kind: &'static str, tensors: &[Tensor]| {
-            let name = move |(i, t): (usize, &Tensor)| (format!("{kind}.{i}"), t.shallow_clone());
-            tensors.iter().enumerate().map(name).collect::<Vec<_>>()
-        };
         let mut all = named("parameter", &self.grid.parameters());
         all.extend(named("first", &self.first));
         all.extend(named("second", &self.second));
@@ -274,14 +262,7 @@ impl GridTrainer {
         let weights = nets::Weights::read(path)?;
         let [tally @ .., samples_per_ray] = counts(&weights)?;
         let now = self.grid.parameters();
-        let read = |kind: &str| -> Result<Vec<Tensor>, TorchFieldError> {
-            let one = |(i, like): (usize, &Tensor)| {
-                Ok(weights
-                    .tensor(&format!("{kind}.{i}"), &like.size())?
-                    .f_to_device(self.grid.device)?)
-            };
-            now.iter().enumerate().map(one).collect()
-        };
+        let read = |kind: &str| read(&weights, kind, &now, self.grid.device);
         let (parameters, first, second) = (read("parameter")?, read("first")?, read("second")?);
         let average = weights.has("average.0").then(|| read("average")).transpose()?;
         let cells = self.occupancy.density().len() as i64;
@@ -306,9 +287,35 @@ const DENSITY: &str = "density";
 const OCCUPIED: &str = "occupied";
 const COUNTS: &str = "counts";
 
+/// Tensors by the names `KIND.0`, `KIND.1` and so on.
+fn named(kind: &str, tensors: &[Tensor]) -> Vec<(String, Tensor)> {
+    let name = |(i, t): (usize, &Tensor)| (format!("{kind}.{i}"), t.shallow_clone());
+    tensors.iter().enumerate().map(name).collect()
+}
+
+/// The tensors that [`named`] named, of the shapes of given ones.
+fn read(
+    weights: &nets::Weights,
+    kind: &str,
+    like: &[Tensor],
+    device: Device,
+) -> Result<Vec<Tensor>, TorchFieldError> {
+    let mut tensors = Vec::with_capacity(like.len());
+    for (i, like) in like.iter().enumerate() {
+        let tensor = weights.tensor(&format!("{kind}.{i}"), &like.size())?;
+        tensors.push(tensor.f_to_device(device)?);
+    }
+    Ok(tensors)
+}
+
 fn counts(weights: &nets::Weights) -> Result<[u64; 6], nets::WeightsError> {
     let counts = weights.integers(COUNTS, 6)?;
     Ok(std::array::from_fn(|i| counts[i] as u64))
+}
+
+/// Moments of parameters that haven't been trained.
+fn zeros(parameters: &[Tensor]) -> Result<Vec<Tensor>, TchError> {
+    parameters.iter().map(|p| p.f_detach()?.f_zeros_like()).collect()
 }
 
 /// One lazy Adam step: what has no gradient keeps its value and its moments.
@@ -333,35 +340,6 @@ fn lazy_adam(
     first.f_copy_(&kept)?;
     let kept = second1.f_where_self(&touched, &second)?;
     second.f_copy_(&kept)
-}
-
-/// The distortion loss (Barron et al. 2022, "Mip-NeRF 360", eq. 15), summed over all rays: Σ_ij
-/// w_i·w_j·|t_i - t_j| + ⅓·step·Σ_i w_i².
-fn distortion(seen: &GridSeen, step: f64) -> Result<Tensor, TchError> {
-    let weights = seen.weights.f_mul(&seen.counted)?;
-    let moments = weights.f_mul(&seen.t)?;
-    let before = |of: &Tensor| of.f_cumsum(1, None::<Kind>)?.f_sub(of);
-    let apart = seen.t.f_mul(&before(&weights)?)?.f_sub(&before(&moments)?)?;
-    let pairs = weights.f_mul(&apart)?.f_mul_scalar(2.0)?;
-    pairs.f_add(&weights.f_square()?.f_mul_scalar(step / 3.0)?)?.f_sum(None::<Kind>)
-}
-
-/// The floater loss, summed over all rays: T·Σ_i w_i·(1 - |c_i - b|² / reach²)₊, with no gradient
-/// by the colours or the transmittance T.
-fn floater_loss(seen: &GridSeen, backgrounds: &Tensor) -> Result<Tensor, TchError> {
-    let behind = backgrounds.f_index_select(0, &seen.shaded_ray)?;
-    let squared = seen.shaded_colour.f_detach()?.f_sub(&behind)?.f_square()?.f_sum_dim_intlist(
-        [1i64].as_slice(),
-        true,
-        None::<Kind>,
-    )?;
-    let likeness = squared
-        .f_mul_scalar(-1.0 / f64::from(LIKE_BACKGROUND).powi(2))?
-        .f_add_scalar(1.0)?
-        .f_relu()?;
-    let through =
-        seen.transmittance.f_detach()?.f_index_select(0, &seen.shaded_ray)?.f_unsqueeze(-1)?;
-    seen.shaded_weight.f_mul(&likeness)?.f_mul(&through)?.f_sum(None::<Kind>)
 }
 
 #[cfg(test)]
@@ -430,8 +408,7 @@ mod tests {
             learning_rate_decay: 0.25,
             warm_up: 5,
             ema_decay: 0.9,
-            distortion: 0.02,
-            floater_loss: 0.01,
+            regularisers: crate::regularisers::ALL,
             network_decay: 1e-4,
             roulette: 0.0,
             seed: 9,

@@ -35,6 +35,7 @@ mod mlp;
 mod mlp_trainer;
 mod network;
 mod ray_maps;
+mod regularisers;
 mod sampling;
 mod schedule;
 mod step;

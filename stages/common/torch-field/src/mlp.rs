@@ -1,3 +1,4 @@
+use std::ops::Range;
 use std::path::Path;
 
 use counter_rng::CounterRng;
@@ -72,19 +73,10 @@ impl SampleDraws {
     ) -> Result<Self, TchError> {
         let (coarse, fine) =
             (field.architecture.coarse_samples as usize, field.architecture.fine_samples as usize);
-        let rows = |purpose: u64, width: usize, draw: &dyn Fn(&mut CounterRng) -> f32| {
-            let row = |ray: u64| {
-                let mut rng = CounterRng::new(seed, purpose, ray);
-                (0..width).map(|_| draw(&mut rng)).collect::<Vec<_>>()
-            };
-            let values: Vec<f32> = (first..first + n as u64).flat_map(row).collect();
-            Tensor::f_from_slice(&values)?
-                .f_reshape([n as i64, width as i64])?
-                .f_to_device(field.device)
-        };
+        let (rays, device) = (first..first + n as u64, field.device);
         let scaled = |rng: &mut CounterRng| (noise * normal(rng)) as f32;
         let noise = if noise > 0.0 {
-            let all = rows(NOISE, 2 * coarse + fine, &scaled)?;
+            let all = rows(seed, NOISE, rays.clone(), 2 * coarse + fine, device, scaled)?;
             Some([
                 all.f_narrow(1, 0, coarse as i64)?,
                 all.f_narrow(1, coarse as i64, (coarse + fine) as i64)?,
@@ -93,11 +85,29 @@ impl SampleDraws {
             None
         };
         Ok(Self {
-            coarse: rows(STRATIFIED, coarse, &CounterRng::uniform)?,
-            fine: rows(IMPORTANCE, fine, &CounterRng::uniform)?,
+            coarse: rows(seed, STRATIFIED, rays.clone(), coarse, device, CounterRng::uniform)?,
+            fine: rows(seed, IMPORTANCE, rays, fine, device, CounterRng::uniform)?,
             noise,
         })
     }
+}
+
+/// A row of so many draws for each of the rays, which has numbers of its own for every purpose.
+fn rows(
+    seed: u64,
+    purpose: u64,
+    rays: Range<u64>,
+    width: usize,
+    device: Device,
+    draw: impl Fn(&mut CounterRng) -> f32,
+) -> Result<Tensor, TchError> {
+    let n = rays.end - rays.start;
+    let mut values = Vec::with_capacity(n as usize * width);
+    for ray in rays {
+        let mut rng = CounterRng::new(seed, purpose, ray);
+        values.extend((0..width).map(|_| draw(&mut rng)));
+    }
+    matrix(&values, [n as i64, width as i64], device)
 }
 
 impl Batch {
@@ -105,14 +115,10 @@ impl Batch {
     pub(crate) fn new(rays: &[Ray], field: &Mlp) -> Result<Self, TchError> {
         let Mlp { bounds, device, architecture: MlpArchitecture { ndc_directions, .. }, .. } =
             *field;
-        let rows = |of: &dyn Fn(&Ray) -> [f32; 3]| {
-            let values: Vec<f32> = rays.iter().flat_map(of).collect();
-            Tensor::f_from_slice(&values)?.f_reshape([rays.len() as i64, 3])?.f_to_device(device)
-        };
         Ok(Self {
-            origin: rows(&|r| r.origin)?,
-            direction: rows(&|r| r.direction)?,
-            background: rows(&|r| r.background)?,
+            origin: columns(rays, device, |r| r.origin)?,
+            direction: columns(rays, device, |r| r.direction)?,
+            background: columns(rays, device, |r| r.background)?,
             maps: (bounds.space != Space::Box)
                 .then(|| RayMaps::new(&bounds, rays, device, ndc_directions))
                 .transpose()?,
@@ -145,23 +151,7 @@ impl Mlp {
             reason: error.to_string(),
         })?;
         let weights = nets::Weights::read(path)?;
-        let network = |prefix: &str| -> Result<MlpNetwork, TorchFieldError> {
-            let read = MlpNetwork::read(architecture, |name, shape| {
-                Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?)
-            })?;
-            let finite = |t: &Tensor| -> Result<bool, TchError> {
-                Ok(t.f_isfinite()?.f_all()?.f_int64_value(&[])? != 0)
-            };
-            for (parameter, (name, _)) in
-                read.parameters.iter().zip(MlpNetwork::names(&architecture))
-            {
-                if !finite(parameter)? {
-                    let reason = format!("tensor {prefix}.{name} is not finite");
-                    return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
-                }
-            }
-            Ok(read.to(device, Kind::Float)?)
-        };
+        let network = |prefix| read_network(&weights, prefix, path, architecture, device);
         Ok(Self {
             architecture,
             bounds,
@@ -180,14 +170,12 @@ impl Mlp {
 
     /// All parameters by name.
     pub(crate) fn named(&self) -> Vec<(String, Tensor)> {
-        let names = || MlpNetwork::names(&self.architecture).map(|(name, _)| name);
-        let named = |prefix: &'static str, network: &MlpNetwork| {
-            names()
-                .zip(network.share().parameters)
-                .map(move |(name, t)| (format!("{prefix}.{name}"), t))
-                .collect::<Vec<_>>()
-        };
-        named("coarse", &self.coarse).into_iter().chain(named("fine", &self.fine)).collect()
+        let mut all = Vec::new();
+        for (prefix, network) in [("coarse", &self.coarse), ("fine", &self.fine)] {
+            let named = MlpNetwork::names(&self.architecture).zip(network.share().parameters);
+            all.extend(named.map(|((name, _), t)| (format!("{prefix}.{name}"), t)));
+        }
+        all
     }
 
     /// Makes every parameter the mean of its own and of another field's of the same architecture.
@@ -303,18 +291,11 @@ impl Mlp {
     }
 
     fn pixels(&self, rays: &[Ray]) -> Result<Vec<Pixel>, TchError> {
-        let usable = |r: &Ray| {
-            r.origin.iter().chain(&r.direction).all(|x| x.is_finite()) && r.direction != [0.0; 3]
-        };
-        let tame: Vec<Ray> = rays
-            .iter()
-            .map(
-                |r| if usable(r) { *r } else { Ray { background: r.background, ..Ray::default() } },
-            )
-            .collect();
+        let tame = |r: &Ray| Ray { background: r.background, ..Ray::default() };
+        let tame: Vec<Ray> = rays.iter().map(|r| if is_usable(r) { *r } else { tame(r) }).collect();
         let batch = Batch::new(&tame, self)?;
         let hits = batch.maps.as_ref().map(|c| host(&c.hits()?)).transpose()?;
-        let usable = |i: usize, ray: &Ray| usable(ray) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
+        let usable = |i: usize, r: &Ray| is_usable(r) && hits.as_ref().is_none_or(|h| h[i] > 0.0);
         let [colour, premultiplied, weights, t] =
             no_grad(|| -> Result<[Vec<f32>; 4], TchError> {
                 let seen = self.see(&batch, None)?;
@@ -327,7 +308,7 @@ impl Mlp {
             })?;
         let samples = weights.len() / rays.len().max(1);
         let far = self.bounds.far as f32;
-        let pixel = |(i, ray): (usize, &Ray)| {
+        let pixels = rays.iter().enumerate().map(|(i, ray)| {
             if !usable(i, ray) {
                 return Pixel {
                     colour: ray.background,
@@ -352,8 +333,8 @@ impl Mlp {
                 depth: if opacity > 1e-4 { distance / opacity } else { far },
                 median_depth: median.map_or(far, |(_, &t)| t),
             }
-        };
-        Ok(rays.iter().enumerate().map(pixel).collect())
+        });
+        Ok(pixels.collect())
     }
 }
 
@@ -361,6 +342,45 @@ impl RayField for Mlp {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         Self::render(self, rays).map_err(|e| RenderError::Backend(e.to_string()))
     }
+}
+
+/// One of the networks of a file, whose numbers must be finite.
+fn read_network(
+    weights: &nets::Weights,
+    prefix: &str,
+    path: &Path,
+    architecture: MlpArchitecture,
+    device: Device,
+) -> Result<MlpNetwork, TorchFieldError> {
+    let read = MlpNetwork::read(architecture, |name, shape| {
+        Ok(weights.tensor(&format!("{prefix}.{name}"), shape)?)
+    })?;
+    for (parameter, (name, _)) in read.parameters.iter().zip(MlpNetwork::names(&architecture)) {
+        if parameter.f_isfinite()?.f_all()?.f_int64_value(&[])? == 0 {
+            let reason = format!("tensor {prefix}.{name} is not finite");
+            return Err(TorchFieldError::Format { path: path.to_path_buf(), reason });
+        }
+    }
+    Ok(read.to(device, Kind::Float)?)
+}
+
+fn is_usable(ray: &Ray) -> bool {
+    ray.origin.iter().chain(&ray.direction).all(|x| x.is_finite()) && ray.direction != [0.0; 3]
+}
+
+/// Numbers as a matrix on a device.
+pub(crate) fn matrix(numbers: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
+    Tensor::f_from_slice(numbers)?.f_reshape(shape)?.f_to_device(device)
+}
+
+/// `N` numbers of each of n rays: n × N.
+pub(crate) fn columns<T, const N: usize>(
+    rays: &[T],
+    device: Device,
+    of: impl Fn(&T) -> [f32; N],
+) -> Result<Tensor, TchError> {
+    let values: Vec<f32> = rays.iter().flat_map(of).collect();
+    matrix(&values, [rays.len() as i64, N as i64], device)
 }
 
 /// A tensor's numbers in f32.

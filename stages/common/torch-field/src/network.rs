@@ -50,13 +50,12 @@ impl MlpNetwork {
     pub(crate) fn names(
         architecture: &MlpArchitecture,
     ) -> impl Iterator<Item = (String, Vec<i64>)> {
-        let both = |(name, inputs, outputs): Layer| {
+        Self::layers(architecture).into_iter().flat_map(|(name, inputs, outputs)| {
             [
                 (format!("{name}.weight"), vec![outputs, inputs]),
                 (format!("{name}.bias"), vec![outputs]),
             ]
-        };
-        Self::layers(architecture).into_iter().flat_map(both)
+        })
     }
 
     /// He et al. 2015, normal, for every layer, with biases of 0: the reference's. `index` tells
@@ -92,13 +91,8 @@ impl MlpNetwork {
 
     /// The same network elsewhere or in another precision; its parameters take gradients.
     pub(crate) fn to(&self, device: Device, kind: Kind) -> Result<Self, TchError> {
-        let moved = |t: &Tensor| -> Result<Tensor, TchError> {
-            Ok(t.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
-        };
-        Ok(Self {
-            architecture: self.architecture,
-            parameters: self.parameters.iter().map(moved).collect::<Result<_, _>>()?,
-        })
+        let moved = self.parameters.iter().map(|t| learnable(t, device, kind));
+        Ok(Self { architecture: self.architecture, parameters: moved.collect::<Result<_, _>>()? })
     }
 
     /// Another handle on the same parameters, for another thread.
@@ -130,6 +124,11 @@ impl MlpNetwork {
         let shaded = linear(&Tensor::f_cat(&[&feature, direction], -1)?, depth + 2)?.f_relu()?;
         Ok((linear(&shaded, depth + 3)?.f_sigmoid()?, density))
     }
+}
+
+/// A copy elsewhere or in another precision, which takes gradients.
+fn learnable(tensor: &Tensor, device: Device, kind: Kind) -> Result<Tensor, TchError> {
+    Ok(tensor.f_to_device(device)?.f_to_kind(kind)?.f_detach_copy()?.set_requires_grad(true))
 }
 
 /// A linear layer. In f32 on a CPU by oneDNN, where libtorch has it: MKL's products use half of the

@@ -2,6 +2,8 @@ use radiance::{NormalizedRay, Ray, RayMap, clip};
 use scene::{Bounds, Space};
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 
+use crate::mlp::columns;
+
 /// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips
 /// in f64 and on the host.
 #[derive(Debug)]
@@ -27,31 +29,17 @@ impl RayMaps {
         ndc_directions: bool,
     ) -> Result<Self, TchError> {
         let rays: Vec<NormalizedRay> = rays.iter().map(|r| clip(bounds, r)).collect();
-        let columns = |width: i64, of: &dyn Fn(&NormalizedRay, &mut Vec<f32>)| {
-            let mut values = Vec::with_capacity(rays.len() * width as usize);
-            rays.iter().for_each(|r| of(r, &mut values));
-            Tensor::f_from_slice(&values)?
-                .f_reshape([rays.len() as i64, width])?
-                .f_to_device(device)
-        };
-        let three = |of: fn(&NormalizedRay) -> [f32; 3]| columns(3, &|r, to| to.extend(of(r)));
-        let one = |of: &dyn Fn(&NormalizedRay) -> f32| columns(1, &|r, to| to.push(of(r)));
-        let of_map = |k: usize| {
-            one(&|r| match r.map {
-                RayMap::Straight { start, scale, perspective } => [start, scale, perspective][k],
-                RayMap::Contracted { start, scale, radii } => [start, scale, radii][k],
-            })
-        };
+        let of_map = |k: usize| columns(&rays, device, |r| [distance_map(r)[k]]);
         let is_ndc = ndc_directions && matches!(bounds.space, Space::Ndc(_));
         let in_ndc = |r: &NormalizedRay| r.direction.map(|d| 2.0 * d / r.direction[2]);
         // What isn't finite meets nothing; its view must not spoil the others' sums.
         let tame = |v: [f32; 3]| if v.iter().all(|x| x.is_finite()) { v } else { [0.0; 3] };
         Ok(Self {
-            origin: three(|r| r.origin)?,
-            direction: three(|r| r.direction)?,
-            view: columns(3, &|r, to| to.extend(tame(if is_ndc { in_ndc(r) } else { r.view })))?,
-            enter: one(&|r| r.enter)?,
-            leave: one(&|r| r.leave.max(r.enter))?,
+            origin: columns(&rays, device, |r| r.origin)?,
+            direction: columns(&rays, device, |r| r.direction)?,
+            view: columns(&rays, device, |r| tame(if is_ndc { in_ndc(r) } else { r.view }))?,
+            enter: columns(&rays, device, |r| [r.enter])?,
+            leave: columns(&rays, device, |r| [r.leave.max(r.enter)])?,
             distance: [of_map(0)?, of_map(1)?, of_map(2)?],
             contracted: bounds.space == Space::Contraction,
         })
@@ -95,6 +83,14 @@ impl RayMaps {
 pub(crate) fn fused(a: &Tensor, b: &Tensor, c: &Tensor) -> Result<Tensor, TchError> {
     let wide = |t: &Tensor| t.f_to_kind(Kind::Double);
     wide(a)?.f_mul(&wide(b)?)?.f_add(&wide(c)?)?.f_to_kind(Kind::Float)
+}
+
+/// Distance where t is 0, its growth, and its perspective or its radii.
+fn distance_map(ray: &NormalizedRay) -> [f32; 3] {
+    match ray.map {
+        RayMap::Straight { start, scale, perspective } => [start, scale, perspective],
+        RayMap::Contracted { start, scale, radii } => [start, scale, radii],
+    }
 }
 
 /// sinh(4t).

@@ -58,10 +58,10 @@ impl Step {
         let colours = host(colour)?.as_chunks::<3>().0.to_vec();
         let mut gradients = vec![[0.0f32; 3]; colours.len()];
         let pairs = colours.chunks_exact(self.bundle).zip(gradients.chunks_exact_mut(self.bundle));
-        let judge = |(g, (colours, gradients))| {
+        let losses = range.clone().zip(pairs).map(|(g, (colours, gradients))| {
             supervision.loss_and_gradient(self.first_bundle + g as u64, colours, gradients)
-        };
-        let loss = range.clone().zip(pairs).map(judge).sum();
+        });
+        let loss = losses.sum();
         let scaled: Vec<f32> =
             gradients.as_flattened().iter().map(|g| g / self.bundles as f32).collect();
         let gradients = Tensor::f_from_slice(&scaled)?

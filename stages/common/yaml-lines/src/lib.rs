@@ -74,10 +74,10 @@ fn line_found(searched: Result<(), serde_yaml::Error>) -> Option<usize> {
 /// The line of a key: the last of `path`, through nested mappings; where it isn't there, that of
 /// the last one that is.
 pub fn line_of(text: &str, path: &[&str]) -> Option<usize> {
-    let search = |length: usize| {
-        Search(&path[..length]).deserialize(serde_yaml::Deserializer::from_str(text))
-    };
-    (1..=path.len()).rev().find_map(|length| line_found(search(length)))
+    (1..=path.len()).rev().find_map(|length| {
+        let search = Search(&path[..length]);
+        line_found(search.deserialize(serde_yaml::Deserializer::from_str(text)))
+    })
 }
 
 /// The line on which a key stands that its mapping has already.

@@ -184,7 +184,7 @@ impl<'a> Schedule<'a> {
         let chain = Chain::find(plan, index, &|from| folder_of(from, &session.store, &output_of))
             .map(|chain| (watch, chain));
         if chain.is_none() {
-            let problem = "nothing in this plan renders and scores it";
+            let problem = "no stage of this run can score its views yet; add a target such as eval";
             self.display.line(&format!("{}: not watched: {problem}", node.label()));
         }
         chain
@@ -288,9 +288,8 @@ fn say_results(session: &Session, plan: &Plan, outcome: &Outcome) -> anyhow::Res
         .collect();
     for index in ends {
         let record = outcome.records[index].as_ref().context("every node is done")?;
-        let stored = || {
-            std::fs::read_to_string(session.store.object(&record.output).join(SUMMARY_FILE)).ok()
-        };
+        let file = session.store.object(&record.output).join(SUMMARY_FILE);
+        let stored = || std::fs::read_to_string(&file).ok();
         if let Some(summary) = record.summary.clone().or_else(stored) {
             print_lines(&format!("{}: {summary}", plan.nodes[index].label()));
         }

@@ -1,4 +1,5 @@
 use std::process::ExitCode;
+use std::time::Duration;
 
 use artifact::{Failure, print_line, report_line, stop_on_signals};
 use garbage::{Choice, Root, Verdict, judge};
@@ -22,13 +23,7 @@ pub(crate) fn gc(
         return style.tell(&judge(store, needed, choice)?);
     }
     let stop = stop_on_signals()?;
-    let say = |_: Option<&_>, waited: std::time::Duration| {
-        report_line!(
-            "nerf-sr: waits until no run looks for artifacts, for {} now",
-            seconds(waited.as_secs_f64())
-        );
-    };
-    let closed = match until_held(&stop, &say, || store.try_close()) {
+    let closed = match until_held(&stop, &|_, waited| say_wait(waited), || store.try_close()) {
         Ok(closed) => closed,
         Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
         Err(failure) => return Err(failure.into()),
@@ -38,6 +33,13 @@ pub(crate) fn gc(
     drop(closed);
     store.empty_trash()?;
     style.tell(&verdict)
+}
+
+fn say_wait(waited: Duration) {
+    report_line!(
+        "nerf-sr: waits until no run looks for artifacts, for {} now",
+        seconds(waited.as_secs_f64())
+    );
 }
 
 /// What to do beside deciding, and how to tell of it.

@@ -1,7 +1,5 @@
-use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::Context as _;
 use artifact::{Store, counted, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -9,10 +7,10 @@ use crate::waiting::enter_at_once;
 
 /// Reads every artifact again.
 pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
-    let (objects, foreign) = list(&store.root().join("objects"))?;
-    for path in &foreign {
+    for path in store.foreign_entries()? {
         print_line!("{}: not an artifact; it is left alone, move it elsewhere", path.display());
     }
+    let objects = store.objects()?;
     let sizes: Vec<u64> = objects
         .iter()
         .map(|object| store.manifest(object).map_or(0, |manifest| manifest.size()))
@@ -44,23 +42,4 @@ fn bar(bytes: u64) -> ProgressBar {
         ProgressStyle::with_template("reading [{bar:30}] {bytes} of {total_bytes}, {eta} left");
     ProgressBar::new(bytes)
         .with_style(style.expect("the template is constant").progress_chars("=> "))
-}
-
-/// Names of artifacts, and what else lies beside them, both sorted.
-fn list(folder: &Path) -> anyhow::Result<(Vec<String>, Vec<PathBuf>)> {
-    let (mut objects, mut foreign) = (Vec::new(), Vec::new());
-    for entry in std::fs::read_dir(folder).with_context(|| folder.display().to_string())? {
-        let entry = entry.with_context(|| folder.display().to_string())?;
-        match entry.file_name().into_string() {
-            Ok(name) if is_hash(&name) => objects.push(name),
-            _ => foreign.push(entry.path()),
-        }
-    }
-    objects.sort_unstable();
-    foreign.sort_unstable();
-    Ok((objects, foreign))
-}
-
-fn is_hash(name: &str) -> bool {
-    name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }

@@ -1,7 +1,7 @@
 use std::process::ExitCode;
 
-use artifact::print_line;
-use planning::Request;
+use artifact::{Record, print_line};
+use planning::{Plan, Request, State};
 
 use crate::node_report::PlanReport;
 use crate::session::{Session, of_stage};
@@ -20,24 +20,30 @@ pub(crate) fn why(
     if json {
         return super::print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
     }
-    let say = |index: usize, indent: &str| {
-        print_line!(
-            "{indent}{}: {}",
-            plan.nodes[index].label(),
-            words(session, &plan, index, &states[index], Some(&records))
-        );
-    };
+    let line = |index: usize| explained(session, &plan, &states, &records, index);
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
         print_line!("{stage}: {}", shown(&plan, sink, &states));
-        sink.shows.iter().for_each(|&index| say(index, "  "));
+        sink.shows.iter().for_each(|&index| print_line!("  {}", line(index)));
         return Ok(ExitCode::SUCCESS);
     }
     for index in of_stage(&plan, stage)? {
-        say(index, "");
+        print_line!("{}", line(index));
         by_scene(session, &plan.nodes[index], &states[index])
             .iter()
             .for_each(|line| print_line!("    {line}"));
-        causes(&states, index).into_iter().for_each(|cause| say(cause, "  "));
+        causes(&states, index).into_iter().for_each(|cause| print_line!("  {}", line(cause)));
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// A node with its state, and why that is so.
+fn explained(
+    session: &Session,
+    plan: &Plan,
+    states: &[State],
+    records: &[Record],
+    index: usize,
+) -> String {
+    let words = words(session, plan, index, &states[index], Some(records));
+    format!("{}: {words}", plan.nodes[index].label())
 }

@@ -1,45 +1,45 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use planning::{Node, Origin, Plan, StageProgram};
+use planning::{NodeInput, Origin, Plan, StageProgram};
 use serde_json::Value;
 
-/// The stages of a plan that show a node's checkpoint: one renders it, the other scores that.
+/// The two blocks of a plan that render a checkpoint's field and score the view.
 pub(crate) struct Chain {
-    pub(super) render: Step,
-    pub(super) score: Step,
+    pub(super) render: Link,
+    pub(super) score: Link,
 }
 
-/// One of them, by the contract. Inputs that may be left out are left out.
-pub(super) struct Step {
+/// One block of a chain. Its optional inputs are omitted.
+pub(super) struct Link {
     pub(super) program: Arc<StageProgram>,
     pub(super) parameters: Value,
     pub(super) device: String,
-    /// The input that the step before makes.
+    /// Name of the input that takes the previous block's output.
     pub(super) fed: String,
     /// The other inputs, with their folders.
     pub(super) inputs: Vec<(String, PathBuf)>,
 }
 
 impl Chain {
-    /// The first two stages that make views of the node's artifact and scores of those, where all
-    /// else that they need is there; `folder_of` says where.
+    /// Finds the first block that renders a node's field, and a block that scores those views.
+    /// Their other required inputs must exist; `folder_of` gives the folders.
     pub(crate) fn find(
         plan: &Plan,
         node: usize,
         folder_of: &dyn Fn(&Origin) -> Option<PathBuf>,
     ) -> Option<Self> {
         (0..plan.nodes.len()).find_map(|index| {
-            let render = Step::new(plan, index, node, "views", folder_of)?;
+            let render = Link::new(plan, index, node, "views", folder_of)?;
             let score = (0..plan.nodes.len())
-                .find_map(|next| Step::new(plan, next, index, "metrics", folder_of))?;
+                .find_map(|next| Link::new(plan, next, index, "metrics", folder_of))?;
             Some(Self { render, score })
         })
     }
 }
 
-impl Step {
-    /// A node that makes a kind of artifact of another's.
+impl Link {
+    /// Node `index`, if it takes node `before` and makes an artifact of this kind.
     fn new(
         plan: &Plan,
         index: usize,
@@ -47,16 +47,15 @@ impl Step {
         kind: &str,
         folder_of: &dyn Fn(&Origin) -> Option<PathBuf>,
     ) -> Option<Self> {
-        let node: &Node = &plan.nodes[index];
+        let node = &plan.nodes[index];
         let description = &node.program.description;
-        let made = Origin::Node { index: before, subtree: None };
-        let fed = node.inputs.iter().find(|input| input.from == made)?.name.clone();
         if description.output.kind != kind {
             return None;
         }
-        let others = node.inputs.iter().filter(|input| {
-            input.name != fed && description.inputs.get(&input.name).is_some_and(|i| !i.optional)
-        });
+        let made = Origin::Node { index: before, subtree: None };
+        let fed = node.inputs.iter().find(|input| input.from == made)?.name.clone();
+        let is_optional = |input: &&NodeInput| description.inputs[&input.name].optional;
+        let others = node.inputs.iter().filter(|input| input.name != fed && !is_optional(input));
         let inputs: Option<Vec<(String, PathBuf)>> =
             others.map(|input| Some((input.name.clone(), folder_of(&input.from)?))).collect();
         Some(Self {

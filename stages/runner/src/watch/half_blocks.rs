@@ -2,15 +2,15 @@ use std::fmt::Write as _;
 
 use pixels::{Filter, Rgba8, resize_pillow};
 
-/// A picture is at most so many characters wide.
+/// Maximum width of a picture in characters.
 const MOST_COLUMNS: usize = 64;
 const RESET: &str = "\x1b[0m";
 
-/// A picture as text for a terminal of some size: each character shows two pixels, the upper as the
-/// colour of `▀`, the lower as that behind it.
+/// A picture as text for a terminal of some size. Each character is `▀`: the foreground is the upper
+/// pixel, the background the lower one.
 pub(super) fn half_blocks(image: &Rgba8, columns: u16, rows: u16) -> String {
     let columns = usize::from(columns).min(MOST_COLUMNS).min(image.width).max(1);
-    // The lines above should stay in sight.
+    // A third of the terminal is left for the lines above.
     let lines = (usize::from(rows) * 2 / 3).max(1);
     let scale = (columns as f64 / image.width as f64).min(2.0 * lines as f64 / image.height as f64);
     let size = |side: usize| ((side as f64 * scale).round() as usize).max(1);

@@ -1,16 +1,16 @@
-//! `run --watch`: one test view of a field while the field trains. The plan's own stages render it
-//! from the latest checkpoint and score it; the training stage is neither asked nor disturbed, and
-//! never gets that view.
+//! `run --watch`: shows a test view of a field in training. A look makes a field of the latest
+//! checkpoint; the plan's own stages then render the view and score it. The training process
+//! doesn't take part.
 //!
-//! * `chain`: which stages of the plan show a node's checkpoints.
+//! * `chain`: the stages that render and score a node's checkpoints.
 //! * `one_view`: a folder of views with only one of them.
-//! * `pace`: how often there is time to look.
+//! * `budget`: when the next look is due.
 //! * `half_blocks`: a picture as text.
 
+mod budget;
 mod chain;
 mod half_blocks;
 mod one_view;
-mod pace;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,21 +19,23 @@ use std::time::{Duration, Instant};
 use artifact::{Event, SUMMARY_FILE};
 use stage_call::{Call, Display, StageFailure, Watcher, seconds};
 
+use budget::LookBudget;
 pub(crate) use chain::Chain;
-use chain::Step;
+use chain::Link;
 use half_blocks::half_blocks;
 use one_view::OneView;
-use pace::Pace;
 
-/// How often it is looked whether it is time.
+/// Interval between two checks whether a look is due.
 const TICK: Duration = Duration::from_millis(50);
-/// A look that takes so many times what was expected is given up, and so is watching: some fields
-/// take hours a view.
+/// Limit of a look, as a multiple of its expected time. Beyond it the watching ends: on a CPU the
+/// paper's field is too slow to watch.
 const MOST: u32 = 10;
+/// The limit is at least so long, for busy machines.
+const LEAST_LIMIT: Duration = Duration::from_secs(60);
 
-/// What `--watch` asks for.
+/// The options of `--watch`.
 pub(crate) struct Watch {
-    /// The view's name; empty for the first.
+    /// The test view's name; empty for the first view.
     pub(crate) view: String,
     /// Folder of the pictures.
     pub(crate) folder: PathBuf,
@@ -44,7 +46,7 @@ pub(crate) struct Watching<'a> {
     pub(crate) watch: &'a Watch,
     pub(crate) chain: &'a Chain,
     pub(crate) label: &'a str,
-    /// A folder of its own, removed at the end.
+    /// A temporary folder for this training's looks, removed when the training ends.
     pub(crate) scratch: PathBuf,
     pub(crate) display: &'a Display,
     /// Whether the training has ended.
@@ -52,67 +54,68 @@ pub(crate) struct Watching<'a> {
 }
 
 impl Watching<'_> {
-    /// Looks at checkpoints of `training` until it is over, and says what it sees. What goes wrong
-    /// is said and ends the watching alone.
+    /// Takes looks until `training` ends, and shows each. An error is printed and ends the
+    /// watching; the training goes on.
     pub(crate) fn run(&self, training: &Call<'_>) {
         if let Err(problem) = self.look_on(training) {
-            self.display.line(&format!("{}: not watched: {problem}", self.label));
+            self.display.line(&format!("{}: {problem}", self.label));
         }
-        // Leftovers have no value.
+        // Leftovers have no value; the run's folder may hold those of others.
         std::fs::remove_dir_all(&self.scratch).ok();
+        self.scratch.parent().map(std::fs::remove_dir);
     }
 
     fn look_on(&self, training: &Call<'_>) -> Result<(), String> {
-        let view = OneView::find(self.chain, &self.watch.view)?;
+        let view = OneView::find(self.chain, &self.watch.view)
+            .map_err(|problem| format!("not watched: {problem}"))?;
         let begin = Instant::now();
-        let mut pace = Pace::new(training.threads, view.pixels);
+        let mut budget = LookBudget::new(training.threads, view.pixels);
         while !self.is_over.load(Ordering::Relaxed) {
-            if begin.elapsed() < pace.next() {
+            if begin.elapsed() < budget.next() {
                 std::thread::sleep(TICK);
                 continue;
             }
-            let (started, limit) = (Instant::now(), pace.expected() * MOST);
-            let after = begin.elapsed().as_secs_f64();
+            let (started, limit) = (Instant::now(), LEAST_LIMIT.max(budget.expected() * MOST));
             let look = Look { watching: self, view: &view, deadline: started + limit };
             match look.at(training) {
                 Ok(Some(seen)) => {
-                    pace.took(seen.processor);
-                    self.show(&seen, &view.name, after)?;
+                    budget.took(seen.processor);
+                    self.show(&seen, &view.name)?;
                 }
-                Ok(None) => pace.took(started.elapsed()),
+                Ok(None) => budget.wasted(started.elapsed()),
                 Err(_) if self.is_over.load(Ordering::Relaxed) => return Ok(()),
                 Err(_) if Instant::now() >= look.deadline => {
                     let limit = seconds(limit.as_secs_f64());
-                    return Err(format!("view {} takes more than {limit}", view.name));
+                    return Err(format!("no longer watched: view {} takes {limit}", view.name));
                 }
-                Err(failure) => return Err(failure.message),
+                Err(failure) => return Err(format!("no longer watched: {failure}")),
             }
         }
         Ok(())
     }
 
-    /// Says the scores, and puts the picture where it can be found.
-    fn show(&self, seen: &Seen, view: &str, after: f64) -> Result<(), String> {
+    /// Prints the scores and writes the picture to the folder of pictures.
+    fn show(&self, seen: &Seen, view: &str) -> Result<(), String> {
         let folder = &self.watch.folder;
         let picture = folder.join(file_name(self.label));
         let beside = picture.with_extension("partial");
         std::fs::create_dir_all(folder)
             .and_then(|()| std::fs::copy(&seen.picture, &beside))
             .and_then(|_| std::fs::rename(&beside, &picture))
-            .map_err(|e| format!("{}: {e}", picture.display()))?;
+            .map_err(|e| format!("no longer watched: {}: {e}", picture.display()))?;
         if std::env::var_os("NO_COLOR").is_none()
             && let Ok(image) = pixels::read_png(&picture)
         {
             self.display.picture(|columns, rows| half_blocks(&image, columns, rows));
         }
-        let (label, scores, after) = (self.label, &seen.scores, seconds(after));
-        self.display
-            .line(&format!("{label}: view {view} after {after}: {scores} · {}", picture.display()));
+        let Seen { field, scores, .. } = seen;
+        let (label, picture) = (self.label, picture.display());
+        self.display.line(&format!("{label}: view {view}: {scores} ({field}): {picture}"));
         Ok(())
     }
 }
 
-/// A file's name for a label, which may hold parameters.
+/// The picture's file name: the label with `_` for each character that isn't plain.
 fn file_name(label: &str) -> String {
     let is_plain = |c: char| c.is_alphanumeric() || "-_=.,".contains(c);
     label.replace(|c| !is_plain(c), "_").trim_end_matches('_').to_owned() + ".png"
@@ -125,81 +128,77 @@ struct Look<'a> {
     deadline: Instant,
 }
 
-/// What a look has seen.
+/// A look's result.
 struct Seen {
     picture: PathBuf,
+    /// The field so far, in words.
+    field: String,
+    /// The view's scores, in words.
     scores: String,
-    /// Processor time that it took.
+    /// Processor time of the look.
     processor: Duration,
 }
 
 impl Look<'_> {
-    /// None where there is no checkpoint yet.
+    /// None where the stage makes no field of a checkpoint, mostly because there is none yet.
     fn at(&self, training: &Call<'_>) -> Result<Option<Seen>, StageFailure> {
         let scratch = &self.watching.scratch;
-        let fail = |e: std::io::Error| StageFailure {
-            code: 1,
-            message: format!("{}: {e}", scratch.display()),
-        };
         if scratch.exists() {
-            std::fs::remove_dir_all(scratch).map_err(fail)?;
+            std::fs::remove_dir_all(scratch).map_err(|e| StageFailure::at(scratch, &e))?;
         }
-        std::fs::create_dir_all(scratch).map_err(fail)?;
+        std::fs::create_dir_all(scratch).map_err(|e| StageFailure::at(scratch, &e))?;
         let [field, views, scores] =
             ["field", "views", "scores"].map(|folder| scratch.join(folder));
         let call =
             Call { output: &field, from_checkpoint: true, threads: 1, lock: None, ..*training };
         let Ok(reading) = self.call(&call) else { return Ok(None) };
         let Chain { render, score } = self.watching.chain;
-        let rendering = self.step(render, "render", &field, &views)?;
-        let scoring = self.step(score, "score", &views, &scores)?;
-        let said = std::fs::read_to_string(scores.join(SUMMARY_FILE)).map_err(fail)?;
+        let rendering = self.follow(render, "render", &field, &views)?;
+        let scoring = self.follow(score, "score", &views, &scores)?;
         Ok(Some(Seen {
             picture: views.join(format!("previews/{}.png", self.view.name)),
-            scores: said.trim().to_owned(),
+            field: summary(&field)?,
+            scores: summary(&scores)?,
             processor: reading + rendering + scoring,
         }))
     }
 
-    /// Calls a stage with what was made before, and with one view of its other inputs.
-    fn step(
+    /// Calls a stage with the previous stage's output; other inputs are cut to the watched view.
+    fn follow(
         &self,
-        step: &Step,
+        link: &Link,
         name: &str,
         fed: &Path,
         output: &Path,
     ) -> Result<Duration, StageFailure> {
         let scratch = self.watching.scratch.join(format!("{name}-inputs"));
         let params = scratch.join("params.json");
-        let fail = |e: std::io::Error| StageFailure {
-            code: 1,
-            message: format!("{}: {e}", scratch.display()),
-        };
-        std::fs::create_dir_all(&scratch).map_err(fail)?;
-        artifact::write_json(&params, &step.parameters).map_err(fail)?;
-        let mut inputs = vec![(step.fed.clone(), fed.to_path_buf())];
-        for (input, folder) in &step.inputs {
-            let narrow = scratch.join(input);
-            self.view.of(folder, &narrow).map_err(fail)?;
-            inputs.push((input.clone(), narrow));
+        std::fs::create_dir_all(&scratch)
+            .and_then(|()| artifact::write_json(&params, &link.parameters))
+            .map_err(|e| StageFailure::at(&params, &e))?;
+        let mut inputs = vec![(link.fed.clone(), fed.to_path_buf())];
+        for (input, folder) in &link.inputs {
+            let cut = scratch.join(input);
+            self.view.of(folder, &cut).map_err(|e| StageFailure::at(&cut, &e))?;
+            inputs.push((input.clone(), cut));
         }
         self.call(&Call {
             label: self.watching.label,
-            program: &step.program.path,
-            description: &step.program.description,
+            program: &link.program.path,
+            description: &link.program.description,
             params: &params,
             inputs: &inputs,
             hashes: &[],
             output,
             work: None,
             from_checkpoint: false,
-            device: &step.device,
+            device: &link.device,
             threads: 1,
             lock: None,
         })
     }
 
-    /// Calls a stage; the processor time that it took.
+    /// Calls a stage and returns its processor time.
     fn call(&self, call: &Call<'_>) -> Result<Duration, StageFailure> {
         let stop = AtomicBool::new(false);
         let end = EndInTime { look: self, stop: &stop };
@@ -208,7 +207,14 @@ impl Look<'_> {
     }
 }
 
-/// Ends a call that nobody waits for any more, or that takes too long; says nothing.
+/// A stage's few words on its result.
+fn summary(output: &Path) -> Result<String, StageFailure> {
+    let file = output.join(SUMMARY_FILE);
+    let text = std::fs::read_to_string(&file).map_err(|e| StageFailure::at(&file, &e))?;
+    Ok(text.trim().to_owned())
+}
+
+/// Stops a call when the training has ended or the deadline has passed. Prints nothing.
 struct EndInTime<'a> {
     look: &'a Look<'a>,
     stop: &'a AtomicBool,
@@ -234,6 +240,6 @@ mod tests {
     #[test]
     fn labels_become_names_of_files() {
         assert_eq!(file_name("train-ss"), "train-ss.png");
-        assert_eq!(file_name("train-ss (supersample=2, a/b)"), "train-ss__supersample=2,_a_b.png");
+        assert_eq!(file_name("train-ss [supersample=2 a/b]"), "train-ss__supersample=2_a_b.png");
     }
 }

@@ -6,18 +6,18 @@ use serde_json::Value;
 
 use super::chain::Chain;
 
-/// The list of a folder of views.
+/// The file that lists a folder's views.
 const VIEWS: &str = "views.json";
 
 /// The view that is watched.
 pub(super) struct OneView {
     pub(super) name: String,
-    /// Its size.
+    /// Pixels of the view's camera.
     pub(super) pixels: u64,
 }
 
 impl OneView {
-    /// A view by its name, or the first of those that a chain renders.
+    /// Finds a view by name, or the chain's first view if the name is empty.
     pub(super) fn find(chain: &Chain, name: &str) -> Result<Self, String> {
         let folders: Vec<&Path> =
             chain.render.inputs.iter().map(|(_, folder)| folder.as_path()).collect();
@@ -36,8 +36,8 @@ impl OneView {
         Ok(Self { name, pixels: side("width") * side("height") })
     }
 
-    /// Makes a folder `into` that has of `folder` all but the other views. A folder without a list
-    /// of views comes whole.
+    /// Makes `into`, a copy of `folder` by links, whose `views.json` lists this view alone. A folder
+    /// without `views.json` becomes one link.
     pub(super) fn of(&self, folder: &Path, into: &Path) -> io::Result<()> {
         let Ok(mut list) = list(folder) else {
             return std::os::unix::fs::symlink(folder, into);
@@ -45,7 +45,7 @@ impl OneView {
         std::fs::create_dir_all(into)?;
         for entry in std::fs::read_dir(folder)? {
             let entry = entry?;
-            // A manifest is of the whole.
+            // The manifest describes the uncut folder.
             if ![VIEWS, MANIFEST_FILE].iter().any(|name| entry.file_name() == *name) {
                 std::os::unix::fs::symlink(entry.path(), into.join(entry.file_name()))?;
             }
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn other_views_are_left_out_and_the_rest_is_there() {
+    fn other_views_are_left_out_and_the_rest_is_linked() {
         let folder = tempfile::tempdir().unwrap();
         let (whole, one) = (folder.path().join("whole"), folder.path().join("one"));
         std::fs::create_dir_all(whole.join("images")).unwrap();

@@ -80,10 +80,16 @@ fn read_counters<T>(
 ) -> Result<T, FieldError> {
     let bytes = std::fs::read(path)
         .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
-    let read = || {
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| e.to_string())?;
-        let counters = read_u8(&tensors, "counters", 48)?;
-        then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
-    };
-    read().map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+    counters_of(&bytes, then)
+        .map_err(|reason| FieldError::Format { path: path.to_path_buf(), reason })
+}
+
+/// The same of a checkpoint's bytes.
+fn counters_of<T>(
+    bytes: &[u8],
+    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>,
+) -> Result<T, String> {
+    let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+    let counters = read_u8(&tensors, "counters", 48)?;
+    then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
 }

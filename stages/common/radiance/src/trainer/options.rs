@@ -1,6 +1,7 @@
 use counter_rng::uniform;
 
 use crate::chunk::Roulette;
+use crate::regularisers::Regularisers;
 use crate::tally::Tally;
 
 /// Steps between those of the weights' average, and the share of the rays after which it begins.
@@ -30,12 +31,8 @@ pub struct TrainingOptions {
     /// Share that the weights' exponential moving average keeps at each of its steps; 0 for no
     /// average.
     pub ema_decay: f32,
-    /// Weight of the distortion loss, the mean over all rays, beside the loss that supervision
-    /// gives.
-    pub distortion: f32,
-    /// Weight of the floater loss, the mean over all rays: opacity that has the background's
-    /// colour.
-    pub floater_loss: f32,
+    /// What is asked of rays beside their colours.
+    pub regularisers: Regularisers,
     /// Weight decay of the networks.
     pub network_decay: f32,
     /// Samples whose gradient is shorter than so many times the mean of those around go back to the
@@ -57,7 +54,7 @@ impl TrainingOptions {
     /// exponentially.
     pub fn schedule(&self, tally: &Tally) -> f64 {
         let warm = ((tally.steps + 1) as f64 / self.warm_up.max(1) as f64).min(1.0);
-        tally.rate_scale * warm * self.learning_rate_decay.powf(tally.done(self.rays))
+        tally.rate_scale * warm * libm::pow(self.learning_rate_decay, tally.done(self.rays))
     }
 
     /// Share of a step by which the samples of a ray are shifted, by its number in the training.

@@ -2,7 +2,6 @@ use std::ops::Range;
 
 use super::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
-use crate::composite::Regularisers;
 use crate::field::Field;
 use crate::mlp::drain_lanes;
 use crate::occupancy::Strides;
@@ -111,15 +110,10 @@ impl Shard {
         self.colours.extend_from_slice(&worker.colours);
         let scale = 1.0 / work.bundles as f32;
         worker.gradients.iter_mut().flatten().for_each(|g| *g *= scale);
-        let of_ray = |weight: f32| weight * scale / bundle as f32;
-        let regularisers = Regularisers {
-            distortion: of_ray(options.distortion),
-            floater_loss: of_ray(options.floater_loss),
-        };
         let towards = RayGradients {
             colours: &worker.gradients,
             backgrounds: &worker.backgrounds,
-            regularisers,
+            regularisers: options.regularisers.of_ray(scale, bundle),
         };
         let mut network =
             NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };

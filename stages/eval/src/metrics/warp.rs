@@ -2,7 +2,7 @@ use artifact::{FailureExt as _, GivenInput};
 use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
-use crate::metric::{Figure, Measured, Metric, Score, Scores};
+use crate::metric::{Figure, Measured, Metric, Score};
 use crate::scored_view::{ScoredScene, ScoredView, read_image};
 
 /// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
@@ -88,10 +88,6 @@ impl Metric for WarpMetric {
         let Some((score, picture)) = warped(view)? else { return Ok(Measured::default()) };
         let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
         Ok(Measured { picture: Some(picture), ..Measured::one(self.name(), score) })
-    }
-
-    fn in_words(&self, _: &Scores) -> Option<String> {
-        None
     }
 }
 

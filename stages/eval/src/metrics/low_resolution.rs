@@ -1,7 +1,8 @@
 use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
-use crate::psnr::psnr;
 use crate::scored_view::{ScoredScene, ScoredView};
-use crate::ssim::ssim;
+
+use super::psnr::masked_psnr;
+use super::ssim::ssim;
 
 /// PSNR and SSIM of a render shrunk to LR, by the kernel that made the LR images or is taken to have
 /// made them, against the view's LR image.
@@ -30,7 +31,7 @@ impl Metric for LowResolutionMetric {
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
         let Some(lr) = &view.lr else { return Ok(Measured::default()) };
         let score = Score::several([
-            ("psnr", psnr(&lr.shrunk, &lr.expected) + lr.masked_decibels),
+            ("psnr", masked_psnr(&lr.shrunk, &lr.expected, lr.counted_share)),
             ("ssim", ssim(&lr.shrunk, &lr.expected).reflected),
         ]);
         Ok(Measured::one(self.name(), score))

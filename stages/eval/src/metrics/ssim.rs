@@ -19,14 +19,14 @@ const RADIUS: usize = 5;
 /// 1, in f64; mean over the channels. An image narrower than the window is reflected as often as it
 /// takes.
 pub fn ssim(a: &Image, b: &Image) -> Ssim {
-    let channel = |c: usize| {
-        let plane =
-            |p: &Image| -> Vec<f64> { p.channel(c).iter().map(|&v| f64::from(v)).collect() };
-        of_planes(&plane(a), &plane(b), a.width, a.height)
-    };
+    let channel = |c: usize| of_planes(&plane(a, c), &plane(b, c), a.width, a.height);
     let channels: Vec<Ssim> = (0..a.channels).map(channel).collect();
     let mean = |of: fn(&Ssim) -> f64| channels.iter().map(of).sum::<f64>() / a.channels as f64;
     Ssim { reflected: mean(|s| s.reflected), valid: mean(|s| s.valid) }
+}
+
+fn plane(image: &Image, c: usize) -> Vec<f64> {
+    image.channel(c).iter().map(|&v| f64::from(v)).collect()
 }
 
 fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize) -> Ssim {
@@ -36,19 +36,23 @@ fn of_planes(x: &[f64], y: &[f64], width: usize, height: usize) -> Ssim {
     let (mx, my) = (blurred(x), blurred(y));
     let (xx, yy, xy) = (blurred(&product(x, x)), blurred(&product(y, y)), blurred(&product(x, y)));
     let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
-    let at = |i: usize| {
+    let similarities = (0..width * height).map(|i| {
         let (vx, vy, cov) = (xx[i] - mx[i] * mx[i], yy[i] - my[i] * my[i], xy[i] - mx[i] * my[i]);
         ((2.0 * mx[i] * my[i] + c1) * (2.0 * cov + c2))
             / ((mx[i] * mx[i] + my[i] * my[i] + c1) * (vx + vy + c2))
-    };
-    let inside = |margin: usize| {
-        let pixels = (margin..height - margin)
-            .flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
-        pixels.map(at).sum::<f64>() / ((width - 2 * margin) * (height - 2 * margin)) as f64
-    };
+    });
+    let similarities: Vec<f64> = similarities.collect();
+    let inside = |margin: usize| mean_inside(&similarities, width, height, margin);
     let reflected = inside(0);
     let valid = if width > 2 * RADIUS && height > 2 * RADIUS { inside(RADIUS) } else { reflected };
     Ssim { reflected, valid }
+}
+
+/// Mean over the pixels that lie farther than a margin from the border.
+fn mean_inside(plane: &[f64], width: usize, height: usize, margin: usize) -> f64 {
+    let pixels = (margin..height - margin)
+        .flat_map(|j| (margin..width - margin).map(move |i| j * width + i));
+    pixels.map(|i| plane[i]).sum::<f64>() / ((width - 2 * margin) * (height - 2 * margin)) as f64
 }
 
 /// Gaussian blur, reflected at the border.
@@ -58,19 +62,18 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
         .collect();
     let sum: f64 = raw.iter().sum();
     let taps: Vec<f64> = raw.iter().map(|w| w / sum).collect();
-    let along = |plane: &[f64], stride: usize, length: usize| -> Vec<f64> {
-        (0..plane.len())
-            .map(|i| {
-                let at = i / stride % length;
-                let line = i - at * stride;
-                taps.iter()
-                    .enumerate()
-                    .map(|(k, w)| w * plane[line + stride * reflected(at + k, length)])
-                    .sum()
-            })
-            .collect()
-    };
-    along(&along(plane, 1, width), width, height)
+    blur_along(&blur_along(plane, &taps, 1, width), &taps, width, height)
+}
+
+/// Blurs lines of so many samples, which lie `stride` apart from each other.
+fn blur_along(plane: &[f64], taps: &[f64], stride: usize, length: usize) -> Vec<f64> {
+    let blurred = (0..plane.len()).map(|i| {
+        let at = i / stride % length;
+        let line = i - at * stride;
+        let near = taps.iter().enumerate();
+        near.map(|(k, w)| w * plane[line + stride * reflected(at + k, length)]).sum::<f64>()
+    });
+    blurred.collect()
 }
 
 /// Index `shifted - RADIUS` mirrored into 0..length without repeating the ends.

@@ -8,7 +8,7 @@ use nets::{Conv, Weights, WeightsError};
 use pixels::Image;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::LpipsNetwork;
+use super::perceptual::LpipsNetwork;
 
 /// A network and its heads.
 pub struct Lpips {
@@ -60,9 +60,8 @@ impl LayerReader<'_> {
     }
 
     fn fire(&mut self, index: usize, squeezed: i64, expanded: i64) -> Result<(), WeightsError> {
-        let conv = |part: &str, shape| {
-            Conv::read(self.weights, &format!("features.{index}.{part}"), shape)
-        };
+        let (weights, name) = (self.weights, format!("features.{index}"));
+        let conv = |part: &str, shape| Conv::read(weights, &format!("{name}.{part}"), shape);
         self.layers.push(LpipsLayer::Fire {
             squeeze: conv("squeeze", [squeezed, self.channels, 1, 1])?,
             expand1: conv("expand1x1", [expanded, squeezed, 1, 1])?,
@@ -172,10 +171,10 @@ impl Lpips {
             LpipsNetwork::Alex => reader.alex().map(|()| 31),
             LpipsNetwork::Vgg => reader.vgg().map(|()| 16),
         }?;
-        let head = |(k, &channels): (usize, &i64)| {
+        let heads = reader.stages.iter().enumerate().map(|(k, &channels)| {
             linear.tensor(&format!("lin{k}.model.1.weight"), &[1, channels, 1, 1])
-        };
-        let heads = reader.stages.iter().enumerate().map(head).collect::<Result<_, _>>()?;
+        });
+        let heads = heads.collect::<Result<_, _>>()?;
         Ok(Self { layers: reader.layers, heads, least })
     }
 

@@ -11,6 +11,11 @@ pub fn psnr(found: &Image, expected: &Image) -> f64 {
     psnr_of(sum / found.data.len() as f64)
 }
 
+/// [`psnr`] of the pixels that count, where these are so much of all pixels and the others are equal.
+pub(super) fn masked_psnr(found: &Image, expected: &Image, counted_share: f64) -> f64 {
+    psnr(found, expected) + 10.0 * counted_share.log10()
+}
+
 /// [`psnr`], of the pixels that count.
 pub(crate) struct PsnrMetric;
 
@@ -34,7 +39,7 @@ impl Metric for PsnrMetric {
 
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
         let Some(expected) = &view.expected else { return Ok(Measured::default()) };
-        let decibels = psnr(&view.found, expected) + view.masked_decibels;
+        let decibels = masked_psnr(&view.found, expected, view.counted_share);
         Ok(Measured::one("psnr", Score::One(decibels)))
     }
 

@@ -1,10 +1,30 @@
-use crate::depth::DepthMetric;
-use crate::low_resolution::LowResolutionMetric;
+//! What views are scored by: a file for each metric. A new one is a file, and here its `mod` and its
+//! place in the list.
+
+mod depth;
+mod low_resolution;
+#[cfg(feature = "torch")]
+mod lpips;
+mod perceptual;
+mod psnr;
+mod ssim;
+mod warp;
+
 use crate::metric::Metric;
-use crate::perceptual::Perceptual;
-use crate::psnr::PsnrMetric;
-use crate::ssim::SsimMetric;
-use crate::warp::WarpMetric;
+
+use depth::DepthMetric;
+pub use depth::{DepthError, depth_error};
+use low_resolution::LowResolutionMetric;
+#[cfg(feature = "torch")]
+pub use lpips::Lpips;
+pub use perceptual::LpipsNetwork;
+pub(crate) use perceptual::Perceptual;
+use psnr::PsnrMetric;
+pub use psnr::psnr;
+use ssim::SsimMetric;
+pub use ssim::{Ssim, ssim};
+use warp::WarpMetric;
+pub use warp::WarpScore;
 
 /// All metrics, in the order in which they are shown.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {

@@ -2,7 +2,7 @@ use artifact::{Failure, GivenInput};
 use pixels::Image;
 
 #[cfg(feature = "torch")]
-use crate::Lpips;
+use super::lpips::Lpips;
 use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
@@ -222,11 +222,11 @@ impl Metric for Perceptual {
 
 /// The files that would be needed.
 fn wanted(networks: &[LpipsNetwork]) -> String {
-    let pair = |network: &LpipsNetwork| {
+    let pairs = networks.iter().map(|network| {
         let [net, heads] = network.files();
         format!("{net} with {heads}")
-    };
-    let pairs: Vec<String> = networks.iter().map(pair).collect();
+    });
+    let pairs: Vec<String> = pairs.collect();
     format!(
         "-i eval.weights=FOLDER with {} (torchvision's and richzhang/PerceptualSimilarity's, as \
         safetensors)",
