@@ -139,7 +139,7 @@ impl Stage for TrainSs {
         if context.from_checkpoint() {
             let from = init.as_ref().map(|init| (init.member(0), combine));
             let member = Member::new(context, params.member(0), (model, from), 0, 0)?;
-            log.add(member.from_checkpoint(views.bounds)?);
+            log.add(member.latest_checkpoint(views.bounds)?);
             return publish(context, &file, &log);
         }
         let first = match (&init, combine) {

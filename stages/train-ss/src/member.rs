@@ -132,7 +132,7 @@ impl<'a> Member<'a> {
     }
 
     /// Writes the weights of the latest checkpoint, whichever member it belongs to; its log.
-    pub(crate) fn from_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+    pub(crate) fn latest_checkpoint(&self, bounds: Bounds) -> anyhow::Result<TrainingLog> {
         let work = self.context.work().context("--from-checkpoint goes with --work")?;
         let mut trainer = self.start(&self.params, bounds)?;
         let curve = read_latest(work, &mut *trainer).ok_or_else(|| {
