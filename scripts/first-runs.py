@@ -62,7 +62,7 @@ def measure(repository: pathlib.Path, commit: str, work: pathlib.Path) -> dict:
     page = clone / "out/report/index.html"
     if status or not page.exists():
         sys.exit(f"{commit}: make demo failed; {work / f'{commit}.log'} has what it said")
-    scores = re.search(r"^eval: (.*)$", words, re.MULTILINE)
+    scores = re.search(r"^eval: (PSNR.*)$", words, re.MULTILINE)
     return {
         "commit": commit, "seconds": round(seconds), "processor_seconds": round(usage.ru_utime + usage.ru_stime),
         "longest_silence": round(silence, 1), "libtorch": (clone / ".libtorch").exists(), "scores": scores and scores[1],
