@@ -26,6 +26,19 @@ impl Mesh {
         self.normals = sums.iter().map(|sum| sum.normalize_or(DVec3::Z).as_vec3()).collect();
     }
 
+    /// Edges with one triangle alone, by their vertices in ascending order, sorted.
+    pub(crate) fn open_edges(&self) -> Vec<[u32; 2]> {
+        let mut edges: Vec<[u32; 2]> = self
+            .triangles
+            .iter()
+            .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
+            .map(|[a, b]| [a.min(b), a.max(b)])
+            .collect();
+        edges.sort_unstable();
+        let alone = edges.chunk_by(|a, b| a == b).filter(|edges| edges.len() == 1);
+        alone.map(|edges| edges[0]).collect()
+    }
+
     /// Drops small pieces, and vertices of no triangle.
     pub(crate) fn drop_small_pieces(&mut self) {
         let pieces = self.pieces();

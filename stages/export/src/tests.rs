@@ -69,18 +69,6 @@ fn fused(views: &[SeenView], cells: u32) -> Mesh {
     mesh
 }
 
-/// Edges with one triangle alone.
-fn open_edges(mesh: &Mesh) -> usize {
-    let mut edges: Vec<[u32; 2]> = mesh
-        .triangles
-        .iter()
-        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
-        .map(|[a, b]| [a.min(b), a.max(b)])
-        .collect();
-    edges.sort_unstable();
-    edges.chunk_by(|a, b| a == b).filter(|same| same.len() == 1).count()
-}
-
 /// The volume inside, above 0 where triangles are counter-clockwise seen from outside.
 fn volume(mesh: &Mesh) -> f64 {
     let volume = |t: &[u32; 3]| {
@@ -107,7 +95,7 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
         let values: Vec<f32> = (0..lattice.len()).map(value).collect();
         let mut mesh = surface_nets::extract(&lattice, &values);
         mesh.find_normals();
-        assert_eq!(open_edges(&mesh), 0, "{space:?}");
+        assert_eq!(mesh.open_edges().len(), 0, "{space:?}");
         assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{space:?}: {}", volume(&mesh));
         for (p, n) in mesh.positions.iter().zip(&mesh.normals) {
             assert!((f64::from(p.length()) - RADIUS).abs() < 4e-3, "{space:?}: {p}");
@@ -132,7 +120,7 @@ fn places_of_a_lattice_come_back() {
 #[test]
 fn fused_depth_is_the_ball() {
     let mesh = fused(&views(&around(24, -0.95)), 64);
-    assert_eq!(open_edges(&mesh), 0);
+    assert_eq!(mesh.open_edges().len(), 0);
     assert!((volume(&mesh) / BALL_VOLUME - 1.0).abs() < 0.02, "{}", volume(&mesh));
     let off = mesh.positions.iter().map(|p| (f64::from(p.length()) - RADIUS).abs());
     let mean = off.sum::<f64>() / mesh.positions.len() as f64;
@@ -144,7 +132,7 @@ fn fused_depth_is_the_ball() {
 #[test]
 fn the_unseen_side_stays_open() {
     let mesh = fused(&views(&around(24, 0.05)), 64);
-    assert!(open_edges(&mesh) > 50, "{}", open_edges(&mesh));
+    assert!(mesh.open_edges().len() > 50, "{}", mesh.open_edges().len());
     for p in &mesh.positions {
         assert!((f64::from(p.length()) - RADIUS).abs() < 0.08, "{p}");
     }

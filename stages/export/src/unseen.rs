@@ -33,17 +33,8 @@ pub(crate) fn drop_unseen(views: &[SeenView], lattice: &Lattice, mesh: &mut Mesh
 
 /// Drops the triangles at a mesh's border: those with a vertex on an edge of one triangle alone.
 fn drop_border(mesh: &mut Mesh) {
-    let mut edges: Vec<[u32; 2]> = mesh
-        .triangles
-        .iter()
-        .flat_map(|&[a, b, c]| [[a, b], [b, c], [c, a]])
-        .map(|[a, b]| [a.min(b), a.max(b)])
-        .collect();
-    edges.par_sort_unstable();
     let mut is_border = vec![false; mesh.positions.len()];
-    for same in edges.chunk_by(|a, b| a == b).filter(|same| same.len() == 1) {
-        same[0].iter().for_each(|&vertex| is_border[vertex as usize] = true);
-    }
+    mesh.open_edges().iter().flatten().for_each(|&vertex| is_border[vertex as usize] = true);
     mesh.triangles.retain(|triangle| triangle.iter().all(|&vertex| !is_border[vertex as usize]));
 }
 
