@@ -122,14 +122,7 @@ impl Stage for Export {
     const ENVIRONMENT: &'static [&'static str] = fields::ENVIRONMENT;
 
     fn inputs() -> Vec<(&'static str, Input)> {
-        let cameras = [
-            "scene/train-cameras",
-            "scene/cameras",
-            "scene/truth",
-            "scene/train",
-            "cameras",
-            "views",
-        ];
+        let cameras = ["scene/cameras", "scene/truth", "scene/train", "cameras", "views"];
         vec![
             ("field", Input::required(&["field"], "a trained field")),
             ("cameras", Input::required(&cameras, "folder with views.json: the training cameras")),
@@ -221,9 +214,10 @@ impl ExportJob<'_> {
         if surfels.is_empty() {
             return Err(no_surface());
         }
+        let chosen = points::chosen(&surfels);
         if self.params.points {
-            self.write("points.ply", |file| points::write(file, &surfels))?;
-            summary.points = surfels.len();
+            self.write("points.ply", |file| points::write(file, &chosen))?;
+            summary.points = chosen.len();
         }
         if self.params.splats {
             self.write("splats.ply", |file| splats::write(file, &surfels))?;
@@ -233,7 +227,7 @@ impl ExportJob<'_> {
             let points = self.params.points.then_some("points.ply");
             let file = cameras::transforms(&self.cameras, points);
             self.context.write_json("transforms.json", &file)?;
-            for (name, text) in cameras::colmap(&self.cameras, &surfels) {
+            for (name, text) in cameras::colmap(&self.cameras, &chosen) {
                 self.write(&format!("colmap/sparse/0/{name}"), |file| {
                     file.write_all(text.as_bytes())
                 })?;

@@ -3,6 +3,14 @@ use std::io::{self, Write};
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
+/// Up to where a surface goes is known to about so many pixels, and so is the side that it turns.
+const UNSURE: u8 = 2;
+
+/// The surfels that become points: all but those at silhouettes, whose normals may be wrong.
+pub(crate) fn chosen(surfels: &[Surfel]) -> Vec<Surfel> {
+    surfels.iter().filter(|surfel| surfel.margin > UNSURE).copied().collect()
+}
+
 /// Writes points with normals and 8-bit colours, display-encoded sRGB.
 pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()> {
     let named = |names: [&str; 3], kind| names.map(|name| (name.to_owned(), kind));

@@ -39,8 +39,9 @@ pub(crate) struct SeenPixel {
     pub(crate) opacity: u8,
     /// Whether something nearer ends beside it: up to where isn't known to a pixel's width.
     pub(crate) is_edge: bool,
-    /// Whether its surface ends beside it: its normal is known by one side alone.
-    pub(crate) is_border: bool,
+    /// For how many pixels its surface goes on to each side in its row and its column, up to
+    /// [`BASELINE`].
+    pub(crate) margin: u8,
 }
 
 /// What a view says of a world point.
@@ -118,10 +119,10 @@ impl SeenView {
                 self.pixels[at].is_edge = beside.into_iter().chain(above).flatten().any(is_nearer);
                 let along = self.tangent(at, (x, width), 1);
                 let down = self.tangent(at, (y, height), width);
-                let (Some((along, is_inside)), Some((down, is_within))) = (along, down) else {
+                let (Some((along, in_row)), Some((down, in_column))) = (along, down) else {
                     continue;
                 };
-                self.pixels[at].is_border = !(is_inside && is_within);
+                self.pixels[at].margin = in_row.min(in_column);
                 let normal = along.cross(down).normalize_or_zero();
                 let towards = if normal.dot(self.point(at)) > 0.0 { -normal } else { normal };
                 self.pixels[at].normal = towards;
@@ -129,20 +130,21 @@ impl SeenView {
         }
     }
 
-    /// The way along the surface from before a pixel to behind it, in a row or a column, and whether
-    /// the surface goes on to both sides; `None` where it ends on both. `place` is the pixel's place
-    /// in its line and the line's length, `stride` the distance of the line's pixels.
+    /// The way along the surface from before a pixel to behind it, in a row or a column, and for how
+    /// many pixels the surface goes on to both sides; `None` where it ends on both. `place` is the
+    /// pixel's place in its line and the line's length, `stride` the distance of the line's pixels.
     fn tangent(
         &self,
         at: usize,
         (place, length): (usize, usize),
         stride: usize,
-    ) -> Option<(Vec3, bool)> {
-        let stride = stride.cast_signed();
-        let before = self.last_of_surface(at, place, -stride);
-        let after = self.last_of_surface(at, length - 1 - place, stride);
+    ) -> Option<(Vec3, u8)> {
+        let step = stride.cast_signed();
+        let before = self.last_of_surface(at, place, -step);
+        let after = self.last_of_surface(at, length - 1 - place, step);
         let way = self.point(after) - self.point(before);
-        (before != after).then_some((way, before != at && after != at))
+        let margin = (at - before).min(after - at) / stride;
+        (before != after).then_some((way, margin as u8))
     }
 
     /// The farthest pixel within [`BASELINE`] that still shows a pixel's surface, `room` pixels
@@ -277,6 +279,6 @@ fn seen(pixel: &Pixel, to_z: f32) -> SeenPixel {
         colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(OPAQUE))),
         opacity: level(pixel.opacity),
         is_edge: false,
-        is_border: false,
+        margin: 0,
     }
 }

@@ -11,6 +11,8 @@ pub(crate) struct Surfel {
     pub(crate) position: DVec3,
     /// Unit normal, towards the cameras that see it.
     pub(crate) normal: DVec3,
+    /// For how many pixels its surface goes on to all sides, where that is most.
+    pub(crate) margin: u8,
     /// Display-encoded sRGB, the mean over the views that see it.
     pub(crate) colour: [f32; 3],
     /// Mean opacity of the pixels that show it.
@@ -78,10 +80,8 @@ fn samples(views: &[SeenView], bounds: &Bounds, edge: f64) -> Vec<Sample> {
 
 /// The mean of a cell's pixels: those count more that see the surface from near and not aslant.
 fn surfel(views: &[SeenView], bounds: &Bounds, edge: f64, group: &[Sample]) -> Option<Surfel> {
-    // Up to where a surface goes is known to a pixel.
-    if group.iter().all(|&(_, number, at)| views[number as usize].pixel(at as usize).is_border) {
-        return None;
-    }
+    let margins = group.iter().map(|&(_, view, at)| views[view as usize].pixel(at as usize).margin);
+    let margin = margins.max().filter(|margin| *margin > 0)?;
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);
     let (mut opacity, mut footprint, mut cell, mut weights) = (0.0, 0.0, 0.0, 0.0);
     for &(_, number, at) in group {
@@ -103,6 +103,7 @@ fn surfel(views: &[SeenView], bounds: &Bounds, edge: f64, group: &[Sample]) -> O
     Some(Surfel {
         position: position / weights,
         normal,
+        margin,
         colour: (colour * share).as_vec3().to_array(),
         opacity: (opacity * share) as f32,
         spacing: (cell / weights).max(footprint / weights / (group.len() as f64).sqrt()),

@@ -9,7 +9,7 @@ use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::seen::SeenView;
 use crate::surfel::Surfel;
-use crate::{cameras, fusion, glb, points, splats, surface_nets, surfel};
+use crate::{cameras, fusion, glb, points, splats, surface_nets, surfel, unseen};
 
 /// A ball around the origin: red on the side of +x, blue on the other.
 struct Ball;
@@ -138,6 +138,25 @@ fn the_unseen_side_stays_open() {
     }
 }
 
+/// Fused surfaces go on a little beyond what is seen; that goes, and with it rows at the border alone.
+#[test]
+fn what_no_view_shows_is_dropped() {
+    let (cameras, lattice) = (around(24, 0.3), Lattice::new(&BOX, 64));
+    let views = views(&cameras);
+    let whole = fused(&views, 64);
+    let mut mesh = whole.clone();
+    unseen::drop_unseen(&views, &lattice, &mut mesh);
+    mesh.drop_small_pieces();
+    // Angle between the way to a camera and the ball's point where the line of sight touches it.
+    let is_seen = |p: &glam::Vec3| {
+        let outwards = p.as_dvec3().normalize();
+        cameras.iter().any(|c| outwards.dot(c.centre().normalize()) > RADIUS / 3.0)
+    };
+    assert!(!whole.positions.iter().all(is_seen) && mesh.positions.iter().all(is_seen));
+    let share = mesh.triangles.len() as f64 / whole.triangles.len() as f64;
+    assert!((0.7..1.0).contains(&share), "{share}");
+}
+
 #[test]
 fn surfels_lie_on_the_ball_and_face_outwards() {
     let views = views(&around(24, -0.95));
@@ -181,6 +200,7 @@ fn one_surfel() -> Surfel {
     Surfel {
         position: DVec3::new(1.0, 2.0, 3.0),
         normal: DVec3::new(0.0, -1.0, 0.0),
+        margin: 4,
         colour: [1.0, 0.5, 0.0],
         opacity: 0.75,
         spacing: 0.1,

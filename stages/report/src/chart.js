@@ -183,22 +183,46 @@ class Chart {
       const [x, y] = places[i];
       if (places.length < 60)
         shape("path", { class: "mark", d: mark, transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` }, group);
-      if (this.spec.named) {
-        const isRight = x > this.width * 0.7;
-        shape(
-          "text",
-          { class: "name", x: x + (isRight ? -9 : 9), y: y + 4, "text-anchor": isRight ? "end" : "start" },
-          group,
-          series.label,
-        );
-      }
       this.points.push({ ...point, place: places[i], series, index, order: i });
     });
   }
 
+  /** Writes series' names beside their points, chosen ones first, where nothing else is; whether all have room. */
+  drawNames() {
+    const box = ([x, y], [width, height]) => ({ left: x, right: x + width, top: y, bottom: y + height });
+    const overlap = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
+    const inside = box([MARGIN.left, 0], [this.width - MARGIN.left, HEIGHT - MARGIN.bottom]);
+    const isInside = ({ left, right, top, bottom }) =>
+      left >= inside.left && right <= inside.right && top >= inside.top && bottom <= inside.bottom;
+    const taken = this.points.map(({ place: [x, y] }) => box([x - 6, y - 6], [12, 12]));
+    // Points are in the order in which they are drawn: chosen ones last.
+    const placed = this.points.toReversed().filter(({ place: [x, y], series }) => {
+      const text = shape("text", { class: "name" }, this.svg, series.label);
+      const size = [text.getComputedTextLength(), 13];
+      const corners = [
+        [x + 9, y - 7],
+        [x - 9 - size[0], y - 7],
+        [x - size[0] / 2, y - 22],
+        [x - size[0] / 2, y + 9],
+      ];
+      const free = corners
+        .map((corner) => box(corner, size))
+        .find((place) => isInside(place) && !taken.some((other) => overlap(place, other)));
+      if (!free) {
+        text.remove();
+        return false;
+      }
+      taken.push(free);
+      text.setAttribute("x", free.left);
+      text.setAttribute("y", free.bottom - 2);
+      return true;
+    });
+    return placed.length === this.points.length;
+  }
+
   drawLegend(isCrowded) {
     this.legend.replaceChildren();
-    if (this.spec.series.length < 2 || this.spec.named) return;
+    if (this.spec.series.length < 2 || (this.spec.named && this.drawNames())) return;
     for (const [i, series] of this.spec.series.entries()) {
       if (isCrowded && !series.chosen) continue;
       const colour = (isCrowded ? series.chosen - 1 : i) % MOST_COLOURS;
@@ -208,7 +232,7 @@ class Chart {
       entry.append(series.label);
     }
     const rest = this.spec.series.filter((series) => !series.chosen).length;
-    const words = rest === this.spec.series.length ? `${rest} lines in grey` : `and ${rest} others in grey`;
+    const words = rest === this.spec.series.length ? `${rest} results in grey` : `and ${rest} others in grey`;
     if (isCrowded) element("span", { class: "rest" }, this.legend, words);
   }
 
