@@ -167,7 +167,7 @@ impl World {
 
     /// Keys that have a record, each with whether its artifact is whole: what a run needn't make.
     fn records(&self) -> BTreeMap<String, bool> {
-        let store = artifact::Store::open(&self.project.path(".nerf-sr")).unwrap();
+        let store = store::Store::open(&self.project.path(".nerf-sr")).unwrap();
         let keys = store.records().unwrap().into_iter().map(|record| record.key());
         keys.map(|key| (key.clone(), store.hit(&key).is_some())).collect()
     }

@@ -70,7 +70,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("pipeline", of::<planning::PipelineFile>()),
         ("describe", of::<artifact::Description>()),
         ("artifact", of::<artifact::Manifest>()),
-        ("action", of::<artifact::Record>()),
+        ("action", of::<store::Record>()),
         ("run", of::<artifact::RunRecord>()),
         ("views", of::<scene::Views>()),
         ("scene", of::<prep::SceneSummary>()),

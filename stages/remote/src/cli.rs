@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, Store, report_line};
+use artifact::{Failure, report_line};
 use clap::{CommandFactory as _, Parser, Subcommand};
+use store::Store;
 
 use crate::export::export;
 use crate::import::import;

@@ -6,11 +6,9 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{
-    Failure, MANIFEST_FILE, Manifest, Record, STORE_FORMAT, Store, counted, print_line,
-    report_line, sized,
-};
+use artifact::{Failure, MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
 use serde::Serialize;
+use store::{Record, Store};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
 use crate::intake::entered;
@@ -141,7 +139,7 @@ impl History {
     fn write_index(&self, out: &mut Writer) -> anyhow::Result<()> {
         let index = Index {
             export: EXPORT,
-            store: STORE_FORMAT,
+            store: store::FORMAT,
             artifact: self.artifact.clone(),
             objects: self.objects.iter().cloned().collect(),
             actions: self.records.keys().cloned().collect(),

@@ -5,10 +5,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{
-    Arrival, Failure, FileEntry, MANIFEST_FILE, Record, STORE_FORMAT, Store, counted, print_line,
-    sized,
-};
+use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, print_line, sized};
+use store::{Arrival, Record, Store};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
@@ -145,7 +143,7 @@ impl<'a, R: Read> Reader<'a, R> {
         let bytes = self.small(INDEX, MANIFEST_LIMIT)?;
         let value: serde_json::Value =
             serde_json::from_slice(&bytes).map_err(|e| self.refuse(format!("{INDEX}: {e}")))?;
-        for (field, known) in [("export", EXPORT), ("store", STORE_FORMAT)] {
+        for (field, known) in [("export", EXPORT), ("store", store::FORMAT)] {
             if value
                 .get(field)
                 .and_then(serde_json::Value::as_u64)

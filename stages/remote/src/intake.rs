@@ -3,10 +3,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{
-    Arrival, Damage, Entered, Failure, FileEntry, Locked, MANIFEST_FILE, Manifest, Record, RunFile,
-    Store, relative_path, report_line,
-};
+use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
+use store::{Arrival, Entered, Locked, Record, RunFile, Store};
 
 use crate::selection::is_hash;
 

@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry, MANIFEST_FILE, Record, Store, counted, print_line, sized};
+use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, print_line, sized};
+use store::{Record, Store};
 
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
 use crate::progress::Progress;

@@ -3,9 +3,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{
-    FileEntry, MANIFEST_FILE, Manifest, Record, Store, counted, print_line, report_line, sized,
-};
+use artifact::{FileEntry, MANIFEST_FILE, Manifest, counted, print_line, report_line, sized};
+use store::{Record, Store};
 
 use crate::intake::entered;
 use crate::progress::Progress;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use artifact::{Failure, STORE_FORMAT};
+use artifact::Failure;
 use futures_util::{StreamExt as _, TryStreamExt as _};
 use object_store::aws::AmazonS3Builder;
 use object_store::local::LocalFileSystem;
@@ -12,6 +12,7 @@ use object_store::path::Path;
 use object_store::{
     ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig,
 };
+use store::FORMAT;
 
 /// A server that says nothing for so long is given up.
 const SILENCE: Duration = Duration::from_secs(60);
@@ -203,10 +204,10 @@ impl Remote {
         };
         let text = String::from_utf8_lossy(&bytes);
         match text.trim().parse::<u32>() {
-            Ok(found) if found < STORE_FORMAT && access == Access::Write => self.mark().await,
-            Ok(found) if found <= STORE_FORMAT => Ok(()),
+            Ok(found) if found < FORMAT && access == Access::Write => self.mark().await,
+            Ok(found) if found <= FORMAT => Ok(()),
             _ => Err(Failure::BadInput(format!(
-                "{}: the remote has format {}, this nerf-sr-remote knows format {STORE_FORMAT}; \
+                "{}: the remote has format {}, this nerf-sr-remote knows format {FORMAT}; \
                 use the newer nerf-sr-remote, or another remote",
                 self.name,
                 text.trim()
@@ -217,6 +218,6 @@ impl Remote {
 
     /// Marks the remote as of this program's format.
     async fn mark(&self) -> anyhow::Result<()> {
-        self.write("format", format!("{STORE_FORMAT}\n").into_bytes()).await
+        self.write("format", format!("{FORMAT}\n").into_bytes()).await
     }
 }

@@ -1,6 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::{Failure, Record, counted};
+use artifact::{Failure, counted};
+use store::Record;
 
 /// Which actions are copied.
 #[derive(clap::Args, Clone, Debug, Default)]

@@ -6,9 +6,10 @@ use std::fs;
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
-use artifact::{FileEntry, Manifest, Record, Store};
+use artifact::{FileEntry, Manifest};
 use common::{assert_clean, assert_equal, assert_tidy, command, said, sample, succeed};
 use serde_json::{Value, json};
+use store::{Record, Store};
 
 fn exported(dir: &Path, store: &Store, what: &str, options: &[&str]) -> PathBuf {
     let file = dir.join("export.tar");

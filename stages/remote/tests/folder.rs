@@ -6,8 +6,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
-use artifact::{MANIFEST_FILE, Manifest, Record, Store, write_json};
+use artifact::{MANIFEST_FILE, Manifest, write_json};
 use common::{Setup, assert_clean, assert_equal, assert_tidy, command, make, said, succeed};
+use store::{Record, Store};
 
 #[test]
 fn what_is_pushed_is_pulled() {

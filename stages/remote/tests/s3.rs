@@ -9,8 +9,8 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use artifact::Store;
 use common::{assert_clean, assert_equal, assert_tidy, bytes, make, said, sample};
+use store::Store;
 
 const REMOTE: &str = "s3://shared/team/store";
 

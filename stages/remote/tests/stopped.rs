@@ -7,8 +7,8 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::{Duration, Instant};
 
-use artifact::Store;
 use common::{Setup, assert_clean, assert_equal, bytes, command, make, succeed};
+use store::Store;
 
 /// A server that takes connections and says nothing holds up nobody who interrupts.
 #[test]

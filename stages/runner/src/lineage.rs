@@ -3,10 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use artifact::{Manifest, Record, Store, label};
+use artifact::{Manifest, label};
 use planning::{Change, changes};
 use serde::Serialize;
 use serde_json::{Map, Value};
+use store::{Record, Store};
 
 /// Metrics of an artifact.
 const METRICS_FILE: &str = "metrics.json";

@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use artifact::{Record, RunInput, hash_json};
+use artifact::{RunInput, hash_json};
 use planning::{Change, Plan, State};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use slurm::Job;
+use store::Record;
 
 use crate::session::Session;
 

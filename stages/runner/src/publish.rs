@@ -7,8 +7,9 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{Locked, MANIFEST_FILE, Manifest, StoreError, list_files};
+use artifact::{MANIFEST_FILE, Manifest, list_files};
 use stage_call::StageFailure;
+use store::{Locked, StoreError};
 
 use crate::aside::{MARK, Mark, place_aside};
 use crate::waiting::until_held;

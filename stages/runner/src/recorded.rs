@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use artifact::{FailedPoint, Record, RunNode, RunRecord, Store, UnfinishedNode};
+use artifact::{FailedPoint, RunNode, RunRecord, UnfinishedNode};
 use planning::{Node, Origin, Plan, Sink};
 use serde_json::Map;
 use stage_call::StageFailure;
+use store::{Record, Store};
 
 /// How a run went.
 pub(crate) struct Course<'a> {

@@ -3,9 +3,10 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Store, check_device, report_text};
+use artifact::{check_device, report_text};
 use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State, known_blocks};
 use slurm::{Job, Queue, Slurm};
+use store::Store;
 
 use crate::execute::identities;
 

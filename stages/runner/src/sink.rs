@@ -4,10 +4,11 @@
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
-use artifact::{MANIFEST_FILE, Manifest, Record, RunFile, RunRecord, Store, hash_json, write_json};
+use artifact::{MANIFEST_FILE, Manifest, RunRecord, hash_json, write_json};
 use planning::{Plan, Sink};
 use serde_json::json;
 use stage_call::{Call, Display, StageFailure};
+use store::{Record, RunFile, Store};
 
 use crate::aside::Mark;
 use crate::publish;

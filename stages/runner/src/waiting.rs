@@ -3,8 +3,8 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Entered, Holder, Locked, Store, StoreError, host_name};
 use stage_call::{StageFailure, seconds};
+use store::{Entered, Holder, Locked, Store, StoreError, host_name};
 
 /// Between two attempts.
 const PAUSE: Duration = Duration::from_millis(20);

@@ -3,10 +3,11 @@
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use artifact::{Record, hash_json};
+use artifact::hash_json;
 use planning::{Node, Plan, Sink, State, short};
 use serde_json::Value;
 use stage_call::seconds;
+use store::Record;
 
 use crate::session::Session;
 

@@ -1,15 +1,13 @@
-//! The stage contract: what makes an executable a stage of the pipeline, and where its results are
-//! kept.
+//! The stage contract: what makes an executable a stage of the pipeline.
 //!
 //! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
 //!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
 //! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and
 //!   blake3); its hash is the artifact's identity.
-//! * [`Store`]: objects by content, actions by key, one OS lock a key; what runs and pins need.
 //! * [`RunRecord`]: what a sink (the report) is told of a run.
 //! * [`canonical`]: the one JSON form that is ever hashed.
 //!
-//! No pixels, no tensors: the runner uses this crate alone.
+//! No pixels, no tensors, no store: the runner uses this crate, too.
 //!
 //! ```no_run
 //! use artifact::{Context, Description, Output, Stage, run_stage};
@@ -39,7 +37,6 @@
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
 mod amounts;
-mod arrivals;
 mod canonical;
 mod console;
 mod describe;
@@ -48,11 +45,9 @@ mod documented;
 mod failure;
 mod fsio;
 mod help;
-mod lock;
 mod manifest;
 mod memory;
 mod nearest;
-mod objects;
 mod panics;
 mod parameters;
 mod parts;
@@ -61,25 +56,21 @@ mod progress;
 mod renames;
 mod rules;
 mod run_record;
-mod runs;
 mod signals;
 mod stage;
-mod store;
 mod tagged;
 mod validator;
 mod values;
 mod warnings;
 
 pub use amounts::{amount, counted, sized};
-pub use arrivals::Arrival;
 pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
 pub use describe::{Description, DescriptionError, Input, Output};
 pub use device::{DeviceError, check_device};
 pub use documented::{GROUPS, ParameterSection, ParameterText, by_group};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
-pub use fsio::{write_atomically, write_json};
-pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
+pub use fsio::{sync_folder, write_atomically, write_json};
 pub use manifest::{
     Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, hash_files, list_files, relative_path,
 };
@@ -92,24 +83,13 @@ pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
 pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
 pub use rules::{GivenInputs, Rule, RuleError};
 pub use run_record::{
-    FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, folders_of,
+    FailedPoint, RunInput, RunNode, RunRecord, RunRecordError, UnfinishedNode, folders_of, label,
 };
-pub use runs::{Run, RunFile, Waiting};
 pub use signals::stop_on_signals;
 pub use stage::{Context, GivenInput, RUNNER_VARIABLE, SUMMARY_FILE, Stage, run_stage};
-pub use store::{
-    Attempt, Checked, FORMAT as STORE_FORMAT, KEY_VERSION, KEY_VERSION_PART, Record, Store,
-    StoreError, Unfinished, label,
-};
 pub use warnings::{WARNING, warnings_of, with_warnings};
 
 /// Seconds since 1970.
 pub fn unix_time() -> u64 {
     std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0, |d| d.as_secs())
-}
-
-/// Tells names apart that one process gives.
-fn unique() -> u32 {
-    static COUNT: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
-    COUNT.fetch_add(1, std::sync::atomic::Ordering::Relaxed)
 }

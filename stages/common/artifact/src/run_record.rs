@@ -133,6 +133,11 @@ pub struct RunInput {
     pub folder: Option<PathBuf>,
 }
 
+/// A stage and a sweep's point, as people read it.
+pub fn label(stage: &str, point: &str) -> String {
+    if point.is_empty() { stage.to_owned() } else { format!("{stage} [{point}]") }
+}
+
 /// A node that needs one that doesn't come before it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("run.json: {stage}{} needs a node that doesn't come before it", named(.input.as_deref()))]

@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use artifact::{Record, Store, StoreError, Unfinished};
+use store::{Record, Store, StoreError, Unfinished};
 
 /// What lies in a store.
 pub(crate) struct Contents {

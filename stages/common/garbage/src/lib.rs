@@ -14,8 +14,9 @@ mod tests;
 
 use std::collections::BTreeMap;
 
-use artifact::{Closed, Record, Run, Store, StoreError, label, unix_time};
+use artifact::{label, unix_time};
 use serde::Serialize;
+use store::{Closed, Record, Run, Store, StoreError};
 
 pub use roots::{Choice, Root};
 

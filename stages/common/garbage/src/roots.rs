@@ -1,7 +1,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
-use artifact::{Run, Store, StoreError, Waiting, unix_time};
+use artifact::unix_time;
 use slurm::{Queue, Slurm};
+use store::{Run, Store, StoreError, Waiting};
 
 use crate::contents::Contents;
 

@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 
-use artifact::{
-    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting,
-    hash_json, unix_time,
-};
+use artifact::{hash_json, unix_time};
 use proptest::prelude::*;
 use serde_json::{Map, Value, json};
+use store::{
+    KEY_VERSION, KEY_VERSION_PART, KeyLock, Locked, Record, RunFile, Store, Unfinished, Waiting,
+};
 
 use super::{Choice, Root, judge};
 
@@ -111,7 +111,7 @@ struct Made {
 
 /// Attempts until it is held: other tests start programs, and a file that was open when one started
 /// stays locked until it is loaded.
-fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, artifact::StoreError>) -> T {
+fn held<T>(mut attempt: impl FnMut() -> Result<Locked<T>, store::StoreError>) -> T {
     loop {
         if let Locked::Held(held) = attempt().unwrap() {
             return held;

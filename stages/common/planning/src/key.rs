@@ -3,8 +3,8 @@
 
 use std::cmp::Reverse;
 
-use artifact::{KEY_VERSION, KEY_VERSION_PART, Record};
 use serde_json::{Map, Value, json};
+use store::{KEY_VERSION, KEY_VERSION_PART, Record};
 
 use crate::changes::{Change, changes};
 use crate::node::Node;

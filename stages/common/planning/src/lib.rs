@@ -12,7 +12,7 @@
 //! ```no_run
 //! use planning::{Asking, Pipeline, Plan, Request};
 //! let pipeline = Pipeline::read("pipeline.yaml".as_ref())?;
-//! let store = artifact::Store::open(".nerf-sr".as_ref())?;
+//! let store = store::Store::open(".nerf-sr".as_ref())?;
 //! let plan = Plan::new(&pipeline, &store, &Request::default(), Asking::Look)?;
 //! println!("{} nodes", plan.nodes.len());
 //! # Ok::<(), Box<dyn std::error::Error>>(())

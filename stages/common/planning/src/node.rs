@@ -2,10 +2,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{FailedPoint, Record, RunInput, Waiting, hash_json, label};
+use artifact::{FailedPoint, RunInput, hash_json, label};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use slurm::Resources;
+use store::{Record, Waiting};
 
 use crate::stages::StageProgram;
 

@@ -1,8 +1,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use artifact::{Description, Store, hash_json};
+use artifact::{Description, hash_json};
 use slurm::Resources;
+use store::Store;
 
 use crate::axes::Scope;
 use crate::check::{self, closure, needs};

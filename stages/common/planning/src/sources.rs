@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use artifact::{Store, hash_files, hash_json, list_files, write_atomically};
+use artifact::{hash_files, hash_json, list_files, write_atomically};
 use serde::{Deserialize, Serialize};
+use store::Store;
 
 /// Hashes by the folder's path, kept as long as the files' paths, sizes and modification times
 /// stay.

@@ -12,10 +12,11 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Description, Schema, Store, nearest, write_atomically};
+use artifact::{Description, Schema, nearest, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage_call::{Answers, Interrupted, ask_all};
+use store::Store;
 
 use crate::file::StageBlock;
 use crate::part::{Part, PipelineError};

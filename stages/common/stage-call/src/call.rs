@@ -1,6 +1,7 @@
 //! One call of a stage: its process, its pipes, its end.
 
 use std::collections::VecDeque;
+use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::process::CommandExt as _;
 use std::path::{Path, PathBuf};
@@ -8,7 +9,7 @@ use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Description, Event, KeyLock, SUMMARY_FILE, counted, printable, sized};
+use artifact::{Description, Event, SUMMARY_FILE, counted, printable, sized};
 use rustix::process::{
     Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid,
 };
@@ -60,8 +61,8 @@ pub struct Call<'a> {
     pub device: &'a str,
     /// `--threads`.
     pub threads: usize,
-    /// The key's lock, which the stage holds on to as its standard input.
-    pub lock: Option<&'a KeyLock>,
+    /// The file of the key's lock, which the stage holds on to as its standard input.
+    pub lock: Option<&'a File>,
 }
 
 /// How a stage ended, if not well.
@@ -165,7 +166,7 @@ impl Call<'_> {
     ) -> Result<Usage, StageFailure> {
         let fail = |e: std::io::Error| StageFailure::at(self.program, &e);
         let stdin = match self.lock {
-            Some(lock) => Stdio::from(lock.share().map_err(fail)?),
+            Some(lock) => Stdio::from(lock.try_clone().map_err(fail)?),
             None => Stdio::null(),
         };
         let mut child = self.command().stdin(stdin).spawn().map_err(fail)?;

@@ -6,8 +6,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
-use artifact::{Entered, Locked, Record, Store, Unfinished};
 use serde_json::json;
+use store::{Entered, Locked, Record, Store, Unfinished};
 
 pub(crate) fn entered(store: &Store) -> Entered {
     match store.try_enter().unwrap() {

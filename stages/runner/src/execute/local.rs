@@ -9,9 +9,10 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, Record, SUMMARY_FILE, print_line, print_lines, report_line, report_text};
+use artifact::{Failure, SUMMARY_FILE, print_line, print_lines, report_line, report_text};
 use planning::{Plan, Sink};
 use stage_call::{Display, StageFailure};
+use store::Record;
 
 use super::node::{Action, Found, folder_of};
 use super::places::{Budget, Need, Place, Places};

@@ -9,8 +9,8 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
 
-use artifact::RunFile;
 use planning::Plan;
+use store::RunFile;
 
 use crate::session::Session;
 

@@ -5,13 +5,11 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{
-    Attempt, Entered, Holder, KeyLock, Record, RunFile, SUMMARY_FILE, Store, Unfinished, hash_json,
-    host_name, unix_time,
-};
+use artifact::{SUMMARY_FILE, hash_json, unix_time};
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use serde_json::{Map, Value};
 use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds};
+use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
 
 use crate::waiting::{by, enter, until_held};
 use crate::watch::{Chain, Watch, Watching};
@@ -157,7 +155,7 @@ impl NodeJob<'_> {
             from_checkpoint: false,
             device: self.device(),
             threads: self.threads,
-            lock: Some(lock),
+            lock: Some(lock.file()),
         };
         let view = self.display.start(&label);
         let started = Instant::now();

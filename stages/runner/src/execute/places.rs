@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use artifact::{Record, sized};
+use artifact::sized;
 use planning::nearest;
 use serde_json::{Map, Value};
+use store::Record;
 
 /// What a stage is expected to take.
 #[derive(Clone, Copy, Debug, PartialEq)]

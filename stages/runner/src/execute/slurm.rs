@@ -6,10 +6,11 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
-use artifact::{Failure, Record, Store, counted, hash_json, print_line, report_line};
+use artifact::{Failure, counted, hash_json, print_line, report_line};
 use planning::{Frozen, Origin, Plan, PlanError, State, source_hash};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
+use store::{Record, Store};
 
 use super::{Executor, Work};
 use crate::counts;

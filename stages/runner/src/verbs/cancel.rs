@@ -1,7 +1,8 @@
 use std::process::ExitCode;
 
-use artifact::{Store, counted, print_line};
+use artifact::{counted, print_line};
 use slurm::{Queue, Slurm};
+use store::Store;
 
 /// Cancels the jobs of this store, or those of one stage. Jobs that need them go with them.
 pub(crate) fn cancel(store: &Store, stage: Option<&str>) -> anyhow::Result<ExitCode> {

@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{Record, RunFile, Store, print_line, report_line, report_text, stop_on_signals};
+use artifact::{print_line, report_line, report_text, stop_on_signals};
 use planning::{Frozen, Node, Plan, Sink, StageProgram, State};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
 use stage_call::{Display, StageFailure, ask_all};
+use store::{Record, RunFile, Store};
 
 use super::run::register;
 use crate::execute::{NodeJob, say_aside};

@@ -2,9 +2,10 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Store, StoreError, label, print_line, print_lines};
+use artifact::{label, print_line, print_lines};
 use planning::{Plan, Request, State};
 use stage_call::utc;
+use store::{Store, StoreError};
 
 use crate::execute::identities;
 use crate::session::{Session, of_stage};

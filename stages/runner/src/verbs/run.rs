@@ -2,9 +2,10 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use artifact::{Failure, RunFile, Store, report_line, stop_on_signals};
+use artifact::{Failure, report_line, stop_on_signals};
 use planning::{Plan, Request, State};
 use stage_call::StageFailure;
+use store::{RunFile, Store};
 
 use crate::execute::{Executor, Work};
 use crate::session::{Session, command_line};
@@ -36,7 +37,7 @@ pub(super) fn register(
     plan: &Plan,
     stop: &AtomicBool,
 ) -> Result<RunFile, StageFailure> {
-    let fail = |e: artifact::StoreError| StageFailure { code: 1, message: e.to_string() };
+    let fail = |e: store::StoreError| StageFailure { code: 1, message: e.to_string() };
     let entered = enter(store, stop, &|text| report_line!("nerf-sr: {text}"))?;
     let file = store.begin_run(&entered, command_line()).map_err(fail)?;
     // A source that can't be read is said when the stage's turn comes; other stages may not need

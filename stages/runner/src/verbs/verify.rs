@@ -1,7 +1,8 @@
 use std::process::ExitCode;
 
-use artifact::{Store, counted, print_line};
+use artifact::{counted, print_line};
 use indicatif::{ProgressBar, ProgressStyle};
+use store::Store;
 
 use crate::waiting::enter_at_once;
 

@@ -1,7 +1,8 @@
 use std::process::ExitCode;
 
-use artifact::{Record, print_line};
+use artifact::print_line;
 use planning::{Plan, Request, State};
+use store::Record;
 
 use crate::node_report::PlanReport;
 use crate::session::{Session, of_stage};

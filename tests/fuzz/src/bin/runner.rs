@@ -6,9 +6,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use artifact::{Description, Record, Schema};
+use artifact::{Description, Schema};
 use libfuzzer_sys::fuzz_target;
 use planning::{Pipeline, Plan, Request};
+use store::Record;
 
 macro_rules! seed {
     ($name:literal) => {

@@ -3,12 +3,14 @@ use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
+use artifact::{unix_time, write_atomically};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::action::Record;
+use crate::error::{StoreError, at};
+use crate::folder::{Store, unique};
 use crate::lock::{Entered, Holder, is_locked};
-use crate::store::{Record, Store, StoreError, at};
-use crate::{unique, unix_time};
 
 /// A line of a run's file: what the run needs becomes known while it goes on.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -196,7 +198,7 @@ impl Store {
         let texts = lines.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>();
         let text = texts.map_err(|e| StoreError::NoArtifact(e.to_string()))?.join("\n") + "\n";
         let path = self.pin_path(name);
-        at(&path, crate::write_atomically(&path, text.as_bytes()))
+        at(&path, write_atomically(&path, text.as_bytes()))
     }
 
     /// Takes a pin away; whether there was one.
@@ -230,16 +232,10 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::Locked;
     use serde_json::json;
 
-    fn entered(store: &Store) -> Entered {
-        match store.try_enter().unwrap() {
-            Locked::Held(entered) => entered,
-            Locked::By(_) => panic!("closed"),
-        }
-    }
+    use super::*;
+    use crate::testing::entered;
 
     #[test]
     fn a_run_is_in_progress_while_its_file_is_held() {

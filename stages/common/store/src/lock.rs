@@ -3,12 +3,13 @@ use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 
+use artifact::unix_time;
 use serde::{Deserialize, Serialize};
 
-use crate::store::{Store, StoreError, at};
-use crate::unix_time;
+use crate::error::{StoreError, at};
+use crate::folder::Store;
 
-/// The lock on a key; held while it, or a process that was handed [`KeyLock::share`], lives.
+/// The lock on a key; held while it, or a process that was handed its [`KeyLock::file`], lives.
 #[derive(Debug)]
 pub struct KeyLock {
     file: File,
@@ -17,8 +18,8 @@ pub struct KeyLock {
 impl KeyLock {
     /// The lock's file, to be handed to the stage as its standard input, which reads as empty. So
     /// the lock outlives a runner that is killed while its stage still writes.
-    pub fn share(&self) -> io::Result<File> {
-        self.file.try_clone()
+    pub fn file(&self) -> &File {
+        &self.file
     }
 }
 
@@ -121,16 +122,6 @@ impl Store {
         self.root().join("locks").join(key)
     }
 
-    /// The file of the lock between runs and garbage collection.
-    pub(crate) fn gate(&self) -> Result<File, StoreError> {
-        let path = self.gate_path();
-        at(&path, File::options().create(true).append(true).open(&path))
-    }
-
-    fn gate_path(&self) -> PathBuf {
-        self.root().join("gate")
-    }
-
     /// Enters the store unless it is closed, or a newer program has marked it meanwhile.
     pub fn try_enter(&self) -> Result<Locked<Entered>, StoreError> {
         let path = self.gate_path();
@@ -206,7 +197,7 @@ mod tests {
     fn a_lock_is_exclusive_and_dropped_with_its_last_owner() {
         let (_dir, store) = store();
         let lock = held(store.try_lock("k").unwrap());
-        let shared = lock.share().unwrap();
+        let shared = lock.file().try_clone().unwrap();
         let Locked::By(Some(holder)) = store.try_lock("k").unwrap() else { panic!("not held") };
         assert_eq!((holder.pid, holder.host), (std::process::id(), host_name()));
         drop(lock);
@@ -225,7 +216,7 @@ mod tests {
         for _ in 0..2 {
             let lock = held(store.try_lock("k").unwrap());
             let mut text = String::new();
-            io::Read::read_to_string(&mut lock.share().unwrap(), &mut text).unwrap();
+            io::Read::read_to_string(&mut lock.file(), &mut text).unwrap();
             assert_eq!(text, "");
         }
     }

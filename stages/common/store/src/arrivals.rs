@@ -1,8 +1,12 @@
 use std::path::{Path, PathBuf};
 
+use artifact::{Damage, MANIFEST_FILE, Manifest};
+
+use crate::action::Record;
+use crate::error::StoreError;
+use crate::folder::Store;
 use crate::lock::Entered;
-use crate::manifest::{Damage, MANIFEST_FILE, Manifest};
-use crate::store::{Record, Store, StoreError, make_durable};
+use crate::objects::make_durable;
 
 /// An artifact from another store, found whole in a scratch folder of this one.
 #[derive(Debug)]
@@ -53,9 +57,12 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::{Locked, write_json};
     use std::fs;
+
+    use artifact::write_json;
+
+    use super::*;
+    use crate::testing::entered;
 
     fn arriving(store: &Store, content: &str) -> (PathBuf, String) {
         let folder = store.scratch("run").join("arriving");
@@ -80,7 +87,7 @@ mod tests {
     fn what_is_whole_stays() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
-        let Locked::Held(entered) = store.try_enter().unwrap() else { panic!("closed") };
+        let entered = entered(&store);
         let take = |host: &str| {
             let (folder, identity) = arriving(&store, "1234");
             store.take_in(&entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();

@@ -1,0 +1,51 @@
+//! The store: artifacts by content and actions by key, kept in one folder.
+//!
+//! * [`Store`]: the folder. It is opened at its [`FORMAT`], and says where each thing lies.
+//! * [`Record`], [`Unfinished`]: an action that is done, and one that was begun, by the key.
+//! * [`Attempt`], [`Checked`]: from a stage's output to an object and its record.
+//! * [`Arrival`]: an artifact that comes from another store.
+//! * [`KeyLock`]: one OS lock a key. [`Entered`] and [`Closed`]: runs and garbage collection keep
+//!   clear of each other.
+//! * [`RunFile`], [`Run`], [`Waiting`]: what runs and pins need.
+//!
+//! Stages don't use this crate: they write a folder, and the runner takes it in.
+//!
+//! ```no_run
+//! use store::{Locked, Record, Store, Unfinished};
+//!
+//! let store = Store::open(".nerf-sr".as_ref())?;
+//! if let Locked::Held(entered) = store.try_enter()? {
+//!     let action = Unfinished { stage: "greet".to_owned(), ..Unfinished::default() };
+//!     let attempt = store.begin(&entered, &action, &serde_json::json!({}))?;
+//!     std::fs::create_dir(&attempt.output)?;
+//!     std::fs::write(attempt.output.join("greeting.txt"), "Hello")?;
+//!     let checked = store.check(attempt, "text")?;
+//!     let record = Record { stage: action.stage, ..Record::default() };
+//!     let record = store.publish(&entered, checked, record)?;
+//!     assert_eq!(store.hit(&record.key()), Some(record));
+//! }
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
+mod action;
+mod arrivals;
+mod attempt;
+mod error;
+mod folder;
+mod format;
+mod lock;
+mod objects;
+mod runs;
+#[cfg(test)]
+mod testing;
+
+pub use action::{KEY_VERSION, KEY_VERSION_PART, Record, Unfinished};
+pub use arrivals::Arrival;
+pub use attempt::{Attempt, Checked};
+pub use error::StoreError;
+pub use folder::Store;
+pub use format::FORMAT;
+pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
+pub use runs::{Run, RunFile, Waiting};

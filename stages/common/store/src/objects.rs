@@ -1,0 +1,150 @@
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use artifact::{Damage, MANIFEST_FILE, Manifest, sync_folder};
+
+use crate::error::{StoreError, at};
+use crate::folder::Store;
+
+impl Store {
+    /// Identities of all objects, sorted. Names that can't be an identity are somebody else's.
+    pub fn objects(&self) -> Result<Vec<String>, StoreError> {
+        let mut names = self.names("objects")?;
+        names.retain(|name| is_identity(name));
+        Ok(names)
+    }
+
+    /// Somebody else's files and folders among the objects, sorted.
+    pub fn foreign_entries(&self) -> Result<Vec<PathBuf>, StoreError> {
+        let folder = self.root().join("objects");
+        let mut foreign = Vec::new();
+        for entry in at(&folder, fs::read_dir(&folder))? {
+            let entry = at(&folder, entry)?;
+            if !entry.file_name().to_str().is_some_and(is_identity) {
+                foreign.push(entry.path());
+            }
+        }
+        foreign.sort_unstable();
+        Ok(foreign)
+    }
+
+    /// Whether an object has its own manifest and files of the right sizes; no content is read.
+    pub fn is_whole(&self, identity: &str) -> bool {
+        let manifest =
+            self.manifest(identity).ok().filter(|manifest| manifest.identity() == identity);
+        manifest.is_some_and(|manifest| manifest.check_sizes(&self.object(identity)).is_ok())
+    }
+
+    /// An object's manifest.
+    pub fn manifest(&self, identity: &str) -> Result<Manifest, Damage> {
+        Manifest::read(&self.object(identity))
+    }
+
+    /// Re-hashes one object.
+    pub fn verify(&self, identity: &str) -> Result<(), Damage> {
+        let folder = self.object(identity);
+        let manifest = self.manifest(identity)?;
+        if manifest.identity() != identity {
+            return Err(Damage::Content { path: folder.join(MANIFEST_FILE) });
+        }
+        manifest.check_contents(&folder)
+    }
+
+    /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions
+    /// may make one object at once: it is moved where there is nothing, and what is there then
+    /// stays if it is whole.
+    pub(crate) fn place(
+        &self,
+        folder: &Path,
+        identity: &str,
+        is_there: bool,
+    ) -> Result<(), StoreError> {
+        use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty, NotADirectory};
+        let object = self.object(identity);
+        if is_there && object.exists() {
+            return Ok(());
+        }
+        loop {
+            match fs::rename(folder, &object) {
+                Ok(()) => return at(&object, sync_folder(&self.root().join("objects"))),
+                Err(error)
+                    if matches!(
+                        error.kind(),
+                        AlreadyExists | DirectoryNotEmpty | NotADirectory
+                    ) => {}
+                Err(source) => return Err(StoreError::Io { path: object, source }),
+            }
+            if self.verify(identity).is_ok() {
+                return Ok(());
+            }
+            match self.discard(&object) {
+                // The other action was faster.
+                Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {}
+                result => result?,
+            }
+        }
+    }
+
+    /// Removes an object; records that name it count as absent from then on.
+    pub fn remove_object(&self, identity: &str) -> Result<(), StoreError> {
+        self.discard(&self.object(identity))
+    }
+}
+
+/// Whether a name is a hash as the store writes it: in lower case.
+fn is_identity(name: &str) -> bool {
+    name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
+}
+
+/// Makes the files of an artifact durable, its manifest among them.
+pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), StoreError> {
+    for file in manifest.files.iter().map(|file| file.path.as_str()).chain([MANIFEST_FILE]) {
+        let path = folder.join(file);
+        at(&path, File::open(&path).and_then(|f| f.sync_all()))?;
+    }
+    at(folder, sync_folder(folder))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::make;
+
+    /// A name is either an object's or foreign.
+    #[test]
+    fn a_name_in_upper_case_is_foreign() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let object = "0a".repeat(32);
+        let others = [".hidden".to_owned(), "0".repeat(63), "0A".repeat(32), "g".repeat(64)];
+        for name in others.iter().chain([&object]) {
+            fs::create_dir(store.object(name)).unwrap();
+        }
+        assert_eq!(store.objects().unwrap(), [object]);
+        assert_eq!(store.foreign_entries().unwrap(), others.map(|name| store.object(&name)));
+    }
+
+    /// Actions with different keys mend one damaged object at once, again and again.
+    #[test]
+    fn actions_at_once_make_one_object() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let output = make(&store, "a", "1234").output;
+        for round in 0..200 {
+            fs::write(store.object(&output).join("x"), "4321").unwrap();
+            std::thread::scope(|scope| {
+                for action in 0..3 {
+                    let store = &store;
+                    scope.spawn(move || {
+                        assert_eq!(
+                            make(store, &format!("{round} {action}"), "1234").output.len(),
+                            64
+                        );
+                    });
+                }
+            });
+            store.verify(&output).unwrap();
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! Actions for tests.
+
+use std::fs;
+
+use serde_json::json;
+
+use crate::action::{Record, Unfinished};
+use crate::attempt::Attempt;
+use crate::folder::Store;
+use crate::lock::{Entered, Locked};
+
+pub(crate) fn entered(store: &Store) -> Entered {
+    match store.try_enter().unwrap() {
+        Locked::Held(entered) => entered,
+        Locked::By(_) => panic!("closed"),
+    }
+}
+
+fn unfinished(name: &str) -> Unfinished {
+    Unfinished {
+        stage: name.to_owned(),
+        key_parts: json!({ "stage": name }).as_object().unwrap().clone(),
+        ..Default::default()
+    }
+}
+
+/// Begins an action and, unless told otherwise, makes its output.
+pub(crate) fn begin(store: &Store, name: &str, content: Option<&str>) -> Attempt {
+    let attempt = store.begin(&entered(store), &unfinished(name), &json!({})).unwrap();
+    if let Some(content) = content {
+        fs::create_dir(&attempt.output).unwrap();
+        fs::write(attempt.output.join("x"), content).unwrap();
+    }
+    attempt
+}
+
+pub(crate) fn make(store: &Store, name: &str, content: &str) -> Record {
+    let checked = store.check(begin(store, name, Some(content)), "text").unwrap();
+    let Unfinished { stage, key_parts, .. } = unfinished(name);
+    let record = Record { stage, key_parts, threads: 1, ..Record::default() };
+    store.publish(&entered(store), checked, record).unwrap()
+}
