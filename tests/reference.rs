@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use artifact::{Description, ParameterSection, by_group};
+use contract::{Description, ParameterSection, by_group};
 use serde_json::Value;
 
 use crate::common::verbs_of;

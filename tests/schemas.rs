@@ -11,7 +11,7 @@ use std::process::Command;
 use std::sync::LazyLock;
 use std::time::SystemTime;
 
-use artifact::{Description, Named, RENAMES, Rename, Schema};
+use contract::{Description, Named, RENAMES, Rename, Schema};
 use schemars::{JsonSchema, schema_for};
 use serde_json::Value;
 
@@ -68,7 +68,7 @@ fn modified(file: &Path) -> SystemTime {
 fn schemas() -> BTreeMap<String, Value> {
     let files = [
         ("pipeline", of::<planning::PipelineFile>()),
-        ("describe", of::<artifact::Description>()),
+        ("describe", of::<contract::Description>()),
         ("artifact", of::<artifact::Manifest>()),
         ("action", of::<store::Record>()),
         ("run", of::<artifact::RunRecord>()),
@@ -160,7 +160,7 @@ fn help_leads_to_the_reference() {
         assert!(!help.contains("null"), "{help}");
         for parameter in description.documented().iter().flat_map(|section| &section.parameters) {
             let known =
-                parameter.group.is_empty() || artifact::GROUPS.contains(&parameter.group.as_str());
+                parameter.group.is_empty() || contract::GROUPS.contains(&parameter.group.as_str());
             assert!(known && help.contains(&format!("  {}", parameter.name)), "{parameter:?}");
             let is_choice = parameter.choices.iter().any(|(word, _)| *word == parameter.default);
             assert!(

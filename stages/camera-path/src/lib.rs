@@ -6,7 +6,8 @@
 
 use std::f64::consts::TAU;
 
-use artifact::{Context, Failure, Input, Output, Stage};
+use artifact::Failure;
+use contract::{Input, Output};
 use glam::{DMat3, DQuat, DVec3};
 use pixels::{DEGRADATION_FILE, Degradation};
 use scene::{
@@ -14,6 +15,7 @@ use scene::{
 };
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 /// Parameters of `camera-path`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -1,7 +1,7 @@
 //! The stage's binary; see the library.
 
 fn main() -> std::process::ExitCode {
-    artifact::run_stage::<camera_path::CameraPath>(
+    stage::run_stage::<camera_path::CameraPath>(
         env!("CARGO_PKG_VERSION"),
         env!("STAGE_FINGERPRINT"),
     )

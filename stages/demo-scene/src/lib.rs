@@ -15,11 +15,12 @@ mod render;
 mod world;
 mod written;
 
-use artifact::{Context, Output, Stage};
+use contract::Output;
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 pub use render::RenderedImage;
 pub use world::World;

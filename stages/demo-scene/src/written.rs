@@ -5,11 +5,11 @@ use std::io::BufWriter;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::Context;
 use image::codecs::jpeg::JpegEncoder;
 use image::{ExtendedColorType, ImageEncoder as _};
 use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr, write_png};
 use serde_json::{Value, json};
+use stage::Context;
 
 use crate::render::RenderedImage;
 use crate::{Form, Params};

@@ -20,12 +20,13 @@ mod scored_view;
 
 use std::collections::BTreeMap;
 
-use artifact::{Context, Input, Output, Stage};
+use contract::{Input, Output};
 use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, heat, write_png};
 use rayon::prelude::*;
 use scene::{Background, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 pub use derived::NearReferences;
 use derived::{least_gain, near_references};

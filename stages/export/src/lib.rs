@@ -33,11 +33,13 @@ use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
+use artifact::{Failure, amount, counted};
+use contract::{Input, Output};
 use fields::Members;
 use scene::{Camera, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 use lattice::Lattice;
 use mesh::Mesh;

@@ -29,10 +29,12 @@ mod split;
 mod summary;
 mod writer;
 
-use artifact::{Context, Failure, FailureExt as _, Input, Output, Rule, Stage};
+use artifact::{Failure, FailureExt as _};
+use contract::{Input, Output, Rule};
 use dataset::{Dataset, Frame};
 use scene::Background;
 use serde_json::json;
+use stage::{Context, Stage};
 
 use borders::{Behind, borders};
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};

@@ -1,7 +1,7 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Context, FailureExt as _, Progress, printable};
+use artifact::{FailureExt as _, printable};
 use dataset::Frame;
 use pixels::{
     Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr,
@@ -9,6 +9,7 @@ use pixels::{
 };
 use rayon::prelude::*;
 use scene::{VIEWS_FILE, View, Views};
+use stage::{Context, Progress};
 
 use crate::degrade::{self, LrImage, degrade};
 use crate::frame_name;

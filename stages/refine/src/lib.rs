@@ -23,9 +23,10 @@ mod references;
 mod summary;
 mod view;
 
-use artifact::{Context, Input, Output, Stage};
+use contract::{Input, Output};
 use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
 use scene::{VIEWS_FILE, Views};
+use stage::{Context, Stage};
 
 pub use params::Params;
 

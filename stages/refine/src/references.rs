@@ -1,6 +1,7 @@
-use artifact::{Context, Failure, FailureExt as _};
+use artifact::{Failure, FailureExt as _};
 use refinement::{Guidance, KnownView, Use, with_references};
 use scene::{Background, Views};
+use stage::Context;
 
 use crate::view::{RefineJob, read_view};
 

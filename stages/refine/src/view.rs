@@ -1,12 +1,13 @@
 use std::path::Path;
 
-use artifact::{Context, Failure, GivenInput};
+use artifact::{Failure, GivenInput};
 use pixels::{
     Channel, ExrImage, Image, PixelError, VIEW_CHANNELS, VIEW_NOTE, write_exr, write_png,
 };
 use refinement::{KnownView, LrObservations, Rendered, Use};
 use scene::{Photograph, View};
 use serde::{Deserialize, Serialize};
+use stage::Context;
 
 use crate::enlarged::Enlarged;
 use crate::network::{AnyRefiner, Application};

@@ -7,15 +7,15 @@
 //! field gets wrong. Only LR photographs are looked at where there are any: HR ones are what views
 //! are scored by.
 
-use artifact::{
-    Context, FailureExt as _, GivenInput, Input, Output, Stage, WARNING, counted, with_warnings,
-};
+use artifact::{FailureExt as _, GivenInput, WARNING, counted, with_warnings};
+use contract::{Input, Output};
 use pixels::{Image, PixelError};
 use poses::{CameraMove, Moved, Options, Pyramid, refine};
 use radiance::{RayField, RenderError};
 use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 /// Parameters of `register`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -87,7 +87,7 @@ enum Verb {
 /// The program: exit code 0 when all is copied, 1 when it failed, 2 for a wrong command line, 3 for
 /// what was refused, 130 when it was interrupted.
 pub fn main() -> ExitCode {
-    artifact::install_panic_hook(NAME);
+    stage::install_panic_hook(NAME);
     match run(Cli::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
@@ -98,7 +98,7 @@ pub fn main() -> ExitCode {
 }
 
 fn run(cli: Cli) -> anyhow::Result<()> {
-    let stop = artifact::stop_on_signals()?;
+    let stop = stage::stop_on_signals()?;
     match cli.verb {
         Verb::Push { remote, selection } => {
             let (store, remote) = (existing(&cli.store)?, Remote::open(&remote, Access::Write)?);

@@ -3,8 +3,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use artifact::{Failure, Pace, report_line, sized};
+use artifact::{Failure, report_line, sized};
 use indicatif::{ProgressBar, ProgressStyle};
+use stage::Pace;
 
 /// Between two lines where there is no terminal.
 const INTERVAL: Duration = Duration::from_secs(10);

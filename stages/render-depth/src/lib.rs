@@ -12,13 +12,15 @@
 use std::ops::Range;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, Stage, amount, counted};
+use artifact::{Failure, amount, counted};
+use contract::{Input, Output};
 use fields::{Members, middle};
 use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
 use radiance::{Ray, RayField};
 use scene::{Background, Camera, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 /// Parameters of `render-depth`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -154,7 +156,7 @@ impl RenderJob<'_> {
         context: &Context,
         image: &str,
         preview: &str,
-        progress: &artifact::Progress,
+        progress: &stage::Progress,
     ) -> anyhow::Result<()> {
         let k = self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);

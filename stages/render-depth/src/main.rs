@@ -1,7 +1,7 @@
 //! The stage's binary; see the library.
 
 fn main() -> std::process::ExitCode {
-    artifact::run_stage::<render_depth::RenderDepth>(
+    stage::run_stage::<render_depth::RenderDepth>(
         env!("CARGO_PKG_VERSION"),
         env!("STAGE_FINGERPRINT"),
     )

@@ -1,8 +1,9 @@
 use std::collections::BTreeMap;
 
-use artifact::{Context, RunNode};
+use artifact::RunNode;
 use serde::Serialize;
 use serde_json::Value;
+use stage::Context;
 
 use crate::Params;
 use crate::gather::{Report, Row};

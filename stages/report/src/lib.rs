@@ -15,7 +15,7 @@
 //! * [`ResultRow`]: the same figures as `results.json` beside the page, for scripts.
 //!
 //! ```
-//! use artifact::Stage as _;
+//! use stage::Stage as _;
 //! let params = report::Params { views: 8, ..report::Params::default() };
 //! assert_eq!(report::Report::NAME, "report");
 //! assert!(params.compare.is_none());
@@ -35,9 +35,11 @@ mod scale;
 mod tables;
 mod viewer;
 
-use artifact::{Context, Failure, Input, Output, RunRecord, Stage, counted, sized};
+use artifact::{Failure, RunRecord, counted, sized};
+use contract::{Input, Output};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 pub use results::{ResultRow, StageResult};
 

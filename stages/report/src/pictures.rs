@@ -2,12 +2,12 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::Context;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
 use jpeg_encoder::{ColorType, Encoder, SamplingFactor};
 use pixels::{Filter, Rgba8, encode_png, read_png, resize_pillow};
 use rayon::prelude::*;
+use stage::Context;
 
 use crate::layers::{Group, Layer, ONLY_RENDER};
 

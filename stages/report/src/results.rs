@@ -2,10 +2,11 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::{RunNode, RunRecord, SUMMARY_FILE, warnings_of};
+use artifact::{RunNode, RunRecord, warnings_of};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+use stage::SUMMARY_FILE;
 
 /// `results.json`: the page's figures for scripts, one row a point of the sweep.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

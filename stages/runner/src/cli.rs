@@ -3,11 +3,12 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::Context as _;
-use artifact::{machine_memory, print_lines, report_line};
+use artifact::{print_lines, report_line};
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Choice;
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
 use slurm::{Memory, Site};
+use stage::machine_memory;
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
 use crate::graph::{ascii, dot};
@@ -277,7 +278,7 @@ enum GraphFormat {
 /// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or
 /// command line, 70 for a panic. None of them changes where stdout is closed.
 pub fn main() -> ExitCode {
-    artifact::install_panic_hook("nerf-sr");
+    stage::install_panic_hook("nerf-sr");
     match run(Cli::parse()) {
         Ok(code) => code,
         Err(error) => {

@@ -5,6 +5,7 @@
 //!
 //! * `node_report`: what is known of a plan's nodes, for programs. `lineage`: two results with all
 //!   that they were made of.
+//! * `identities`: what nodes are known by before their keys are.
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: hands the run's record (`recorded`) to stages that show it (the report), and puts what
@@ -17,6 +18,7 @@ mod cli;
 mod counts;
 mod execute;
 mod graph;
+mod identities;
 mod limits;
 mod lineage;
 mod node_report;

@@ -3,12 +3,13 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{check_device, report_text};
+use artifact::report_text;
 use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State, known_blocks};
 use slurm::{Job, Queue, Slurm};
+use stage::check_device;
 use store::Store;
 
-use crate::execute::identities;
+use crate::identities::identities;
 
 /// What every verb works with.
 pub(crate) struct Session {

@@ -18,10 +18,12 @@ mod values;
 use std::collections::BTreeMap;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, RunRecord, Stage};
+use artifact::{Failure, RunRecord};
+use contract::{Input, Output};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
+use stage::{Context, Stage};
 
 use figures::Figures;
 

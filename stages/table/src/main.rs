@@ -1,5 +1,5 @@
 //! The stage's binary; see the library.
 
 fn main() -> std::process::ExitCode {
-    artifact::run_stage::<table::Table>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
+    stage::run_stage::<table::Table>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
 }

@@ -1,9 +1,10 @@
-use artifact::{Context, Failure};
+use artifact::Failure;
 use pixels::psnr_of;
 use refinement::{
     Guidance, Network, REFINER_FILE, Refiner, RefinerArchitecture, RefinerFile, RefinerTrainer,
     RefinerTraining, WEIGHTS_FILE,
 };
+use stage::Context;
 
 use crate::examples::{Examples, lr_observations};
 use crate::steps::train;

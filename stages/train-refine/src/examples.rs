@@ -1,6 +1,7 @@
-use artifact::{Context, Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput};
 use refinement::{KnownView, LrObservations, Rendered};
 use scene::{View, Views};
+use stage::Context;
 
 /// One view in so many is left out of training.
 const LEFT_OUT: usize = 8;

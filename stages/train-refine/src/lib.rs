@@ -23,8 +23,9 @@ mod paper;
 mod params;
 mod steps;
 
-use artifact::{Context, Input, Output, Stage};
+use contract::{Input, Output};
 use refinement::RefinerFile;
+use stage::{Context, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
 

@@ -1,7 +1,7 @@
 //! The stage's binary; see the library.
 
 fn main() -> std::process::ExitCode {
-    artifact::run_stage::<train_refine::TrainRefine>(
+    stage::run_stage::<train_refine::TrainRefine>(
         env!("CARGO_PKG_VERSION"),
         env!("STAGE_FINGERPRINT"),
     )

@@ -1,7 +1,8 @@
-use artifact::{Context, Failure, FailureExt as _, GivenInput};
+use artifact::{Failure, FailureExt as _, GivenInput};
 use paper_refiner::{OVERLAP, PaperRefiner, PaperTrainer, PaperTraining, PerceptualLoss};
 use pixels::{Image, psnr_of};
 use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
+use stage::Context;
 
 use crate::examples::Examples;
 use crate::steps::train;

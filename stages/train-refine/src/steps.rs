@@ -2,8 +2,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure};
+use artifact::Failure;
 use refinement::{KnownView, RefinementError, Training};
+use stage::Context;
 
 /// Steps between two notes of how the training goes.
 const STEPS_BETWEEN_NOTES: u64 = 50;

@@ -1,8 +1,9 @@
 use std::path::PathBuf;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, GivenInput};
+use artifact::{Failure, GivenInput};
 use radiance::FieldFile;
+use stage::Context;
 
 /// A field to go on from.
 pub(crate) struct InitField<'a> {

@@ -43,11 +43,13 @@ mod supersampling_options;
 mod supervision;
 mod training_log;
 
-use artifact::{Context, Failure, Input, Output, Rule, Stage, WARNING, amount, with_warnings};
+use artifact::{Failure, WARNING, amount, with_warnings};
+use contract::{Input, Output, Rule};
 use pixels::DEGRADATION_FILE;
 use radiance::{FIELD_FILE, FIELD_FORMAT, FieldFile};
 use scene::Views;
 use serde_json::json;
+use stage::{Context, Stage};
 
 use init_field::InitField;
 use member::{Member, TrainingData};

@@ -1,5 +1,5 @@
 //! The stage's binary; see the library.
 
 fn main() -> std::process::ExitCode {
-    artifact::run_stage::<train_ss::TrainSs>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
+    stage::run_stage::<train_ss::TrainSs>(env!("CARGO_PKG_VERSION"), env!("STAGE_FINGERPRINT"))
 }

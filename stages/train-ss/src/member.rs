@@ -1,10 +1,11 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, GivenInput, Progress};
+use artifact::{Failure, GivenInput};
 use poses::Moved;
 use radiance::{FieldFile, FieldModel};
 use scene::{Bounds, Views};
+use stage::{Context, Progress};
 
 use crate::checkpoint::{Checkpoints, read_latest};
 use crate::field_trainer::{Collapsed, FieldTrainer, average, start};

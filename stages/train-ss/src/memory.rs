@@ -1,7 +1,8 @@
 use std::path::PathBuf;
 
-use artifact::{Failure, MEMORY_REMEDY, sized};
+use artifact::{Failure, sized};
 use scene::{Background, View, Views};
+use stage::MEMORY_REMEDY;
 
 use crate::packed::PixelMemory;
 use crate::resolve::{Resolved, ResolvedField};

@@ -441,8 +441,8 @@ impl Resolved {
 
 #[cfg(test)]
 mod tests {
-    use artifact::Stage as _;
     use scene::Frustum;
+    use stage::Stage as _;
 
     use super::*;
 
@@ -539,7 +539,7 @@ mod tests {
     #[test]
     fn what_is_by_scene_is_recorded() {
         let schema =
-            artifact::Schema::new("train-ss", &crate::TrainSs::describe("", "").parameters)
+            contract::Schema::new("train-ss", &crate::TrainSs::describe("", "").parameters)
                 .unwrap();
         let scene = facts(Space::Box, Background::White);
         for (name, field) in

@@ -1,9 +1,10 @@
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{Failure, GivenInput, available_memory};
+use artifact::{Failure, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Kernel};
 use scene::{Background, Views};
+use stage::available_memory;
 
 use crate::memory::MemoryNeed;
 use crate::packed::PackedPhotograph;

@@ -23,7 +23,8 @@ mod liif;
 mod swinir;
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, FailureExt as _, GivenInput, Input, Output, Rule, Stage};
+use artifact::{Failure, FailureExt as _, GivenInput};
+use contract::{Input, Output, Rule};
 use nets::Weights;
 use pixels::{
     Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png,
@@ -33,6 +34,7 @@ use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
+use stage::{Context, Stage};
 use tch::{TchError, Tensor, no_grad};
 
 /// Parameters of `upsample`.

@@ -7,7 +7,8 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 use anyhow::Context as _;
-use artifact::{Context, Failure, Input, Output, RunNode, RunRecord, Stage, folders_of};
+use artifact::{Failure, RunNode, RunRecord, folders_of};
+use contract::{Input, Output};
 use pixels::{
     Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png,
 };
@@ -15,6 +16,7 @@ use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 /// Parameters of `video`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

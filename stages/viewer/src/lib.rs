@@ -27,16 +27,15 @@ mod visibility;
 use std::path::Path;
 
 use anyhow::Context as _;
-use artifact::{
-    Context, Failure, FailureExt as _, GivenInput, Input, Output, RunNode, RunRecord, Stage,
-    folders_of,
-};
+use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, folders_of};
 use base64::Engine as _;
+use contract::{Input, Output};
 use pixels::{Filter, Rgba8, encode_png, read_premultiplied, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Space, Views};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use stage::{Context, Stage};
 
 use crate::atlas::Atlas;
 use crate::page::{ImageSize, PageCamera, PageScene};

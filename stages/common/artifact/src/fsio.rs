@@ -18,7 +18,7 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
 
 /// What makes a hidden temporary file (mode 0o666) or folder (0o777) whose permissions are left to
 /// the umask, so that a group can share what becomes of it; tempfile's own are the owner's alone.
-pub(crate) fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
+pub fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
     let mut builder = tempfile::Builder::new();
     builder.prefix(".").permissions(fs::Permissions::from_mode(mode));
     builder

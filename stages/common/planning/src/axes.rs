@@ -4,7 +4,8 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use artifact::{Named, known_names, renamed_in};
+use artifact::known_names;
+use contract::{Named, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;

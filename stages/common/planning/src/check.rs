@@ -3,7 +3,8 @@
 
 use std::collections::BTreeSet;
 
-use artifact::{Description, Input, Named, known_names, renamed};
+use artifact::known_names;
+use contract::{Description, Input, Named, renamed};
 
 use serde_json::Map;
 

@@ -4,7 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
-use artifact::{FailedPoint, GivenInputs};
+use artifact::FailedPoint;
+use contract::GivenInputs;
 use serde_json::{Map, Value};
 
 use crate::axes::{Axis, Kind, Setting};

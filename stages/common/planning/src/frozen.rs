@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use artifact::{Description, FailedPoint};
+use artifact::FailedPoint;
+use contract::Description;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use slurm::Resources;

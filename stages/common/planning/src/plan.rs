@@ -1,7 +1,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use artifact::{Description, hash_json};
+use artifact::hash_json;
+use contract::Description;
 use slurm::Resources;
 use store::Store;
 

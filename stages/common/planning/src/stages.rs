@@ -12,7 +12,8 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::UNIX_EPOCH;
 
-use artifact::{Description, Schema, nearest, write_atomically};
+use artifact::{nearest, write_atomically};
+use contract::{Description, Schema};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use stage_call::{Answers, Interrupted, ask_all};

@@ -9,10 +9,12 @@ use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Description, Event, SUMMARY_FILE, counted, printable, sized};
+use artifact::{counted, printable, sized};
+use contract::Description;
 use rustix::process::{
     Pid, Signal, WaitId, WaitIdOptions, kill_process, kill_process_group, waitid,
 };
+use stage::{Event, SUMMARY_FILE};
 use wait4::{ResUse, Wait4 as _};
 
 use crate::clock::seconds;
@@ -21,7 +23,7 @@ use crate::verdict::{End, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
 const ENVIRONMENT: [&str; 11] = [
-    artifact::MEMORY_VARIABLE,
+    stage::MEMORY_VARIABLE,
     "PATH",
     "HOME",
     "LANG",
@@ -31,7 +33,7 @@ const ENVIRONMENT: [&str; 11] = [
     "CUDA_VISIBLE_DEVICES",
     "NO_COLOR",
     "RUST_BACKTRACE",
-    artifact::STOP_VARIABLE,
+    stage::STOP_VARIABLE,
 ];
 
 /// Last lines of a stage's stderr in which the reason of a failure is looked for.
@@ -226,7 +228,7 @@ impl Call<'_> {
         command
             .env_clear()
             .envs(passed)
-            .env(artifact::RUNNER_VARIABLE, std::process::id().to_string());
+            .env(stage::RUNNER_VARIABLE, std::process::id().to_string());
         // A group of its own: Ctrl-C reaches the runner alone, which then asks its stages to end,
         // once.
         command.process_group(0).stdout(Stdio::piped()).stderr(Stdio::piped());

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
-use artifact::Description;
+use contract::Description;
 
 /// After so long a program that has said nothing is taken to hang.
 const LONGEST: Duration = Duration::from_secs(120);

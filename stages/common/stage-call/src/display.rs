@@ -4,8 +4,9 @@ use std::io::IsTerminal as _;
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-use artifact::{Event, Pace, printable, report_text};
+use artifact::{printable, report_text};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
+use stage::{Event, Pace};
 
 use crate::call::Watcher;
 use crate::clock::seconds;

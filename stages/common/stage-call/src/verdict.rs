@@ -4,7 +4,7 @@
 use std::os::unix::process::ExitStatusExt as _;
 use std::process::ExitStatus;
 
-use artifact::{MEMORY_REMEDY, out_of_memory};
+use stage::{MEMORY_REMEDY, out_of_memory};
 
 use crate::call::StageFailure;
 

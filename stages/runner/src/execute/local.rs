@@ -9,8 +9,9 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc;
 
 use anyhow::{Context as _, anyhow};
-use artifact::{Failure, SUMMARY_FILE, print_line, print_lines, report_line, report_text};
+use artifact::{Failure, print_line, print_lines, report_line, report_text};
 use planning::{Plan, Sink};
+use stage::SUMMARY_FILE;
 use stage_call::{Display, StageFailure};
 use store::Record;
 

@@ -17,7 +17,7 @@ use crate::session::Session;
 pub(crate) use local::{Local, say_aside};
 pub(crate) use node::NodeJob;
 pub(crate) use places::Budget;
-pub(crate) use slurm::{Cluster, JOB_VERB, identities};
+pub(crate) use slurm::{Cluster, JOB_VERB};
 
 /// Carries out plans.
 pub(crate) trait Executor {

@@ -5,9 +5,10 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{SUMMARY_FILE, hash_json, unix_time};
+use artifact::{hash_json, unix_time};
 use planning::{Node, NodeInput, Origin, Plan, PlanError, input_hashes};
 use serde_json::{Map, Value};
+use stage::SUMMARY_FILE;
 use stage_call::{Call, Display, StageFailure, StageView, Usage, seconds};
 use store::{Attempt, Entered, Holder, KeyLock, Record, RunFile, Store, Unfinished, host_name};
 

@@ -7,13 +7,14 @@ use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
 use artifact::{Failure, counted, hash_json, print_line, report_line};
-use planning::{Frozen, Origin, Plan, PlanError, State, source_hash};
+use planning::{Frozen, Plan, PlanError, State};
 use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
 use store::{Record, Store};
 
 use super::{Executor, Work};
 use crate::counts;
+use crate::identities::identities;
 use crate::sink::is_shown;
 
 /// The verb that a job calls.
@@ -109,26 +110,6 @@ fn tasks(plan: &Plan, store: &Store, out: &Path) -> Result<Vec<Task>, PlanError>
         }
     });
     Ok(nodes.chain(sinks).collect())
-}
-
-/// By what nodes are known before their keys are: a key's parts, with what a parent is in the place
-/// of what it made.
-pub(crate) fn identities(plan: &Plan, store: &Store) -> Result<Vec<String>, PlanError> {
-    let mut identities: Vec<String> = Vec::with_capacity(plan.nodes.len());
-    for node in &plan.nodes {
-        let mut inputs = Vec::new();
-        for input in &node.inputs {
-            let from = match &input.from {
-                Origin::Node { index, subtree } => {
-                    format!("{}/{}", identities[*index], subtree.as_deref().unwrap_or_default())
-                }
-                Origin::Folder(folder) => source_hash(store, node, &input.name, folder)?,
-            };
-            inputs.push((input.name.clone(), from));
-        }
-        identities.push(hash_json(&planning::parts(node, &inputs, plan.device(&node.stage))));
-    }
-    Ok(identities)
 }
 
 /// Which tasks need no job.

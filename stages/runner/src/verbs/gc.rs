@@ -1,10 +1,11 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
-use artifact::{Failure, print_line, report_line, stop_on_signals};
+use artifact::{Failure, print_line, report_line};
 use garbage::{Choice, Root, Verdict, judge};
 use planning::Request;
 use serde_json::json;
+use stage::stop_on_signals;
 use stage_call::seconds;
 
 use crate::session::Session;

@@ -4,10 +4,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context as _;
-use artifact::{print_line, report_line, report_text, stop_on_signals};
+use artifact::{print_line, report_line, report_text};
 use planning::{Frozen, Node, Plan, Sink, StageProgram, State};
 use signal_hook::consts::SIGUSR1;
 use slurm::{Slurm, Submission};
+use stage::stop_on_signals;
 use stage_call::{Display, StageFailure, ask_all};
 use store::{Record, RunFile, Store};
 

@@ -7,7 +7,7 @@ use planning::{Plan, Request, State};
 use stage_call::utc;
 use store::{Store, StoreError};
 
-use crate::execute::identities;
+use crate::identities::identities;
 use crate::session::{Session, of_stage};
 
 /// Prints what a stage said: of the nodes that the plan comes to, or else when it last ran with

@@ -2,8 +2,9 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use artifact::{Failure, report_line, stop_on_signals};
+use artifact::{Failure, report_line};
 use planning::{Plan, Request, State};
+use stage::stop_on_signals;
 use stage_call::StageFailure;
 use store::{RunFile, Store};
 

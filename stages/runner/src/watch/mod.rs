@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use artifact::{Event, SUMMARY_FILE};
+use stage::{Event, SUMMARY_FILE};
 use stage_call::{Call, Display, StageFailure, Watcher, seconds};
 
 use budget::LookBudget;

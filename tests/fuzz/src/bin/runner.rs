@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::LazyLock;
 
-use artifact::{Description, Schema};
+use contract::{Description, Schema};
 use libfuzzer_sys::fuzz_target;
 use planning::{Pipeline, Plan, Request};
 use store::Record;

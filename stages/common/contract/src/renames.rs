@@ -113,32 +113,7 @@ pub fn renamed_in<'a>(
 
 #[cfg(test)]
 mod tests {
-    use serde_json::{Map, json};
-
     use super::*;
-    use crate::Schema;
-
-    /// Whoever gives an old name learns the new one, and what to write instead of an old value.
-    #[test]
-    fn every_old_name_is_refused_with_the_new_one() {
-        for rename in RENAMES.iter().filter(|rename| rename.kind == Named::Parameter) {
-            let schema =
-                Schema::new(rename.program, &json!({"properties": {rename.new: {}}})).unwrap();
-            let given = |value: &str| Map::from_iter([(rename.old.to_owned(), json!(value))]);
-            let says = |value: &str| schema.resolve(&given(value)).unwrap_err()[0].to_string();
-            assert_eq!(
-                says("1"),
-                format!("parameter {}: is called {} now", rename.old, rename.new)
-            );
-            for (old, write) in rename.values {
-                assert!(
-                    says(old).ends_with(&format!("; for {old} write {write}")),
-                    "{}",
-                    says(old)
-                );
-            }
-        }
-    }
 
     #[test]
     fn a_name_is_old_for_its_own_program_only() {

@@ -2,9 +2,8 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use artifact::Failure;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
-
-use crate::failure::Failure;
 
 /// A flag that SIGINT, SIGTERM and SIGHUP set; the second of them ends the process at once, with 130.
 ///

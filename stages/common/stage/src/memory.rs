@@ -1,7 +1,5 @@
+use artifact::{Failure, sized};
 use sysinfo::{MemoryRefreshKind, System};
-
-use crate::Failure;
-use crate::amounts::sized;
 
 /// How allocators name what they didn't get: that of Rust, of libtorch, of CUDA, and of NumPy.
 const MARKS: [&str; 4] =
@@ -11,9 +9,9 @@ const MARKS: [&str; 4] =
 /// for other words.
 ///
 /// ```
-/// let said = artifact::out_of_memory("memory allocation of 99532800 bytes failed").unwrap();
+/// let said = stage::out_of_memory("memory allocation of 99532800 bytes failed").unwrap();
 /// assert!(said.starts_with("out of memory: 99.5 MB more were asked for;"));
-/// assert_eq!(artifact::out_of_memory("lost memory of it"), None);
+/// assert_eq!(stage::out_of_memory("lost memory of it"), None);
 /// ```
 pub fn out_of_memory(text: &str) -> Option<String> {
     let amount = MARKS.iter().find_map(|mark| amount(text.split_once(mark)?.1))?;

@@ -1,9 +1,7 @@
 //! The end of a stage's `--help`: inputs and parameters, in groups, wrapped.
 
+use contract::{Description, ParameterText, by_group};
 use textwrap::{Options, fill};
-
-use crate::describe::Description;
-use crate::documented::{ParameterText, by_group};
 
 /// Columns of the help.
 const WIDTH: usize = 100;
@@ -69,9 +67,10 @@ fn capitalised(word: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::{Input, Output};
+    use contract::{Input, Output};
     use serde_json::json;
+
+    use super::*;
 
     #[test]
     fn help_is_grouped_and_wrapped() {

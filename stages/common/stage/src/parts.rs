@@ -3,12 +3,11 @@ use std::path::Path;
 use std::sync::atomic::Ordering;
 
 use anyhow::Context as _;
+use artifact::{MANIFEST_FILE, Manifest, sync_folder, temporary, write_json};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::fsio::{sync_folder, temporary, write_json};
-use crate::manifest::{MANIFEST_FILE, Manifest};
-use crate::stage::Context;
+use crate::context::Context;
 
 /// In `--work`: finished parts of outputs, by what they were made from and by name. Each is a
 /// folder with a manifest, so that one cut short is seen.
@@ -22,7 +21,7 @@ impl Context {
     /// Nothing is where an input has no manifest: it may have changed since.
     ///
     /// ```no_run
-    /// # fn of(context: &artifact::Context) -> anyhow::Result<()> {
+    /// # fn of(context: &stage::Context) -> anyhow::Result<()> {
     /// for name in ["a", "b"] {
     ///     let file = format!("{name}.txt");
     ///     let letters: usize = context.part(name, &[&file], || {

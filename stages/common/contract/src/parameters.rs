@@ -1,6 +1,6 @@
+use artifact::{known_names, nearest};
 use serde_json::{Map, Value, json};
 
-use crate::nearest::{known_names, nearest};
 use crate::renames::{Named, renamed};
 use crate::tagged::Tag;
 use crate::validator::{Misfit, Validator};
@@ -40,7 +40,7 @@ pub struct ParameterProblem {
 /// A parameter schema that can't be used: what is wrong with it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub struct SchemaError(pub(crate) String);
+pub struct SchemaError(String);
 
 impl Schema {
     /// Compiles the schema that a program describes.
@@ -107,7 +107,7 @@ impl Schema {
     }
 
     /// Resolved parameters as the stage's type has them, a variant's parameters inside it.
-    pub(crate) fn nested(&self, resolved: &Value) -> Value {
+    pub fn nested(&self, resolved: &Value) -> Value {
         self.tag.as_ref().map_or_else(|| resolved.clone(), |tag| tag.nested(resolved))
     }
 
@@ -247,8 +247,11 @@ fn bound_formats(schema: &mut Value) {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use artifact::canonical;
     use serde_json::json;
+
+    use super::*;
+    use crate::renames::RENAMES;
 
     fn schema() -> Schema {
         Schema::new(
@@ -300,11 +303,7 @@ mod tests {
             json!({"assumed": null}),
             json!({"place": [1.0, 0.5]}),
         ] {
-            assert_eq!(
-                crate::canonical(&resolve(&said).unwrap()),
-                crate::canonical(&unsaid),
-                "{said}"
-            );
+            assert_eq!(canonical(&resolve(&said).unwrap()), canonical(&unsaid), "{said}");
         }
         for (one, other) in [
             (json!({"scale": 6e4}), json!({"scale": 60000})),
@@ -312,10 +311,9 @@ mod tests {
             (json!({"width": 7.0}), json!({"width": 7})),
             (json!({"place": [2, 3.0]}), json!({"place": [2.0, 3]})),
         ] {
-            let [one, other] =
-                [one, other].map(|given| crate::canonical(&resolve(&given).unwrap()));
+            let [one, other] = [one, other].map(|given| canonical(&resolve(&given).unwrap()));
             assert_eq!(one, other);
-            assert_ne!(one, crate::canonical(&unsaid));
+            assert_ne!(one, canonical(&unsaid));
         }
         let problems = resolve(&json!({"rate": null})).unwrap_err();
         assert!(
@@ -345,6 +343,28 @@ mod tests {
             let problems = resolve(&given).unwrap_err();
             assert_eq!(problems[0].name, name);
             assert!(problems[0].problem.contains(word), "{}", problems[0]);
+        }
+    }
+
+    /// Whoever gives an old name learns the new one, and what to write instead of an old value.
+    #[test]
+    fn every_old_name_is_refused_with_the_new_one() {
+        for rename in RENAMES.iter().filter(|rename| rename.kind == Named::Parameter) {
+            let schema =
+                Schema::new(rename.program, &json!({"properties": {rename.new: {}}})).unwrap();
+            let given = |value: &str| Map::from_iter([(rename.old.to_owned(), json!(value))]);
+            let says = |value: &str| schema.resolve(&given(value)).unwrap_err()[0].to_string();
+            assert_eq!(
+                says("1"),
+                format!("parameter {}: is called {} now", rename.old, rename.new)
+            );
+            for (old, write) in rename.values {
+                assert!(
+                    says(old).ends_with(&format!("; for {old} write {write}")),
+                    "{}",
+                    says(old)
+                );
+            }
         }
     }
 }

@@ -1,136 +1,93 @@
 use std::collections::BTreeMap;
 
+use artifact::{PathError, relative_path};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::describe::{Description, Input};
-use crate::validator::Validator;
+use crate::input::Input;
+use crate::output::Output;
+use crate::parameters::{Schema, SchemaError};
+use crate::rules::{GivenInputs, Rule, RuleError};
 
-/// What parameters and inputs must be together, beyond what each may be alone. The runner checks it
-/// in the plan, the stage when it starts.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
+/// What `STAGE describe` prints: all that the runner knows of a stage.
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
-pub struct Rule {
-    /// When it applies: parameters, each with a JSON Schema that its value fits then.
-    /// `INPUT.PARAMETER` is a parameter of the stage that the input comes from; where that isn't
-    /// known, the rule doesn't apply.
-    pub when: BTreeMap<String, Value>,
-    /// Inputs that must be given then.
+pub struct Description {
+    /// The stage's name; also its binary's.
+    pub name: String,
+    /// Version for people; not part of a key.
+    pub version: String,
+    /// Fingerprint of the code: part of every key.
+    pub code: String,
+    /// One sentence: what the stage makes of what.
+    pub summary: String,
+    /// JSON Schema of the parameters: an object, every property with its default. `x-group` names a
+    /// parameter's group; `x-default` stands for a default that is null, and is `by scene` where
+    /// the inputs decide.
+    pub parameters: Value,
+    /// Inputs by name.
+    pub inputs: BTreeMap<String, Input>,
+    /// What comes out.
+    pub output: Output,
+    /// Names of environment variables that change the result; their values join the key.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub needs: Vec<String>,
-    /// What parameters must fit then, likewise.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub must: BTreeMap<String, Value>,
-    /// What to say where it isn't kept: what is wrong, and what to do.
-    pub message: String,
+    pub environment: Vec<String>,
+    /// A sink shows a run (times, hashes) and is never cached; its input `run` is the run's record.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub sink: bool,
+    /// A sink that shows what there is, where some of it couldn't be made.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub partial: bool,
+    /// Whether the stage accepts `--from-checkpoint`: then it writes its output from the latest
+    /// checkpoint.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub from_checkpoint: bool,
+    /// What parameters and inputs must be together.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub rules: Vec<Rule>,
 }
 
-/// The inputs that are given, each with the parameters of the stage that it comes from, where those
-/// are known.
-pub type GivenInputs = BTreeMap<String, Option<Value>>;
-
-/// What is wrong with a rule.
+/// A description that contradicts itself: what is wrong with it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RuleError {
-    /// It names an input that the stage doesn't have.
-    #[error("there is no input {0:?}")]
-    Input(String),
-    /// It names a parameter that the stage doesn't have.
-    #[error("there is no parameter {0:?}")]
-    Parameter(String),
-    /// What a value must fit.
-    #[error("{name}: not a JSON Schema: {reason}")]
-    Schema {
-        /// The value's name.
-        name: String,
+pub enum DescriptionError {
+    /// Its parameter schema.
+    #[error("its parameter schema is {0}")]
+    Schema(#[from] SchemaError),
+    /// It doesn't say its name.
+    #[error("it has no name")]
+    Unnamed,
+    /// A folder of its output.
+    #[error("its output: {0}")]
+    Output(#[from] PathError),
+    /// A rule.
+    #[error("its rule {number}: {problem}")]
+    Rule {
+        /// Which, counted from 1.
+        number: usize,
         /// What is wrong.
-        reason: String,
+        problem: RuleError,
     },
 }
 
-impl Rule {
-    /// A rule that always applies and asks for nothing yet.
-    pub fn new(message: &str) -> Self {
-        Self {
-            when: BTreeMap::new(),
-            needs: Vec::new(),
-            must: BTreeMap::new(),
-            message: message.to_owned(),
+impl Description {
+    /// Says what is wrong with a description that has the right form: what it names must be there,
+    /// and its folders inside the output.
+    pub fn check(&self) -> Result<(), DescriptionError> {
+        let schema = Schema::new(&self.name, &self.parameters)?;
+        if self.name.is_empty() {
+            return Err(DescriptionError::Unnamed);
         }
-    }
-
-    /// Applies it only where a parameter fits a JSON Schema.
-    #[must_use]
-    pub fn when(mut self, parameter: &str, fits: Value) -> Self {
-        self.when.insert(parameter.to_owned(), fits);
-        self
-    }
-
-    /// Asks for an input.
-    #[must_use]
-    pub fn needs(mut self, input: &str) -> Self {
-        self.needs.push(input.to_owned());
-        self
-    }
-
-    /// Asks that a parameter fits a JSON Schema.
-    #[must_use]
-    pub fn must(mut self, parameter: &str, fit: Value) -> Self {
-        self.must.insert(parameter.to_owned(), fit);
-        self
-    }
-
-    /// Says what is wrong with the rule itself.
-    pub(crate) fn check(
-        &self,
-        parameters: &[&str],
-        inputs: &BTreeMap<String, Input>,
-    ) -> Result<(), RuleError> {
-        if let Some(input) = self.needs.iter().find(|input| !inputs.contains_key(*input)) {
-            return Err(RuleError::Input(input.clone()));
+        for folder in self.output.subtrees.keys().chain(&self.output.resolved) {
+            relative_path(folder)?;
         }
-        for (name, schema) in self.when.iter().chain(&self.must) {
-            let is_known = match name.split_once('.') {
-                Some((input, _)) => inputs.contains_key(input),
-                None => parameters.contains(&name.as_str()),
-            };
-            if !is_known {
-                return Err(RuleError::Parameter(name.clone()));
-            }
-            Validator::new(schema)
-                .map_err(|reason| RuleError::Schema { name: name.clone(), reason })?;
+        for (index, rule) in self.rules.iter().enumerate() {
+            rule.check(&schema.names(), &self.inputs)
+                .map_err(|problem| DescriptionError::Rule { number: index + 1, problem })?;
         }
         Ok(())
     }
 
-    fn is_kept(&self, parameters: &Value, inputs: &GivenInputs) -> bool {
-        let applies = self
-            .when
-            .iter()
-            .all(|(name, schema)| fits(name, schema, parameters, inputs) == Some(true));
-        if !applies {
-            return true;
-        }
-        let is_given = self.needs.iter().all(|input| inputs.contains_key(input));
-        is_given
-            && self
-                .must
-                .iter()
-                .all(|(name, schema)| fits(name, schema, parameters, inputs) != Some(false))
-    }
-}
-
-/// Whether the value of a name fits a schema; nothing where the value isn't known.
-fn fits(name: &str, schema: &Value, parameters: &Value, inputs: &GivenInputs) -> Option<bool> {
-    let value = match name.split_once('.') {
-        Some((input, inner)) => inputs.get(input).and_then(|made_by| made_by.as_ref()?.get(inner)),
-        None => parameters.get(name),
-    };
-    Some(Validator::new(schema).ok()?.is_valid(value?))
-}
-
-impl Description {
     /// What the first rule that isn't kept says.
     pub fn broken_rule(&self, parameters: &Value, inputs: &GivenInputs) -> Option<String> {
         self.rules
@@ -143,7 +100,6 @@ impl Description {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::describe::Output;
     use serde_json::json;
 
     fn description() -> Description {

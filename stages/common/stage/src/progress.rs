@@ -3,9 +3,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use artifact::report_line;
 use serde::{Deserialize, Serialize};
-
-use crate::report_line;
 
 /// How a stage shows that it is getting on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]

@@ -1,0 +1,65 @@
+//! What makes a program a stage: arguments, parameters, progress, exit codes, output.
+//!
+//! * [`Stage`] and [`run_stage`]: a stage implements the trait and gets arguments, checked
+//!   parameters, `describe`, progress, exit codes, interruption and an atomic output for free.
+//! * [`Context`]: what a running stage has at hand: its inputs, its output, the folder for
+//!   checkpoints.
+//! * [`Progress`], [`Event`]: how far it is, for people and for the runner.
+//! * [`stop_on_signals`], [`install_panic_hook`]: how a program ends before it is done. The runner
+//!   ends so, too.
+//! * [`available_memory`], [`check_device`]: where a stage may compute, and how much it may take.
+//!
+//! No pixels, no tensors, no store. What a stage says of itself is in `contract`, artifacts and
+//! failures in `artifact`.
+//!
+//! ```no_run
+//! use contract::Output;
+//! use stage::{Context, Stage, run_stage};
+//!
+//! #[derive(serde::Serialize, serde::Deserialize, schemars::JsonSchema, Default)]
+//! #[serde(default, deny_unknown_fields)]
+//! struct Params {
+//!     /// Whom to greet.
+//!     name: String,
+//! }
+//! struct Greet;
+//! impl Stage for Greet {
+//!     type Params = Params;
+//!     const NAME: &'static str = "greet";
+//!     const SUMMARY: &'static str = "Writes a greeting.";
+//!     fn output() -> Output { Output::kind("text") }
+//!     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
+//!         std::fs::write(context.output_path("greeting.txt")?, &params.name)?;
+//!         Ok(())
+//!     }
+//! }
+//! fn main() -> std::process::ExitCode {
+//!     run_stage::<Greet>(env!("CARGO_PKG_VERSION"), "code-fingerprint")
+//! }
+//! ```
+
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
+mod arguments;
+mod context;
+mod device;
+mod help;
+mod memory;
+#[cfg(test)]
+mod panic_tests;
+mod panics;
+mod parts;
+mod progress;
+mod run;
+mod signals;
+mod stage;
+mod staging;
+
+pub use context::{Context, SUMMARY_FILE};
+pub use device::{DeviceError, check_device};
+pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
+pub use panics::install_panic_hook;
+pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
+pub use run::{RUNNER_VARIABLE, run_stage};
+pub use signals::stop_on_signals;
+pub use stage::Stage;

@@ -1,0 +1,149 @@
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs;
+use std::io::Write as _;
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context as _;
+use artifact::{Failure, GivenInput, exit_code, hash_json, one_line, print_lines, report_line};
+use clap::CommandFactory as _;
+use contract::Description;
+
+use crate::arguments::{Arguments, Command, input_folders, read_params};
+use crate::context::Context;
+use crate::help::help_of;
+use crate::panics::install_panic_hook;
+use crate::progress::{ProgressMode, emit_events, failed_event};
+use crate::signals::stop_on_signals;
+use crate::stage::Stage;
+use crate::staging::Staging;
+
+/// Environment variable in which a runner tells its stages its process id, so that they see when it
+/// is gone.
+pub const RUNNER_VARIABLE: &str = "NERF_SR_RUNNER";
+
+/// The whole `main` of a stage: parses, checks, runs, publishes, and maps errors and panics to an
+/// exit code. The reason of a failure is one line on stderr, and with `--progress json` an event on
+/// stdout.
+pub fn run_stage<S: Stage>(version: &'static str, code: &str) -> ExitCode {
+    run_stage_with::<S>(version, code, std::env::args_os())
+}
+
+pub(crate) fn run_stage_with<S: Stage>(
+    version: &'static str,
+    code: &str,
+    arguments: impl IntoIterator<Item = OsString>,
+) -> ExitCode {
+    install_panic_hook(S::NAME);
+    match parse_and_run::<S>(version, code, arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let message = one_line(&error);
+            report_line!("{}: {message}", S::NAME);
+            if let Some(event) = failed_event(&message) {
+                std::io::stdout().write_all(event.as_bytes()).ok();
+            }
+            ExitCode::from(exit_code(&error))
+        }
+    }
+}
+
+fn parse_and_run<S: Stage>(
+    version: &'static str,
+    code: &str,
+    arguments: impl IntoIterator<Item = OsString>,
+) -> anyhow::Result<()> {
+    let description = S::describe(version, code);
+    let mut command = Arguments::command()
+        .name(S::NAME)
+        .about(S::SUMMARY)
+        .after_help(help_of(&description))
+        .mut_arg("from_checkpoint", |argument| argument.hide(!S::FROM_CHECKPOINT));
+    if !version.is_empty() {
+        command = command.version(version);
+    }
+    let arguments = match command.clone().try_get_matches_from(arguments) {
+        Ok(matches) => <Arguments as clap::FromArgMatches>::from_arg_matches(&matches)?,
+        // Help and version, too, come this way; clap knows where to print and how to exit.
+        Err(error) => error.exit(),
+    };
+    match arguments.command {
+        Some(Command::Describe) => {
+            print_lines(&serde_json::to_string_pretty(&description)?);
+            Ok(())
+        }
+        None => execute::<S>(arguments, &description),
+    }
+}
+
+fn execute<S: Stage>(arguments: Arguments, description: &Description) -> anyhow::Result<()> {
+    let for_runner = arguments.progress == ProgressMode::Json;
+    if for_runner {
+        emit_events();
+    }
+    let (resolved, params) = read_params::<S::Params>(arguments.params.as_deref(), description)?;
+    let folders = input_folders(&arguments.inputs, description)?;
+    // What made an input isn't known here; rules about that are the runner's to check.
+    let given = folders.iter().map(|(name, _)| ((*name).to_owned(), None)).collect();
+    if let Some(problem) = description.broken_rule(&resolved, &given) {
+        return Err(Failure::Usage(problem).into());
+    }
+    if arguments.from_checkpoint && !S::FROM_CHECKPOINT {
+        let problem =
+            format!("--from-checkpoint: stage {} doesn't have this option; leave it out", S::NAME);
+        return Err(Failure::Usage(problem).into());
+    }
+    let threads = match arguments.threads {
+        Some(0) => return Err(Failure::Usage("--threads 0: give at least 1".to_owned()).into()),
+        Some(n) => n,
+        None => std::thread::available_parallelism().map_or(1, std::num::NonZero::get),
+    };
+    rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
+    let mut inputs = BTreeMap::new();
+    for (name, folder) in folders {
+        inputs.insert(name.to_owned(), GivenInput::open(name, folder)?);
+    }
+    let interrupted = stop_on_signals()?;
+    if for_runner {
+        end_with_runner(&interrupted)?;
+    }
+    let output = arguments.output.expect("clap requires --output");
+    let staging = Staging::new(&output)?;
+    if let Some(work) = &arguments.work {
+        fs::create_dir_all(work)
+            .with_context(|| format!("--work {}: cannot be made", work.display()))?;
+    }
+    let made_from: Option<BTreeMap<&str, &str>> =
+        inputs.iter().map(|(name, input)| Some((name.as_str(), input.identity()?))).collect();
+    let identity =
+        made_from.map(|inputs| hash_json(&(&params, inputs, &description.code, &arguments.device)));
+    let context = Context {
+        threads,
+        device: arguments.device,
+        inputs,
+        output: staging.folder().to_path_buf(),
+        work: arguments.work,
+        from_checkpoint: arguments.from_checkpoint,
+        progress: arguments.progress,
+        interrupted,
+        identity,
+        goes_on: AtomicBool::new(false),
+    };
+    S::run(&context, &params)?;
+    context.check_interrupt()?;
+    staging.publish(&description.output.kind, &output)
+}
+
+/// Lets the stage end as if interrupted, with a checkpoint, when the runner is killed, rather than
+/// work on unseen.
+fn end_with_runner(interrupted: &AtomicBool) -> anyhow::Result<()> {
+    rustix::process::set_parent_process_death_signal(Some(rustix::process::Signal::TERM))?;
+    // It may have been killed before that, while this process was being loaded.
+    let runner = std::env::var(RUNNER_VARIABLE).ok().and_then(|pid| pid.parse::<i32>().ok());
+    let parent = rustix::process::getppid().map_or(0, rustix::process::Pid::as_raw_pid);
+    if runner.is_some_and(|pid| pid != parent) {
+        interrupted.store(true, Ordering::SeqCst);
+    }
+    Ok(())
+}
