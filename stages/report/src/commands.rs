@@ -1,7 +1,7 @@
+use std::path::Path;
+
 use artifact::{RunNode, RunRecord};
 use maud::{Markup, html};
-
-use crate::pipeline::name_of;
 
 /// The command that the page is of.
 pub(crate) fn commands(run: &RunRecord) -> Markup {
@@ -57,6 +57,12 @@ fn quoted(word: &str) -> String {
         return word.to_owned();
     }
     format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+/// The last part of a path.
+pub(crate) fn name_of(path: &Path) -> String {
+    let name = path.file_name().unwrap_or(path.as_os_str());
+    name.to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

@@ -6,9 +6,10 @@ use serde_json::Value;
 use stage::Context;
 
 use crate::Params;
-use crate::gather::{Report, Row};
+use crate::gather::Report;
 use crate::layers::{Group, Layer, layers, pixels_of};
 use crate::pictures::{Picture, Wanted, pictures};
+use crate::row::Row;
 use crate::scale::Scale;
 
 /// What the page's script works on.

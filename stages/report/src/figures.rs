@@ -1,7 +1,7 @@
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::gather::Row;
+use crate::row::Row;
 
 /// A figure of the scores, and how its metric says that it is shown.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]

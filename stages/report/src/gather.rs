@@ -3,6 +3,7 @@ use serde_json::Value;
 
 use crate::figures::{Figure, figures};
 use crate::results::{metrics, scored};
+use crate::row::Row;
 
 /// What a page shows of a run.
 pub(crate) struct Report<'a> {
@@ -15,23 +16,6 @@ pub(crate) struct Report<'a> {
     pub(crate) figures: Vec<Figure>,
     /// Results whose figures can't be read, with why.
     pub(crate) unread: Vec<String>,
-}
-
-/// One result: the scores of a method's views.
-pub(crate) struct Row<'a> {
-    pub(crate) node: &'a RunNode,
-    /// The node's place in the run.
-    pub(crate) index: usize,
-    /// `metrics.json`.
-    pub(crate) metrics: Value,
-    /// What tells it from the others.
-    pub(crate) label: String,
-    /// Its place among [`Report::scenes`].
-    pub(crate) scene: usize,
-    /// Seconds of training.
-    pub(crate) training: f64,
-    /// Seconds of rendering, refinement included.
-    pub(crate) rendering: f64,
 }
 
 /// The views of a data set.

@@ -7,7 +7,8 @@ use pixels::{
 use scene::{View, Views};
 use serde_json::Value;
 
-use crate::gather::{Report, Row};
+use crate::gather::Report;
+use crate::row::Row;
 
 /// One picture of every view of a data set, such as ground truth or a method's error maps.
 pub(crate) struct Layer<'a> {

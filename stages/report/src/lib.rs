@@ -31,6 +31,7 @@ mod page;
 mod pictures;
 mod pipeline;
 mod results;
+mod row;
 mod scale;
 mod tables;
 mod viewer;

@@ -2,10 +2,10 @@ use artifact::{RunRecord, counted};
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use stage_call::utc;
 
-use crate::commands::commands;
+use crate::commands::{commands, name_of};
 use crate::data::Data;
 use crate::gather::{Report, SceneViews};
-use crate::pipeline::{name_of, pipeline};
+use crate::pipeline::pipeline;
 use crate::results::warnings_by_node;
 use crate::tables::{conventions, numbers_of_views, scores, summary};
 use crate::viewer::{plots, viewer};

@@ -6,7 +6,7 @@ use maud::{Markup, html};
 use serde_json::Value;
 use stage_call::{seconds, utc};
 
-use crate::commands::stage_command;
+use crate::commands::{name_of, stage_command};
 use crate::layout::{Drawing, HEIGHT, WIDTH, draw};
 
 /// All nodes of a block, at every point of a sweep.
@@ -157,12 +157,6 @@ fn boxes(blocks: &[Block<'_>], folders: &[&PathBuf], drawing: &Drawing) -> Marku
 
 fn place([x, y]: [f64; 2]) -> String {
     format!("left:{x:.0}px;top:{y:.0}px;width:{WIDTH}px;height:{HEIGHT}px")
-}
-
-/// The last part of a path.
-pub(crate) fn name_of(path: &Path) -> String {
-    let name = path.file_name().unwrap_or(path.as_os_str());
-    name.to_string_lossy().into_owned()
 }
 
 impl Block<'_> {

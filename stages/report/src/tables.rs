@@ -2,7 +2,8 @@ use maud::{Markup, html};
 use stage_call::seconds;
 
 use crate::figures::Figure;
-use crate::gather::{Report, Row};
+use crate::gather::Report;
+use crate::row::Row;
 
 /// Figures in the summary.
 const SUMMARY: usize = 4;

@@ -1,4 +1,4 @@
-//! Artifacts and words: what every program and library here shares.
+//! What every program and library here shares: artifacts' manifests, hashing, files, failures.
 //!
 //! * [`Manifest`]: the `artifact.json` of an artifact (kind, and each file's path, size and
 //!   blake3); its hash is the artifact's identity.

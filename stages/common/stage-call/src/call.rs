@@ -19,7 +19,7 @@ use wait4::{ResUse, Wait4 as _};
 
 use crate::clock::seconds;
 use crate::log::{StageLog, Tenths};
-use crate::verdict::{End, is_noise};
+use crate::verdict::{End, StageFailure, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
 const ENVIRONMENT: [&str; 11] = [
@@ -65,23 +65,6 @@ pub struct Call<'a> {
     pub threads: usize,
     /// The file of the key's lock, which the stage holds on to as its standard input.
     pub lock: Option<&'a File>,
-}
-
-/// How a stage ended, if not well.
-#[derive(Debug, Clone, thiserror::Error)]
-#[error("{message}")]
-pub struct StageFailure {
-    /// Its exit code; 1 where a signal ended it.
-    pub code: u8,
-    /// Why, on one line.
-    pub message: String,
-}
-
-impl StageFailure {
-    /// A file that can't be read or written.
-    pub fn at(path: &Path, error: &std::io::Error) -> Self {
-        Self { code: 1, message: format!("{}: {error}", path.display()) }
-    }
 }
 
 /// What a call took of the machine.

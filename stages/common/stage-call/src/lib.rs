@@ -16,7 +16,8 @@ mod display;
 mod log;
 mod verdict;
 
-pub use call::{Call, StageFailure, Usage, Watcher};
+pub use call::{Call, Usage, Watcher};
 pub use clock::{seconds, utc};
 pub use describing::{Answers, Interrupted, ask_all};
 pub use display::{Display, StageView};
+pub use verdict::StageFailure;

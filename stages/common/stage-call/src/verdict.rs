@@ -2,11 +2,27 @@
 //! that ended it, and only then by the last line on its stderr.
 
 use std::os::unix::process::ExitStatusExt as _;
+use std::path::Path;
 use std::process::ExitStatus;
 
 use stage::{MEMORY_REMEDY, out_of_memory};
 
-use crate::call::StageFailure;
+/// How a stage ended, if not well.
+#[derive(Debug, Clone, thiserror::Error)]
+#[error("{message}")]
+pub struct StageFailure {
+    /// Its exit code; 1 where a signal ended it.
+    pub code: u8,
+    /// Why, on one line.
+    pub message: String,
+}
+
+impl StageFailure {
+    /// A file that can't be read or written.
+    pub fn at(path: &Path, error: &std::io::Error) -> Self {
+        Self { code: 1, message: format!("{}: {error}", path.display()) }
+    }
+}
 
 /// How a stage ended.
 pub(crate) struct End {

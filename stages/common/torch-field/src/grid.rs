@@ -7,8 +7,8 @@ use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
-use crate::mlp::{host, matrix};
 use crate::ray_maps::{RayMaps, fused};
+use crate::transfer::{host, matrix};
 
 /// The fast field, [`radiance::Field`], through libtorch's operations: another reading of the same
 /// description and the same numbers, that judges the hand-written one, and its way to CUDA.

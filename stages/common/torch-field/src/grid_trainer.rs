@@ -6,9 +6,9 @@ use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
 use crate::grid::TorchGrid;
-use crate::mlp::host;
 use crate::regularisers::add_regularisers;
 use crate::step::Step;
+use crate::transfer::host;
 
 /// Trains a [`radiance::Field`] as [`radiance::Trainer`] does, by libtorch's operations and
 /// autograd: the same draws, steps, rates and looks at the occupancy. Only

@@ -39,6 +39,7 @@ mod regularisers;
 mod sampling;
 mod schedule;
 mod step;
+mod transfer;
 
 use std::path::PathBuf;
 

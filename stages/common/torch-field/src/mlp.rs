@@ -13,6 +13,7 @@ use crate::encoding::encode;
 use crate::network::{MlpNetwork, normal};
 use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};
+use crate::transfer::{columns, host, matrix};
 
 /// The paper's field: a coarse network that says where to look and a fine one that is looked at. In
 /// a box, positions are scene units, as they come, and rays run from `near` to `far` of the bounds;
@@ -366,32 +367,6 @@ fn read_network(
 
 fn is_usable(ray: &Ray) -> bool {
     ray.origin.iter().chain(&ray.direction).all(|x| x.is_finite()) && ray.direction != [0.0; 3]
-}
-
-/// Numbers as a matrix on a device.
-pub(crate) fn matrix(numbers: &[f32], shape: [i64; 2], device: Device) -> Result<Tensor, TchError> {
-    Tensor::f_from_slice(numbers)?.f_reshape(shape)?.f_to_device(device)
-}
-
-/// `N` numbers of each of n rays: n × N.
-pub(crate) fn columns<T, const N: usize>(
-    rays: &[T],
-    device: Device,
-    of: impl Fn(&T) -> [f32; N],
-) -> Result<Tensor, TchError> {
-    let values: Vec<f32> = rays.iter().flat_map(of).collect();
-    matrix(&values, [rays.len() as i64, N as i64], device)
-}
-
-/// A tensor's numbers in f32.
-pub(crate) fn host(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    let flat = tensor
-        .f_detach()?
-        .f_to_device(Device::Cpu)?
-        .f_to_kind(Kind::Float)?
-        .f_contiguous()?
-        .f_view([-1])?;
-    Vec::<f32>::try_from(flat)
 }
 
 #[cfg(test)]

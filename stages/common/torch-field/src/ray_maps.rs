@@ -2,7 +2,7 @@ use radiance::{NormalizedRay, Ray, RayMap, clip};
 use scene::{Bounds, Space};
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor};
 
-use crate::mlp::columns;
+use crate::transfer::columns;
 
 /// How rays run through the unit cube, as tensors: `radiance`'s [`NormalizedRay`]s, which it clips
 /// in f64 and on the host.

@@ -4,7 +4,7 @@ use radiance::{Ray, Supervisor, Tally};
 use tch::{TchError, Tensor};
 
 use crate::TorchFieldError;
-use crate::mlp::host;
+use crate::transfer::host;
 
 /// A step of a training: so many bundles of rays, counted on from what was cast before.
 #[derive(Clone, Copy, Debug)]
