@@ -175,7 +175,7 @@ compare-engines: build ## Train and render with this build and that of AGAINST=D
 	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
-	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py && .venv/bin/python scripts/make-goldens-mlp.py && .venv/bin/python scripts/make-goldens-upsample.py && .venv/bin/python scripts/make-goldens-refiner.py
+	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens/requirements.txt && .venv/bin/python scripts/goldens
 
 clean: ## Remove what was built and run (not .libtorch)
 	rm -rf target .nerf-sr out

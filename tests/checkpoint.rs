@@ -114,7 +114,7 @@ fn released_weights_become_what_upsample_reads() {
         let done = convert(network, &format!("tests/data/{network}.pth"), &out);
         assert_eq!(done.code, 0, "{}", done.stderr);
         let expected =
-            std::fs::read(here(&format!("stages/upsample/tests/data/{golden}.safetensors")))
+            std::fs::read(here(&format!("stages/upsample/tests/goldens/{golden}.safetensors")))
                 .unwrap();
         let (found, expected) = (std::fs::read(&out).unwrap(), expected);
         let [found, expected] =

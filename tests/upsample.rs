@@ -29,7 +29,7 @@ fn project() -> Project {
 }
 
 fn goldens() -> std::path::PathBuf {
-    common::root().join("stages/upsample/tests/data")
+    common::root().join("stages/upsample/tests/goldens")
 }
 
 #[test]

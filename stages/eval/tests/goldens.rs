@@ -67,7 +67,7 @@ fn lpips_gives_the_published_distances() {
     assert!(lpips.distance(&reference, &reference).unwrap().abs() < 1e-6);
 }
 
-/// Every network with fixed random weights, against PyTorch's layers (`scripts/make-goldens.py`).
+/// Every network with fixed random weights, against PyTorch's layers (`scripts/goldens/images.py`).
 #[cfg(feature = "torch")]
 #[test]
 fn lpips_is_that_of_pytorch_with_every_network() {

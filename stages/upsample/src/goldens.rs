@@ -1,4 +1,4 @@
-//! Networks against PyTorch's (`scripts/make-goldens-upsample.py`), and what their readers make of
+//! Networks against PyTorch's (`scripts/goldens/upsample.py`), and what their readers make of
 //! broken files.
 
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ const FILES: [&str; 7] = [
 ];
 
 fn golden(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/data/{name}.safetensors"))
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/goldens/{name}.safetensors"))
 }
 
 fn read(name: &str, weights: &Weights) -> Result<Box<dyn Network>, nets::WeightsError> {
@@ -125,7 +125,7 @@ fn imdn_as_released_scores_as_in_pytorch() {
         return;
     }
     nets::deterministic();
-    let scores = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/imdn-lego.json");
+    let scores = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/imdn-lego.json");
     let scores: serde_json::Value =
         serde_json::from_slice(&std::fs::read(scores).unwrap()).unwrap();
     for scale in [2usize, 4] {

@@ -1,4 +1,4 @@
-//! The network and its loss against PyTorch's (`scripts/make-goldens-refiner.py`).
+//! The network and its loss against PyTorch's (`scripts/goldens/paper_refiner.py`).
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use crate::network::PaperRefiner;
 use crate::trainer::loss;
 
 fn golden() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/golden.safetensors")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/goldens/golden.safetensors")
 }
 
 fn apart(a: &Tensor, b: &Tensor) -> f64 {
@@ -51,7 +51,7 @@ fn network_and_loss_are_those_of_pytorch() {
         let prefix = format!("golden.{kind}.");
         let perceptual = (blocks > 0).then(|| {
             let path = Path::new(env!("CARGO_MANIFEST_DIR"))
-                .join(format!("tests/data/vgg-{kind}.safetensors"));
+                .join(format!("tests/goldens/vgg-{kind}.safetensors"));
             PerceptualLoss::of(&Weights::read(&path).unwrap(), [4, 4, 6, 6, 6]).unwrap()
         });
         assert_eq!(perceptual.as_ref().map_or(0, PerceptualLoss::blocks), blocks);

@@ -1,4 +1,4 @@
-//! The byte pattern of scripts/make-goldens.py, repeated.
+//! The byte pattern of scripts/goldens/images.py, repeated.
 
 /// Flat areas, edges, noise, and alpha of every kind; `channels` interleaved.
 pub fn pattern(width: usize, height: usize, channels: usize, seed: u32) -> Vec<u8> {

@@ -13,7 +13,7 @@ use crate::network::MlpNetwork;
 use crate::sampling::{importance, middles, stratified};
 use crate::{MlpTrainer, MlpTraining, Schedule};
 
-const GOLDENS: &[u8] = include_bytes!("goldens/mlp.safetensors");
+const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 
 /// What the script's `draw` gives.
 fn draw(purpose: u64, shape: &[i64]) -> Tensor {

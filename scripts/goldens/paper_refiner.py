@@ -12,8 +12,8 @@ from safetensors.torch import save_file
 from torch import nn
 from torch.nn import functional
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
-TO = ROOT / "stages/common/paper-refiner/tests/data"
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TO = ROOT / "stages/common/paper-refiner/tests/goldens"
 torch.manual_seed(3)
 
 

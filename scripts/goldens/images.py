@@ -1,7 +1,5 @@
 #!/usr/bin/env python3
-"""Makes the golden files that tests compare with, from the real thing.
-
-    python3 -m venv .venv && .venv/bin/pip install -r scripts/goldens-requirements.txt && .venv/bin/python scripts/make-goldens.py
+"""Makes the golden files of `pixels` and `eval`, from Pillow, scikit-image and PyTorch: run by `make goldens`.
 
 Inputs come from an integer formula that the tests repeat (`pattern`), so only outputs are kept.
 """
@@ -16,7 +14,7 @@ from PIL import Image
 
 import draws
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
 def pattern(width, height, channels, seed):

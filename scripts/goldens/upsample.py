@@ -20,8 +20,8 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 from torch.nn import functional
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
-TO = ROOT / "stages/upsample/tests/data"
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+TO = ROOT / "stages/upsample/tests/goldens"
 torch.manual_seed(7)
 
 
