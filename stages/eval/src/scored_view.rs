@@ -1,7 +1,7 @@
 use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput};
-use pixels::{Degradation, Filter, Image, Mask, Resampling, read_premultiplied};
-use scene::{Background, View, Views};
+use pixels::{Degradation, Filter, Image, Mask, Resampling};
+use scene::{View, Views};
 
 /// What is scored: rendered views, and what they should be.
 pub(crate) struct ScoredScene<'a> {
@@ -44,8 +44,8 @@ impl<'a> ScoredView<'a> {
         })?;
         let image = view.image.as_ref().with_context(|| format!("view {name}: it has no image"));
         let image = image.bad_input("views")?;
-        let found = read_image(scene.views_in, view, image, scene.views.background)?;
-        let read_true = |file| read_image(scene.truth_in, true_view, file, scene.truth.background);
+        let found = read_image(scene.views_in, scene.views, view, image)?;
+        let read_true = |file| read_image(scene.truth_in, scene.truth, true_view, file);
         let expected = true_view.image.as_deref().map(read_true).transpose()?;
         check_sizes(true_view, &found, expected.as_ref())?;
         let lr = true_view.low_resolution.as_deref().map(read_true).transpose()?;
@@ -132,13 +132,12 @@ fn shrunk(found: &Image, lr: &Image, filter: Filter) -> Image {
 /// An image of a view over its background, clamped to [0, 1].
 pub(crate) fn read_image(
     input: &GivenInput,
+    views: &Views,
     view: &View,
     file: &str,
-    background: Background,
 ) -> anyhow::Result<Image> {
     let place = format!("view {}", view.camera.name);
-    let image = read_premultiplied(&input.path(file)).bad_input(&place)?;
-    let mut image = image.over(background.shown());
+    let mut image = views.read_over(&input.path(file)).bad_input(&place)?;
     image.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     Ok(image)
 }

@@ -8,7 +8,7 @@ use pixels::{
     write_png,
 };
 use rayon::prelude::*;
-use scene::{VIEWS_FILE, View, Views};
+use scene::{VIEWS_FILE, View, Views, mask_file};
 use stage::{Context, Progress};
 
 use crate::degrade::{self, LrImage, degrade};
@@ -223,11 +223,8 @@ impl<'a> SceneWriter<'a> {
     }
 
     fn write_mask(&self, subtree: &str, name: &str, mask: &Mask) -> anyhow::Result<()> {
-        write_png(
-            &self.context.output_path(&format!("{subtree}/masks/{name}.png"))?,
-            &mask.to_rgba8(),
-        )
-        .map_err(Into::into)
+        let path = self.context.output_path(&format!("{subtree}/{}", mask_file(name)))?;
+        Ok(write_png(&path, &mask.to_rgba8())?)
     }
 
     /// The mask of an LR image: what its pixels were made from must count. Photographs that are LR
@@ -313,5 +310,5 @@ impl<'a> SceneWriter<'a> {
 
 /// A mask's file, where a frame has one.
 fn mask_name(frame: &Frame) -> Option<String> {
-    frame.mask.as_ref().map(|_| format!("masks/{}.png", frame.name))
+    frame.mask.as_ref().map(|_| mask_file(&frame.name))
 }

@@ -25,7 +25,7 @@ mod view;
 
 use contract::{Input, Output};
 use refinement::{KnownView, LrObservations, REFINER_FILE, RefinerFile, Use};
-use scene::{VIEWS_FILE, Views};
+use scene::{VIEWS_FILE, Views, image_file, preview_file};
 use stage::{Context, Stage};
 
 pub use params::Params;
@@ -142,7 +142,7 @@ fn refine_all(
     for view in &mut views.views {
         job.context.check_interrupt()?;
         let name = &view.camera.name;
-        let [image, preview] = [format!("images/{name}.exr"), format!("previews/{name}.png")];
+        let [image, preview] = [image_file(name), preview_file(name)];
         let refined: RefinedView = job
             .context
             .part(name, &[&image, &preview], || job.refine(view, references, [&image, &preview]))?;

@@ -17,7 +17,7 @@ use contract::{Input, Output};
 use fields::{Members, middle};
 use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
 use radiance::{Ray, RayField};
-use scene::{Background, Camera, VIEWS_FILE, View, Views};
+use scene::{Background, Camera, VIEWS_FILE, View, Views, image_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
@@ -99,8 +99,7 @@ impl Stage for RenderDepth {
         let progress = context.progress("rendering", rows);
         let (mut views, mut done) = (Vec::with_capacity(resized.len()), 0);
         for camera in resized {
-            let [image, preview] =
-                [format!("images/{}.exr", camera.name), format!("previews/{}.png", camera.name)];
+            let [image, preview] = [image_file(&camera.name), preview_file(&camera.name)];
             let job = RenderJob {
                 params,
                 members: &fields,

@@ -1,9 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use pixels::{
-    ExrImage, Rgba8, common_range, depth_range, draw_depth, read_exr, read_png, read_premultiplied,
-};
+use pixels::{ExrImage, Rgba8, common_range, depth_range, draw_depth, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
 
@@ -62,8 +60,7 @@ impl Folder {
 
     /// An image of it over the background.
     fn colour(&self, file: &str) -> anyhow::Result<Rgba8> {
-        let image = read_premultiplied(&self.path.join(file))?;
-        Ok(image.over(self.views.background.shown()).to_rgba8())
+        Ok(self.views.read_over(&self.path.join(file))?.to_rgba8())
     }
 
     fn depth(&self, name: &str) -> anyhow::Result<Option<ExrImage>> {

@@ -30,7 +30,9 @@ use pixels::{
     Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png,
 };
 use rayon::prelude::*;
-use scene::{Camera, Photograph, VIEWS_FILE, View, Views};
+use scene::{
+    Camera, Photograph, VIEWS_FILE, View, Views, image_file, mask_file, preview_file,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -146,7 +148,7 @@ impl Stage for Upsample {
             });
         work.collect::<anyhow::Result<Vec<_>>>()?;
         let hr = pairs.iter().map(|(view, camera)| {
-            let image = Some(format!("images/{}.exr", camera.name));
+            let image = Some(image_file(&camera.name));
             View {
                 image,
                 mask: view.mask.as_ref().map(|_| mask_file(&camera.name)),
@@ -261,17 +263,13 @@ fn enlarge(network: Option<&dyn Network>, lr: &Image, camera: &Camera) -> anyhow
     Ok(nets::image_of(&hr)?)
 }
 
-fn mask_file(name: &str) -> String {
-    format!("masks/{name}.png")
-}
-
 /// A view's files: opaque colours, a preview, and what counts of them.
 fn write(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyhow::Result<()> {
     if let Some(mask) = mask {
         write_png(&context.output_path(&mask_file(name))?, &mask.to_rgba8())?;
     }
     let channels = &VIEW_CHANNELS[..4];
-    let path = context.output_path(&format!("images/{name}.exr"))?;
+    let path = context.output_path(&image_file(name))?;
     write_exr(&path, (hr.width, hr.height), channels, VIEW_NOTE, |first, rows, samples| {
         let pixels = hr.data[first * hr.width * 3..(first + rows) * hr.width * 3].chunks_exact(3);
         for (sample, pixel) in samples.chunks_exact_mut(4).zip(pixels) {
@@ -280,5 +278,5 @@ fn write(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyho
         }
         Ok::<(), PixelError>(())
     })?;
-    Ok(write_png(&context.output_path(&format!("previews/{name}.png"))?, &hr.to_rgba8())?)
+    Ok(write_png(&context.output_path(&preview_file(name))?, &hr.to_rgba8())?)
 }

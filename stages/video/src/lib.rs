@@ -9,9 +9,7 @@ use std::process::{Command, Stdio};
 use anyhow::Context as _;
 use artifact::{Failure, RunNode, RunRecord, folders_of};
 use contract::{Input, Output};
-use pixels::{
-    Rgba8, common_range, depth_range, draw_depth, read_exr, read_premultiplied, write_png,
-};
+use pixels::{Rgba8, common_range, depth_range, draw_depth, read_exr, write_png};
 use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -103,8 +101,7 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
                 .image
                 .as_ref()
                 .with_context(|| format!("view {}: it has no image", view.camera.name))?;
-            let colour =
-                read_premultiplied(&folder.join(image))?.over(views.background.shown()).to_rgba8();
+            let colour = views.read_over(&folder.join(image))?.to_rgba8();
             let depth = match (&view.depth, range) {
                 (Some(file), Some(range)) => {
                     let image = read_exr(&folder.join(file))?;

@@ -30,7 +30,7 @@ use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput, RunNode, RunRecord, folders_of};
 use base64::Engine as _;
 use contract::{Input, Output};
-use pixels::{Filter, Rgba8, encode_png, read_premultiplied, resize_pillow};
+use pixels::{Filter, Rgba8, encode_png, resize_pillow};
 use radiance::{Field, FieldFile, FieldModel};
 use scene::{Bounds, Camera, Space, Views};
 use schemars::JsonSchema;
@@ -178,8 +178,7 @@ fn page_cameras(params: &Params, folder: &Path, views: &Views) -> anyhow::Result
         let is_shown = (i + 1) * most / count > i * most / count;
         let photograph = match &view.image {
             Some(file) if is_shown => {
-                let image = read_premultiplied(&folder.join(file))?;
-                let image = image.over(views.background.shown()).to_rgba8();
+                let image = views.read_over(&folder.join(file))?.to_rgba8();
                 Some(shrunk(image, params.photograph_width as usize))
             }
             _ => None,

@@ -38,5 +38,8 @@ pub use camera::{Camera, CameraError, CameraRay, CameraRays, Intrinsics, common_
 pub use lens::Distortion;
 pub use pose::{Pose, looking_at, pose_of};
 pub use space::{Frustum, Space};
-pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
+pub use views::{
+    Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError, image_file,
+    mask_file, preview_file,
+};
 pub use warp::{Surface, Visibility};

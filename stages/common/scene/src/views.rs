@@ -47,6 +47,21 @@ pub struct View {
     pub low_resolution: Option<String>,
 }
 
+/// Where a stage that renders or changes views puts the image of one: EXR.
+pub fn image_file(name: &str) -> String {
+    format!("images/{name}.exr")
+}
+
+/// The same image to look at: PNG, over the background.
+pub fn preview_file(name: &str) -> String {
+    format!("previews/{name}.png")
+}
+
+/// The view's [mask](View::mask).
+pub fn mask_file(name: &str) -> String {
+    format!("masks/{name}.png")
+}
+
 impl View {
     /// A camera without files.
     pub fn camera_only(camera: Camera) -> Self {
@@ -244,6 +259,11 @@ impl Views {
         self.views.iter().find(|v| {
             v.camera.name == camera.name && v.camera.camera_to_world == camera.camera_to_world
         })
+    }
+
+    /// An image file of these views over their background: RGB.
+    pub fn read_over(&self, path: &Path) -> Result<Image, PixelError> {
+        Ok(read_premultiplied(path)?.over(self.background.shown()))
     }
 
     /// Reads and checks the `views.json` of an input.

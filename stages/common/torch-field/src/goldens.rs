@@ -1,4 +1,4 @@
-//! Against PyTorch: `goldens/mlp.safetensors` is made by `scripts/make-goldens-mlp.py` (`make
+//! Against PyTorch: `tests/goldens/mlp.safetensors` is made by `scripts/goldens/torch_field.py` (`make
 //! goldens`).
 
 use counter_rng::uniform;

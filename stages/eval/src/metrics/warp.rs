@@ -104,7 +104,7 @@ fn warped(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
     let (Some(own), Some(theirs)) = (own, read_surface(scene.views_in, other)?) else {
         return Ok(None);
     };
-    let image = read_image(scene.truth_in, other_view, file, scene.truth.background)?;
+    let image = read_image(scene.truth_in, scene.truth, other_view, file)?;
     if (image.width, image.height) != (theirs.width, theirs.height) {
         return Ok(None);
     }
