@@ -72,7 +72,7 @@ fn shade(world: &World, origin: DVec3, direction: DVec3, bounces: u32) -> Option
     let look = surface(hit.material, hit.local, hit.local_normal, world.seed);
     let start = point + 1e-4 * normal;
     let sun = normal.dot(SUN).max(0.0);
-    let lit = if sun > 0.0 && world.first_hit(start, SUN).is_none() { sun } else { 0.0 };
+    let lit = if sun > 0.0 && !world.is_met(start, SUN) { sun } else { 0.0 };
     let sky = 0.32 + 0.18 * normal.z;
     let mut light =
         look.albedo * (DVec3::new(0.80, 0.76, 0.68) * lit + DVec3::new(0.85, 0.95, 1.10) * sky);

@@ -32,14 +32,33 @@ impl Thing {
     fn new(shape: Shape, centre: DVec3, material: Material) -> Self {
         Self { shape, centre, to_local: DMat3::IDENTITY, material }
     }
+
+    /// Distance and normal of the first surface that a ray meets; the normal in the thing's own
+    /// space.
+    fn intersect(&self, origin: DVec3, direction: DVec3) -> Option<(f64, DVec3)> {
+        let local_origin = self.to_local * (origin - self.centre);
+        self.shape.intersect(local_origin, self.to_local * direction)
+    }
+
+    fn bounding_ball(&self) -> BoundingBall {
+        let (centre, radius) = self.shape.bounding_ball();
+        BoundingBall { centre: self.centre + self.to_local.transpose() * centre, radius }
+    }
 }
 
-/// Things behind one bounding ball, so that most rays pass them at the cost of one test.
-#[derive(Clone, Debug)]
-struct Cluster {
+/// A ball around things, so that most rays pass them at the cost of one test.
+#[derive(Clone, Copy, Debug)]
+struct BoundingBall {
     centre: DVec3,
     radius: f64,
+}
+
+/// Things behind one bounding ball, each behind its own.
+#[derive(Clone, Debug)]
+struct Cluster {
+    ball: BoundingBall,
     things: Vec<Thing>,
+    balls: Vec<BoundingBall>,
 }
 
 /// Where a ray meets a surface.
@@ -130,18 +149,11 @@ impl World {
     /// The first surface along a ray, beyond a tiny distance.
     pub(crate) fn first_hit(&self, origin: DVec3, direction: DVec3) -> Option<Hit> {
         let mut best: Option<(f64, &Thing, DVec3)> = None;
-        for group in &self.groups {
-            if !group.may_meet(origin, direction) {
-                continue;
-            }
-            for thing in &group.things {
-                let o = thing.to_local * (origin - thing.centre);
-                let d = thing.to_local * direction;
-                if let Some((t, normal)) = thing.shape.intersect(o, d)
-                    && best.as_ref().is_none_or(|(nearest, ..)| t < *nearest)
-                {
-                    best = Some((t, thing, normal));
-                }
+        for thing in self.candidates(origin, direction) {
+            if let Some((t, normal)) = thing.intersect(origin, direction)
+                && best.as_ref().is_none_or(|(nearest, ..)| t < *nearest)
+            {
+                best = Some((t, thing, normal));
             }
         }
         best.map(|(t, thing, local_normal)| {
@@ -154,6 +166,22 @@ impl World {
                 material: thing.material,
             }
         })
+    }
+}
+
+impl World {
+    /// Whether a ray meets any surface, beyond a tiny distance.
+    pub(crate) fn is_met(&self, origin: DVec3, direction: DVec3) -> bool {
+        self.candidates(origin, direction).any(|thing| thing.intersect(origin, direction).is_some())
+    }
+
+    /// The things that a ray may meet, by their bounding balls.
+    fn candidates(&self, origin: DVec3, direction: DVec3) -> impl Iterator<Item = &Thing> {
+        let groups = self.groups.iter().filter(move |group| group.ball.may_meet(origin, direction));
+        groups
+            .flat_map(|group| group.things.iter().zip(&group.balls))
+            .filter(move |(_, ball)| ball.may_meet(origin, direction))
+            .map(|(thing, _)| thing)
     }
 }
 
@@ -229,19 +257,16 @@ fn sign(foot: DVec3) -> Cluster {
 }
 
 fn group(things: Vec<Thing>) -> Cluster {
-    let spheres: Vec<(DVec3, f64)> = things
-        .iter()
-        .map(|t| {
-            let (c, r) = t.shape.bounding_ball();
-            (t.centre + t.to_local.transpose() * c, r)
-        })
-        .collect();
-    let centre = spheres.iter().map(|(c, _)| *c).sum::<DVec3>() / spheres.len() as f64;
-    let radius = spheres.iter().map(|(c, r)| (*c - centre).length() + r).fold(0.0, f64::max);
-    Cluster { centre, radius, things }
+    let mut balls: Vec<BoundingBall> = things.iter().map(Thing::bounding_ball).collect();
+    let centre = balls.iter().map(|ball| ball.centre).sum::<DVec3>() / balls.len() as f64;
+    let reach = |ball: &BoundingBall| (ball.centre - centre).length() + ball.radius;
+    let radius = balls.iter().map(reach).fold(0.0, f64::max);
+    // A ray that touches a shape is met by its ball, whatever rounding does.
+    balls.iter_mut().for_each(|ball| ball.radius += ROUNDING);
+    Cluster { ball: BoundingBall { centre, radius }, things, balls }
 }
 
-impl Cluster {
+impl BoundingBall {
     fn may_meet(&self, origin: DVec3, direction: DVec3) -> bool {
         let to = self.centre - origin;
         let along = to.dot(direction);
@@ -251,6 +276,8 @@ impl Cluster {
     }
 }
 
+/// More than rounding errors of distances in the scene.
+const ROUNDING: f64 = 1e-6;
 /// Surfaces nearer than this are the one the ray starts on.
 const EPSILON: f64 = 1e-6;
 

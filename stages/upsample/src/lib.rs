@@ -30,9 +30,7 @@ use pixels::{
     Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png,
 };
 use rayon::prelude::*;
-use scene::{
-    Camera, Photograph, VIEWS_FILE, View, Views, image_file, mask_file, preview_file,
-};
+use scene::{Camera, Photograph, VIEWS_FILE, View, Views, image_file, mask_file, preview_file};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
