@@ -1,5 +1,5 @@
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use artifact::{RunInput, RunNode, RunRecord, UnfinishedNode, counted, sized};
 use maud::{Markup, html};
