@@ -26,6 +26,7 @@ mod colmap;
 mod found;
 mod frame;
 mod llff;
+mod npy;
 mod number;
 mod photograph;
 mod split;

@@ -1,4 +1,3 @@
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 use artifact::counted;
@@ -7,6 +6,7 @@ use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::found::{Found, find};
 use crate::frame::names;
+use crate::npy::read_matrix;
 use crate::photograph::{Stored, fitted, is_image_name, look};
 use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
@@ -148,54 +148,16 @@ fn images(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String>
     Err(format!("{count} poses, but {seen}; images and poses must be as many"))
 }
 
-/// Opening brackets in the header of an array of numbers, at most: a dictionary's and its shape's
-/// are two. The parser takes twice the time for each further one that is nested (found by fuzzing),
-/// and as much more of the stack.
-const MOST_BRACKETS: usize = 4;
-
-/// Opening brackets in a NumPy file's header.
-fn brackets(bytes: &[u8]) -> usize {
-    // Magic bytes, version, and the header's length: two bytes, or four from version 2 on.
-    let length = match *bytes {
-        [_, _, _, _, _, _, 1, _, a, b, ..] => 10 + usize::from(u16::from_le_bytes([a, b])),
-        [_, _, _, _, _, _, _, _, a, b, c, d, ..] => {
-            12usize.saturating_add(u32::from_le_bytes([a, b, c, d]) as usize)
-        }
-        _ => 0,
-    };
-    bytes[..length.min(bytes.len())].iter().filter(|byte| b"{[(".contains(byte)).count()
-}
-
 /// The array's rows.
 fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
-    let io = |source| DatasetError::Io { path: path.to_path_buf(), source };
-    let mut bytes = Vec::new();
-    std::fs::File::open(path).and_then(|mut f| f.read_to_end(&mut bytes)).map_err(io)?;
-    if brackets(&bytes) > MOST_BRACKETS {
-        return Err(no_array(path, "its header is nested"));
+    let bytes = std::fs::read(path)
+        .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
+    let matrix = read_matrix(&bytes).map_err(|reason| no_array(path, &reason))?;
+    if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
+        let rows = matrix.numbers.len() / matrix.columns.max(1);
+        return Err(no_array(path, &format!("its shape is {:?}", [rows, matrix.columns])));
     }
-    let file = npyz::NpyFile::new(&bytes[..]).map_err(|e| no_array(path, &e.to_string()))?;
-    let shape = file.shape().to_vec();
-    let rows = match shape[..] {
-        // A claim of more numbers than there are bytes isn't believed.
-        [rows, columns] if columns == NUMBERS as u64 && rows > 0 && rows <= bytes.len() as u64 => {
-            rows as usize
-        }
-        _ => return Err(no_array(path, &format!("its shape is {shape:?}"))),
-    };
-    let by_columns = file.header().order() == npyz::Order::Fortran;
-    let kind = file.dtype().descr();
-    let numbers: Vec<f64> = if kind.contains("f8") {
-        file.into_vec().map_err(|e| no_array(path, &e.to_string()))?
-    } else {
-        let singles: Vec<f32> =
-            file.into_vec().map_err(|e| no_array(path, &format!("{e}; it holds {kind}")))?;
-        singles.into_iter().map(f64::from).collect()
-    };
-    let (down, across) = if by_columns { (1, rows) } else { (NUMBERS, 1) };
-    let at = |row: usize, column: usize| row * down + column * across;
-    let number = |row, column| numbers.get(at(row, column)).copied().unwrap_or(f64::NAN);
-    Ok((0..rows).map(|row| std::array::from_fn(|column| number(row, column))).collect())
+    Ok(matrix.numbers.as_chunks().0.to_vec())
 }
 
 fn no_array(path: &Path, reason: &str) -> DatasetError {
@@ -346,7 +308,7 @@ mod tests {
             nested.extend(header);
             let message =
                 Dataset::read(folder(&nested, &[("images", 3)]).path()).unwrap_err().to_string();
-            assert!(message.contains("its header is nested"), "{message}");
+            assert!(message.contains("not a NumPy array"), "{message}");
         }
     }
 

@@ -1,0 +1,134 @@
+//! A matrix as NumPy saves one, in versions 1 to 3 of its format.
+
+/// Numbers of a two-dimensional array, row by row.
+#[derive(Debug, PartialEq)]
+pub(crate) struct Matrix {
+    pub(crate) columns: usize,
+    pub(crate) numbers: Vec<f64>,
+}
+
+/// Reads a whole file; the reason is for people.
+pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
+    let (header, data) = parts(bytes).ok_or("it doesn't begin as one")?;
+    let kind = entry(header, "descr").and_then(quoted).ok_or("its header has no descr")?;
+    let order = entry(header, "fortran_order").ok_or("its header has no fortran_order")?;
+    let shape = entry(header, "shape").and_then(lengths).ok_or("its header has no shape")?;
+    let [rows, columns] = shape[..] else { return Err(format!("its shape is {shape:?}")) };
+    let count = rows.checked_mul(columns).ok_or_else(|| format!("its shape is {shape:?}"))?;
+    let stored: Vec<f64> = match kind {
+        "<f8" | "=f8" => numbers(data, f64::from_le_bytes),
+        ">f8" => numbers(data, f64::from_be_bytes),
+        "<f4" | "=f4" => numbers(data, |bytes| f64::from(f32::from_le_bytes(bytes))),
+        ">f4" => numbers(data, |bytes| f64::from(f32::from_be_bytes(bytes))),
+        _ => return Err(format!("it holds {kind:?}")),
+    };
+    // A claim of more numbers than there are isn't believed.
+    let stored = stored.get(..count).ok_or("it is cut short")?;
+    let numbers = if order.starts_with("True") {
+        let at = |i: usize| stored[i % columns * rows + i / columns];
+        (0..count).map(at).collect()
+    } else {
+        stored.to_vec()
+    };
+    Ok(Matrix { columns, numbers })
+}
+
+/// The header's text and the data behind it.
+fn parts(bytes: &[u8]) -> Option<(&str, &[u8])> {
+    let rest = bytes.strip_prefix(b"\x93NUMPY")?;
+    let (length, rest) = match *rest {
+        [1, _, a, b, ref rest @ ..] => (u32::from(u16::from_le_bytes([a, b])), rest),
+        [2 | 3, _, a, b, c, d, ref rest @ ..] => (u32::from_le_bytes([a, b, c, d]), rest),
+        _ => return None,
+    };
+    let (header, data) = rest.split_at_checked(length as usize)?;
+    Some((std::str::from_utf8(header).ok()?, data))
+}
+
+/// What stands behind a key of the header, a Python dictionary, up to its end.
+fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
+    let keys = [format!("'{key}':"), format!("\"{key}\":")];
+    let rest = keys.iter().find_map(|key| Some(header.split_once(key.as_str())?.1))?;
+    Some(rest.trim_start())
+}
+
+/// The string that a text begins with, between quotes.
+fn quoted(text: &str) -> Option<&str> {
+    let quote = text.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
+    Some(text[1..].split_once(quote)?.0)
+}
+
+/// The lengths in the brackets that a text begins with. Python 2 wrote `20L`.
+fn lengths(text: &str) -> Option<Vec<usize>> {
+    let (lengths, _) = text.strip_prefix('(')?.split_once(')')?;
+    let words = lengths.split(',').map(str::trim).filter(|word| !word.is_empty());
+    words.map(|word| word.strip_suffix('L').unwrap_or(word).parse().ok()).collect()
+}
+
+fn numbers<const N: usize>(data: &[u8], number: impl Fn([u8; N]) -> f64) -> Vec<f64> {
+    data.as_chunks::<N>().0.iter().map(|bytes| number(*bytes)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(version: u8, header: &str, data: &[u8]) -> Vec<u8> {
+        let length = (header.len() as u32).to_le_bytes();
+        let length = if version == 1 { &length[..2] } else { &length };
+        [b"\x93NUMPY", &[version, 0][..], length, header.as_bytes(), data].concat()
+    }
+
+    fn matrix(numbers: [f64; 6]) -> Result<Matrix, String> {
+        Ok(Matrix { columns: 3, numbers: numbers.to_vec() })
+    }
+
+    #[test]
+    fn every_version_order_and_float_is_read() {
+        let data = [1.5f64, 2.0, 3.0, 4.0, 5.0, -6.5];
+        let little: Vec<u8> = data.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let big: Vec<u8> = data.iter().flat_map(|v| v.to_be_bytes()).collect();
+        let single: Vec<u8> = data.iter().flat_map(|v| (*v as f32).to_le_bytes()).collect();
+        let header = |kind: &str, order: &str| {
+            format!("{{'descr': '{kind}', 'fortran_order': {order}, 'shape': (2, 3), }}   \n")
+        };
+        for version in [1, 2, 3] {
+            for (kind, bytes) in [("<f8", &little), (">f8", &big), ("<f4", &single)] {
+                let bytes = file(version, &header(kind, "False"), bytes);
+                assert_eq!(read_matrix(&bytes), matrix(data), "{version} {kind}");
+            }
+        }
+        // Column by column.
+        let bytes = file(1, &header("<f8", "True"), &little);
+        assert_eq!(read_matrix(&bytes), matrix([1.5, 3.0, 5.0, 2.0, 4.0, -6.5]));
+        let old = r#"{"descr": "<f8", "fortran_order": False, "shape": (2L, 3L)}"#;
+        assert_eq!(read_matrix(&file(1, old, &little)), matrix(data));
+    }
+
+    #[test]
+    fn other_files_are_refused_in_words() {
+        let header = |kind: &str, shape: &str| {
+            format!("{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}")
+        };
+        let data = [0; 48];
+        let huge = format!("({0}, {0})", usize::MAX);
+        for (kind, shape, words) in [
+            ("'<i8'", "(2, 3)", "it holds \"<i8\""),
+            ("[('x', '<f8')]", "(2, 3)", "no descr"),
+            ("'<f8'", "(2, 3, 1)", "its shape is [2, 3, 1]"),
+            ("'<f8'", "()", "its shape is []"),
+            ("'<f8'", "(2, -3)", "no shape"),
+            ("'<f8'", "((((2, 3))))", "no shape"),
+            ("'<f8'", "(2, 4)", "cut short"),
+            ("'<f8'", &huge, "its shape is"),
+        ] {
+            let reason = read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err();
+            assert!(reason.contains(words), "{kind} {shape}: {reason}");
+        }
+        let whole = file(1, &header("'<f8'", "(2, 3)"), &data);
+        assert!(read_matrix(&whole).is_ok());
+        for end in 0..whole.len() {
+            assert!(read_matrix(&whole[..end]).is_err(), "{end} of {} bytes", whole.len());
+        }
+    }
+}
