@@ -1,6 +1,7 @@
-"""Makes all golden files that tests compare with, from the real thing: python scripts/goldens
+"""Makes the golden files that other implementations give: python scripts/goldens
 
-A crate's lie in its `tests/goldens/`. Pinned packages are in requirements.txt; `make goldens` installs them.
+They lie in `tests/goldens/` of their crate. Checkpoints for tests/checkpoint.rs lie in `tests/data/`. `make goldens` installs the packages
+that requirements.txt pins.
 """
 
 import pathlib

@@ -1,4 +1,4 @@
-"""The counter-based draws of `radiance::uniform`, repeated for the golden files: weights that are drawn needn't be kept. Not a program."""
+"""The draws of `counter_rng::uniform`, repeated, so that golden files needn't keep drawn weights. Not a program."""
 
 import numpy
 

@@ -2,7 +2,7 @@
 """Makes the golden file of the paper's field (`torch-field`), from PyTorch's own layers and optimiser: run by `make goldens`.
 
 The networks, the sampling and the compositing are built here from their published description. Inputs and weights come from the
-counter-based draws of `radiance::uniform`, which are repeated here, so only outputs are kept: one safetensors file. Besides, two
+counter-based draws of `counter_rng::uniform`, which are repeated here, so only outputs are kept: one safetensors file. Besides, two
 small checkpoints for tests/checkpoint.rs.
 """
 
@@ -20,7 +20,7 @@ SEED = 11
 
 
 def draw(purpose, *shape):
-    """Numbers in [0, 1), as `radiance::uniform(SEED, purpose, 0..)` gives them."""
+    """Numbers in [0, 1), as `counter_rng::uniform(SEED, purpose, 0..)` gives them."""
     return torch.from_numpy(draws.uniform(SEED, purpose, math.prod(shape))).reshape(shape)
 
 

@@ -53,7 +53,7 @@ struct BoundingBall {
     radius: f64,
 }
 
-/// Things behind one bounding ball, each behind its own.
+/// Things inside one bounding ball, each inside its own.
 #[derive(Clone, Debug)]
 struct Cluster {
     ball: BoundingBall,
@@ -167,9 +167,7 @@ impl World {
             }
         })
     }
-}
 
-impl World {
     /// Whether a ray meets any surface, beyond a tiny distance.
     pub(crate) fn is_met(&self, origin: DVec3, direction: DVec3) -> bool {
         self.candidates(origin, direction).any(|thing| thing.intersect(origin, direction).is_some())
@@ -261,7 +259,8 @@ fn group(things: Vec<Thing>) -> Cluster {
     let centre = balls.iter().map(|ball| ball.centre).sum::<DVec3>() / balls.len() as f64;
     let reach = |ball: &BoundingBall| (ball.centre - centre).length() + ball.radius;
     let radius = balls.iter().map(reach).fold(0.0, f64::max);
-    // A ray that touches a shape is met by its ball, whatever rounding does.
+    // A thing's ball is a little larger, so that rounding loses no hit. The cluster's ball isn't: a
+    // larger one would change images.
     balls.iter_mut().for_each(|ball| ball.radius += ROUNDING);
     Cluster { ball: BoundingBall { centre, radius }, things, balls }
 }
@@ -276,7 +275,7 @@ impl BoundingBall {
     }
 }
 
-/// More than rounding errors of distances in the scene.
+/// Above the rounding errors of distances in the scene.
 const ROUNDING: f64 = 1e-6;
 /// Surfaces nearer than this are the one the ray starts on.
 const EPSILON: f64 = 1e-6;

@@ -3,12 +3,14 @@ use std::io::{self, Write};
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
-/// Up to where a surface goes is known to about so many pixels, and so is the side that it turns.
+/// Normals so many pixels from a silhouette may be wrong.
 const UNSURE: u8 = 2;
 
-/// The surfels that become points: all but those at silhouettes, whose normals may be wrong.
+/// The surfels that become points: all but those near silhouettes, or all where there are no others.
 pub(crate) fn chosen(surfels: &[Surfel]) -> Vec<Surfel> {
-    surfels.iter().filter(|surfel| surfel.margin > UNSURE).copied().collect()
+    let sure: Vec<Surfel> =
+        surfels.iter().filter(|surfel| surfel.margin > UNSURE).copied().collect();
+    if sure.is_empty() { surfels.to_vec() } else { sure }
 }
 
 /// Writes points with normals and 8-bit colours, display-encoded sRGB.

@@ -11,7 +11,7 @@ pub(crate) struct Surfel {
     pub(crate) position: DVec3,
     /// Unit normal, towards the cameras that see it.
     pub(crate) normal: DVec3,
-    /// For how many pixels its surface goes on to all sides, where that is most.
+    /// Pixels from its middle to the nearest silhouette, in the view where that is most.
     pub(crate) margin: u8,
     /// Display-encoded sRGB, the mean over the views that see it.
     pub(crate) colour: [f32; 3],
@@ -80,6 +80,7 @@ fn samples(views: &[SeenView], bounds: &Bounds, edge: f64) -> Vec<Sample> {
 
 /// The mean of a cell's pixels: those count more that see the surface from near and not aslant.
 fn surfel(views: &[SeenView], bounds: &Bounds, edge: f64, group: &[Sample]) -> Option<Surfel> {
+    // Up to where a surface goes is known to a pixel: a cell of silhouettes alone is dropped.
     let margins = group.iter().map(|&(_, view, at)| views[view as usize].pixel(at as usize).margin);
     let margin = margins.max().filter(|margin| *margin > 0)?;
     let (mut position, mut normal, mut colour) = (DVec3::ZERO, DVec3::ZERO, DVec3::ZERO);

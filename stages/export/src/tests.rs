@@ -138,7 +138,8 @@ fn the_unseen_side_stays_open() {
     }
 }
 
-/// Fused surfaces go on a little beyond what is seen; that goes, and with it rows at the border alone.
+/// Fused surfaces extend a little beyond what is seen. That part is dropped, with only a few rows
+/// before it.
 #[test]
 fn what_no_view_shows_is_dropped() {
     let (cameras, lattice) = (around(24, 0.3), Lattice::new(&BOX, 64));
@@ -147,7 +148,8 @@ fn what_no_view_shows_is_dropped() {
     let mut mesh = whole.clone();
     unseen::drop_unseen(&views, &lattice, &mut mesh);
     mesh.drop_small_pieces();
-    // Angle between the way to a camera and the ball's point where the line of sight touches it.
+    // A camera at distance 3 sees the points whose direction has a cosine above RADIUS / 3 with its
+    // own.
     let is_seen = |p: &glam::Vec3| {
         let outwards = p.as_dvec3().normalize();
         cameras.iter().any(|c| outwards.dot(c.centre().normalize()) > RADIUS / 3.0)
@@ -228,6 +230,14 @@ fn points_have_normals_and_colours() {
     let floats: Vec<u8> =
         [1.0f32, 2.0, 3.0, 0.0, -1.0, 0.0].iter().flat_map(|v| v.to_le_bytes()).collect();
     assert_eq!(data, [&floats[..], &[255, 128, 0]].concat());
+}
+
+#[test]
+fn points_keep_away_from_silhouettes_where_there_are_others() {
+    let with = |margin| Surfel { margin, ..one_surfel() };
+    let all = [with(1), with(2), with(3), with(4)];
+    assert_eq!(points::chosen(&all), all[2..]);
+    assert_eq!(points::chosen(&all[..2]), all[..2]);
 }
 
 #[test]

@@ -85,7 +85,7 @@ function axis(values, { log = false, names = null, count = 5 }) {
 /**
  * A chart in `home`. `spec`: `title`; `x` and `y`, each with `label`, and `log` or `names` for x; `series`, each with
  * `label`, `points` of `x`, `y`, `text` and `key`, and `chosen` where it stands out; `lines`; `named` where points bear
- * their series' names; `pick(point)`.
+ * their series' names as far as there is room; `pick(point)`.
  */
 class Chart {
   constructor(home) {
@@ -187,7 +187,7 @@ class Chart {
     });
   }
 
-  /** Writes series' names beside their points, chosen ones first, where nothing else is; whether all have room. */
+  /** Writes series' names beside their points where there is room, chosen ones first. Returns whether all have room. */
   drawNames() {
     const box = ([x, y], [width, height]) => ({ left: x, right: x + width, top: y, bottom: y + height });
     const overlap = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
@@ -222,7 +222,8 @@ class Chart {
 
   drawLegend(isCrowded) {
     this.legend.replaceChildren();
-    if (this.spec.series.length < 2 || (this.spec.named && this.drawNames())) return;
+    if (this.spec.named && this.drawNames()) return;
+    if (this.spec.series.length < 2) return;
     for (const [i, series] of this.spec.series.entries()) {
       if (isCrowded && !series.chosen) continue;
       const colour = (isCrowded ? series.chosen - 1 : i) % MOST_COLOURS;

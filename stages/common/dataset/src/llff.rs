@@ -154,8 +154,8 @@ fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
         .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
     let matrix = read_matrix(&bytes).map_err(|reason| no_array(path, &reason))?;
     if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
-        let rows = matrix.numbers.len() / matrix.columns.max(1);
-        return Err(no_array(path, &format!("its shape is {:?}", [rows, matrix.columns])));
+        let shape = [matrix.rows, matrix.columns];
+        return Err(no_array(path, &format!("its shape is {shape:?}")));
     }
     Ok(matrix.numbers.as_chunks().0.to_vec())
 }

@@ -3,6 +3,7 @@
 /// Numbers of a two-dimensional array, row by row.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Matrix {
+    pub(crate) rows: usize,
     pub(crate) columns: usize,
     pub(crate) numbers: Vec<f64>,
 }
@@ -10,27 +11,30 @@ pub(crate) struct Matrix {
 /// Reads a whole file; the reason is for people.
 pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
     let (header, data) = parts(bytes).ok_or("it doesn't begin as one")?;
-    let kind = entry(header, "descr").and_then(quoted).ok_or("its header has no descr")?;
+    let kind = entry(header, "descr")
+        .and_then(quoted)
+        .ok_or("its header has no descr that is a string")?;
     let order = entry(header, "fortran_order").ok_or("its header has no fortran_order")?;
-    let shape = entry(header, "shape").and_then(lengths).ok_or("its header has no shape")?;
+    let shape = entry(header, "shape")
+        .and_then(lengths)
+        .ok_or("its header has no shape of whole numbers")?;
     let [rows, columns] = shape[..] else { return Err(format!("its shape is {shape:?}")) };
     let count = rows.checked_mul(columns).ok_or_else(|| format!("its shape is {shape:?}"))?;
-    let stored: Vec<f64> = match kind {
-        "<f8" | "=f8" => numbers(data, f64::from_le_bytes),
-        ">f8" => numbers(data, f64::from_be_bytes),
-        "<f4" | "=f4" => numbers(data, |bytes| f64::from(f32::from_le_bytes(bytes))),
-        ">f4" => numbers(data, |bytes| f64::from(f32::from_be_bytes(bytes))),
+    let stored = match kind {
+        "<f8" | "=f8" => numbers(data, count, f64::from_le_bytes),
+        ">f8" => numbers(data, count, f64::from_be_bytes),
+        "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
+        ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
         _ => return Err(format!("it holds {kind:?}")),
     };
-    // A claim of more numbers than there are isn't believed.
-    let stored = stored.get(..count).ok_or("it is cut short")?;
+    let stored = stored.ok_or("it is cut short")?;
     let numbers = if order.starts_with("True") {
         let at = |i: usize| stored[i % columns * rows + i / columns];
         (0..count).map(at).collect()
     } else {
-        stored.to_vec()
+        stored
     };
-    Ok(Matrix { columns, numbers })
+    Ok(Matrix { rows, columns, numbers })
 }
 
 /// The header's text and the data behind it.
@@ -65,8 +69,13 @@ fn lengths(text: &str) -> Option<Vec<usize>> {
     words.map(|word| word.strip_suffix('L').unwrap_or(word).parse().ok()).collect()
 }
 
-fn numbers<const N: usize>(data: &[u8], number: impl Fn([u8; N]) -> f64) -> Vec<f64> {
-    data.as_chunks::<N>().0.iter().map(|bytes| number(*bytes)).collect()
+/// So many numbers; none where the data have fewer, before anything is allocated.
+fn numbers<const N: usize>(
+    data: &[u8],
+    count: usize,
+    number: impl Fn([u8; N]) -> f64,
+) -> Option<Vec<f64>> {
+    Some(data.as_chunks::<N>().0.get(..count)?.iter().map(|bytes| number(*bytes)).collect())
 }
 
 #[cfg(test)]
@@ -80,7 +89,7 @@ mod tests {
     }
 
     fn matrix(numbers: [f64; 6]) -> Result<Matrix, String> {
-        Ok(Matrix { columns: 3, numbers: numbers.to_vec() })
+        Ok(Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() })
     }
 
     #[test]

@@ -12,6 +12,21 @@ use crate::space::Space;
 /// Name of the file in every folder of views.
 pub const VIEWS_FILE: &str = "views.json";
 
+/// Path of a view's image in the output of a stage that renders or changes views: EXR.
+pub fn image_file(name: &str) -> String {
+    format!("images/{name}.exr")
+}
+
+/// Path of the same image for people: PNG, over the background. The runner's `--watch` shows it.
+pub fn preview_file(name: &str) -> String {
+    format!("previews/{name}.png")
+}
+
+/// Path of a view's [mask](View::mask): PNG.
+pub fn mask_file(name: &str) -> String {
+    format!("masks/{name}.png")
+}
+
 /// `views.json`: cameras, and the files that belong to them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -45,21 +60,6 @@ pub struct View {
     /// The same view at low resolution, to look at beside the others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub low_resolution: Option<String>,
-}
-
-/// Where a stage that renders or changes views puts the image of one: EXR.
-pub fn image_file(name: &str) -> String {
-    format!("images/{name}.exr")
-}
-
-/// The same image to look at: PNG, over the background.
-pub fn preview_file(name: &str) -> String {
-    format!("previews/{name}.png")
-}
-
-/// The view's [mask](View::mask).
-pub fn mask_file(name: &str) -> String {
-    format!("masks/{name}.png")
 }
 
 impl View {
@@ -261,7 +261,7 @@ impl Views {
         })
     }
 
-    /// An image file of these views over their background: RGB.
+    /// Reads one of these views' images over the background on which they are shown: RGB.
     pub fn read_over(&self, path: &Path) -> Result<Image, PixelError> {
         Ok(read_premultiplied(path)?.over(self.background.shown()))
     }

@@ -1,6 +1,6 @@
 //! The store: artifacts by content and actions by key, kept in one folder.
 //!
-//! * [`Store`]: the folder. It is opened at its [`FORMAT`], and says where each thing lies.
+//! * [`Store`]: the folder. It says where each thing lies. [`FORMAT`] is the version of its layout.
 //! * [`Record`], [`Unfinished`]: an action that is done, and one that was begun, by the key.
 //! * [`Attempt`], [`Checked`]: from a stage's output to an object and its record.
 //! * [`Arrival`]: an artifact that comes from another store.

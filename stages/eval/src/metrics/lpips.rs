@@ -8,7 +8,7 @@ use nets::{Conv, Weights, WeightsError};
 use pixels::Image;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use super::perceptual::LpipsNetwork;
+use super::lpips_network::LpipsNetwork;
 
 /// A network and its heads.
 pub struct Lpips {

@@ -5,6 +5,7 @@ mod depth;
 mod low_resolution;
 #[cfg(feature = "torch")]
 mod lpips;
+mod lpips_network;
 mod perceptual;
 mod psnr;
 mod ssim;
@@ -17,7 +18,7 @@ pub use depth::{DepthError, depth_error};
 use low_resolution::LowResolutionMetric;
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
-pub use perceptual::LpipsNetwork;
+pub use lpips_network::LpipsNetwork;
 pub(crate) use perceptual::Perceptual;
 use psnr::PsnrMetric;
 pub use psnr::psnr;

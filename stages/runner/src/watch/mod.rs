@@ -156,6 +156,7 @@ impl Look<'_> {
         let rendering = self.follow(render, "render", &field, &views)?;
         let scoring = self.follow(score, "score", &views, &scores)?;
         Ok(Some(Seen {
+            // As `scene::preview_file` has it, which the runner doesn't link.
             picture: views.join(format!("previews/{}.png", self.view.name)),
             field: summary(&field)?,
             scores: summary(&scores)?,
