@@ -12,8 +12,8 @@ pub(crate) fn commands(run: &RunRecord) -> Markup {
                 p { "This run:" }
                 (command(&line))
                 p class="note" {
-                    "A second run finds everything in the cache. Each stage above has the command "
-                    "that runs it alone."
+                    @if run.failed.is_empty() { "A second run finds everything in the cache. " }
+                    "Each stage above has the command that runs it alone."
                 }
             } @else {
                 p { "The run's command line isn't recorded. Each stage above has the command that \
