@@ -34,14 +34,17 @@
 //! assert!(found == camera && before == after);
 //! ```
 
+mod normal_matrix;
 mod photometric;
+
 use std::fmt;
 
 use glam::{DMat3, DQuat, DVec3};
-use nalgebra::{Matrix6, Vector6};
 use pixels::{Filter, Image, Resampling};
 use radiance::{Ray, RayField, RenderError};
 use scene::{Camera, pose_of};
+
+use crate::normal_matrix::NormalMatrix;
 
 pub use photometric::{Shot, photometric_error};
 
@@ -205,8 +208,9 @@ const THIN: f32 = 0.02;
 
 /// Least squares for a small motion of the camera, linear about where it is.
 struct Equations {
-    matrix: Matrix6<f64>,
-    right: Vector6<f64>,
+    matrix: NormalMatrix,
+    /// Right-hand sides of turning and shifting.
+    right: [DVec3; 2],
     /// Middle depth of what is seen, where anything is.
     depth: Option<f64>,
     /// Unit of translation: that depth, so that turning and moving weigh alike.
@@ -238,8 +242,8 @@ impl Equations {
         let depth = sorted.get(sorted.len() / 2).copied();
         let unit = depth.unwrap_or(1.0);
         let mut sums = Self {
-            matrix: Matrix6::zeros(),
-            right: Vector6::zeros(),
+            matrix: NormalMatrix::ZERO,
+            right: [DVec3::ZERO; 2],
             depth,
             unit,
             error: 0.0,
@@ -255,10 +259,12 @@ impl Equations {
             for (c, error) in errors.into_iter().enumerate() {
                 let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
                 // What is seen would have to move by the opposite of the error over the gradient.
-                let row = -(motion[0] * right + motion[1] * down);
+                let row = [0, 1].map(|part| -(motion[0][part] * right + motion[1][part] * down));
                 let weight = if error.abs() > HUBER { HUBER / error.abs() } else { 1.0 };
-                sums.matrix += weight * row * row.transpose();
-                sums.right += weight * error * row;
+                sums.matrix.add(weight, row);
+                for (sum, part) in sums.right.iter_mut().zip(row) {
+                    *sum += weight * error * part;
+                }
             }
         }
         sums.error /= (3 * level.telling.len()).max(1) as f64;
@@ -270,15 +276,8 @@ impl Equations {
         if self.pixels < LEAST || !self.error.is_finite() {
             return None;
         }
-        let mut matrix = self.matrix;
-        let floor = 1e-9 * matrix.trace();
-        (0..6).for_each(|i| matrix[(i, i)] += damping.mul_add(self.matrix[(i, i)], floor));
-        let motion = matrix.cholesky()?.solve(&self.right);
-        let motion = Motion {
-            turn: DVec3::new(motion[0], motion[1], motion[2]),
-            shift: self.unit * DVec3::new(motion[3], motion[4], motion[5]),
-        };
-        (motion.turn.is_finite() && motion.shift.is_finite()).then_some(motion)
+        let [turn, shift] = self.matrix.damped(damping).solve(self.right)?;
+        Some(Motion { turn, shift: self.unit * shift })
     }
 }
 
@@ -294,23 +293,21 @@ fn huber(error: f64) -> f64 {
 }
 
 /// How far what is seen at an image position moves to the right and down when the camera turns
-/// about its axes and shifts along them, by a radian and by so many scene units.
-fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [Vector6<f64>; 2] {
+/// about its axes and shifts along them, by a radian and by so many scene units. Of both: turning,
+/// then shifting.
+fn image_motion(camera: &Camera, [u, v]: [f64; 2], depth: f64, unit: f64) -> [[DVec3; 2]; 2] {
     let k = &camera.intrinsics;
     let [u, v] = k.undistort([u, v]);
     let (x, y) = ((u - k.cx) / k.fx, -(v - k.cy) / k.fy);
     let [by_x, by_both, by_y] = k.distortion.slope([x, -y]);
     let place = depth * DVec3::new(x, y, -1.0);
-    let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+    // Of a point in camera space, on the plane of depth 1.
+    let along_x = DVec3::new(1.0, 0.0, x) / depth;
+    let along_y = DVec3::new(0.0, -1.0, -y) / depth;
+    let right = k.fx * (by_x * along_x + by_both * along_y);
+    let down = k.fy * (by_both * along_x + by_y * along_y);
     // In camera space a point goes the other way: by place × turn, and by -shift.
-    let moves = axes.map(|axis| place.cross(axis)).into_iter().chain(axes.map(|axis| -unit * axis));
-    let (mut right, mut down) = (Vector6::zeros(), Vector6::zeros());
-    for (i, by) in moves.enumerate() {
-        let (along_x, along_y) = ((by.x + x * by.z) / depth, -(by.y + y * by.z) / depth);
-        right[i] = k.fx * (by_x * along_x + by_both * along_y);
-        down[i] = k.fy * (by_both * along_x + by_y * along_y);
-    }
-    [right, down]
+    [right, down].map(|along| [along.cross(place), -unit * along])
 }
 
 /// A motion of a camera in its own axes.

@@ -108,7 +108,9 @@ fn image_motion_is_that_of_a_moved_camera() {
         let one = |k: usize, size: f64| [0, 1, 2].map(|j| if j + k == i { size } else { 0.0 });
         let moved = motion(one(0, step), one(3, unit * step)).applied_to(&camera);
         let (u, v, _) = moved.project(ray.at(distance)).unwrap();
-        for (predicted, seen) in [(predicted[0][i], u - at[0]), (predicted[1][i], v - at[1])] {
+        for (predicted, seen) in
+            [(predicted[0][i / 3][i % 3], u - at[0]), (predicted[1][i / 3][i % 3], v - at[1])]
+        {
             assert!(
                 (predicted - seen / step).abs() < 1e-3 * predicted.abs().max(1.0),
                 "{i}: {predicted} {}",

@@ -1,0 +1,107 @@
+//! Normal equations of a camera's motion.
+
+use glam::{DMat3, DVec3};
+
+/// A symmetric 6×6 matrix by its blocks: the first three rows are of turning, the others of
+/// shifting.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct NormalMatrix {
+    turning: DMat3,
+    /// Rows of turning, columns of shifting.
+    both: DMat3,
+    shifting: DMat3,
+}
+
+impl NormalMatrix {
+    pub(crate) const ZERO: Self =
+        Self { turning: DMat3::ZERO, both: DMat3::ZERO, shifting: DMat3::ZERO };
+
+    /// Adds a row's product with itself.
+    pub(crate) fn add(&mut self, weight: f64, [turn, shift]: [DVec3; 2]) {
+        self.turning += outer(weight * turn, turn);
+        self.both += outer(weight * turn, shift);
+        self.shifting += outer(weight * shift, shift);
+    }
+
+    /// Levenberg and Marquardt's: the diagonal grows by a share of itself, and by a little of the
+    /// trace where a direction says nothing.
+    pub(crate) fn damped(&self, damping: f64) -> Self {
+        let [turning, shifting] = [self.turning, self.shifting].map(diagonal);
+        let floor = DVec3::splat(1e-9 * (turning.element_sum() + shifting.element_sum()));
+        Self {
+            turning: self.turning + DMat3::from_diagonal(damping * turning + floor),
+            both: self.both,
+            shifting: self.shifting + DMat3::from_diagonal(damping * shifting + floor),
+        }
+    }
+
+    /// Solves by the Schur complement of turning; none unless the matrix is positive.
+    pub(crate) fn solve(&self, [turn, shift]: [DVec3; 2]) -> Option<[DVec3; 2]> {
+        let inverse = positive_inverse(self.turning)?;
+        let across = self.both.transpose() * inverse;
+        let moved = positive_inverse(self.shifting - across * self.both)? * (shift - across * turn);
+        let turned = inverse * (turn - self.both * moved);
+        (turned.is_finite() && moved.is_finite()).then_some([turned, moved])
+    }
+}
+
+fn outer(column: DVec3, row: DVec3) -> DMat3 {
+    DMat3::from_cols(column * row.x, column * row.y, column * row.z)
+}
+
+fn diagonal(matrix: DMat3) -> DVec3 {
+    DVec3::new(matrix.x_axis.x, matrix.y_axis.y, matrix.z_axis.z)
+}
+
+fn positive_inverse(matrix: DMat3) -> Option<DMat3> {
+    (matrix.determinant() > 0.0).then(|| matrix.inverse())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ROWS: [[DVec3; 2]; 6] = [
+        [DVec3::new(1.0, 0.2, -0.3), DVec3::new(0.9, 0.1, 0.4)],
+        [DVec3::new(-0.5, 2.0, 0.1), DVec3::new(0.3, -1.8, 0.0)],
+        [DVec3::new(0.4, 0.3, 0.7), DVec3::new(-0.2, 0.6, 1.1)],
+        [DVec3::new(0.0, -0.6, 0.2), DVec3::new(1.4, 0.2, -0.5)],
+        [DVec3::new(0.8, 0.0, 1.5), DVec3::new(0.0, 0.3, 0.6)],
+        [DVec3::new(0.1, 0.9, -1.0), DVec3::new(0.5, -0.4, 2.0)],
+    ];
+
+    #[test]
+    fn solves_what_its_rows_ask_for() {
+        let asked = [DVec3::new(0.3, -0.7, 0.2), DVec3::new(-1.1, 0.4, 2.5)];
+        let (mut matrix, mut right) = (NormalMatrix::ZERO, [DVec3::ZERO; 2]);
+        for (i, row) in ROWS.into_iter().enumerate() {
+            let weight = 1.0 + i as f64;
+            let value = weight * (row[0].dot(asked[0]) + row[1].dot(asked[1]));
+            matrix.add(weight, row);
+            right = [0, 1].map(|part| right[part] + value * row[part]);
+        }
+        let found = matrix.solve(right).unwrap();
+        for (found, asked) in found.into_iter().zip(asked) {
+            assert!((found - asked).length() < 1e-9, "{found} instead of {asked}");
+        }
+    }
+
+    #[test]
+    fn damping_bounds_a_direction_that_no_row_has() {
+        let mut matrix = NormalMatrix::ZERO;
+        matrix.add(4.0, [DVec3::X, DVec3::ZERO]);
+        assert!(matrix.solve([DVec3::X, DVec3::ZERO]).is_none());
+        let [turn, shift] = matrix.damped(1.0).solve([8.0 * DVec3::X, DVec3::ZERO]).unwrap();
+        assert!((turn - DVec3::X).length() < 1e-6 && shift == DVec3::ZERO, "{turn} {shift}");
+    }
+
+    #[test]
+    fn nothing_seen_and_numbers_out_of_range_have_no_motion() {
+        assert!(NormalMatrix::ZERO.damped(1e-3).solve([DVec3::ZERO; 2]).is_none());
+        for value in [f64::NAN, f64::INFINITY, 1e200] {
+            let mut matrix = NormalMatrix::ZERO;
+            matrix.add(1.0, [DVec3::splat(value), DVec3::ONE]);
+            assert!(matrix.damped(1e-3).solve([DVec3::ONE; 2]).is_none(), "{value}");
+        }
+    }
+}
