@@ -1,11 +1,9 @@
 use std::path::Path;
 
 use artifact::{Failure, GivenInput};
-use pixels::{
-    Channel, ExrImage, Image, PixelError, VIEW_CHANNELS, VIEW_NOTE, write_exr, write_png,
-};
+use pixels::{Channel, ExrImage, Image, write_png};
 use refinement::{KnownView, LrObservations, Rendered, Use};
-use scene::{Photograph, View};
+use scene::{Photograph, VIEW_CHANNELS, View, write_view_image};
 use serde::{Deserialize, Serialize};
 use stage::Context;
 
@@ -116,7 +114,7 @@ fn write_recoloured(
         .collect();
     let channels: Vec<Channel> = kept.iter().map(|(c, _)| *c).collect();
     let size = (image.width, image.height);
-    let written = write_exr(path, size, &channels, VIEW_NOTE, |first, rows, samples| {
+    write_view_image(path, size, &channels, |first, rows, samples| {
         let pixels = first * image.width..(first + rows) * image.width;
         for (i, sample) in pixels.zip(samples.chunks_exact_mut(kept.len())) {
             for (c, (value, (_, same))) in sample.iter_mut().zip(&kept).enumerate() {
@@ -126,11 +124,7 @@ fn write_recoloured(
                 );
             }
         }
-        Ok::<(), PixelError>(())
-    });
-    written.map_err(|error| match error {
-        PixelError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
-        error => error.into(),
+        Ok(())
     })
 }
 
@@ -144,9 +138,9 @@ mod tests {
     fn rendered(folder: &Path) -> ExrImage {
         let path = folder.join("rendered.exr");
         let pixels = [[0.5, 0.25, 0.125, 1.0, 2.0, 2.5], [0.25, 0.25, 0.25, 0.5, 3.0, 3.5]];
-        write_exr(&path, (2, 1), &VIEW_CHANNELS, VIEW_NOTE, |_, _, samples| {
+        write_view_image(&path, (2, 1), &VIEW_CHANNELS, |_, _, samples| {
             samples.copy_from_slice(pixels.as_flattened());
-            Ok::<(), PixelError>(())
+            anyhow::Ok(())
         })
         .unwrap();
         read_exr(&path).unwrap()

@@ -12,12 +12,15 @@
 use std::ops::Range;
 
 use anyhow::Context as _;
-use artifact::{Failure, amount, counted};
+use artifact::{amount, counted};
 use contract::{Input, Output};
 use fields::{Members, middle};
-use pixels::{PixelError, PngRows, VIEW_CHANNELS, VIEW_NOTE, to_u8, write_exr};
+use pixels::{PngRows, to_u8};
 use radiance::{Ray, RayField};
-use scene::{Background, Camera, VIEWS_FILE, View, Views, image_file, preview_file};
+use scene::{
+    Background, Camera, VIEW_CHANNELS, VIEWS_FILE, View, Views, image_file, preview_file,
+    write_view_image,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
@@ -163,29 +166,15 @@ impl RenderJob<'_> {
         let exr = context.output_path(image)?;
         let mut png = PngRows::create(&context.output_path(preview)?, width, height)?;
         let mut centres = Centres::default();
-        write_exr(
-            &exr,
-            (width, height),
-            channels,
-            VIEW_NOTE,
-            |first, rows, samples| -> Result<(), Stopped> {
-                context.check_interrupt().map_err(Stopped::Other)?;
-                let pixels =
-                    self.band(&mut centres, first..first + rows).map_err(Stopped::Other)?;
-                for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
-                    sample.copy_from_slice(&pixel.channels[..channels.len()]);
-                }
-                png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
-                progress.add(rows as u64);
-                Ok(())
-            },
-        )
-        .map_err(|stopped| match stopped {
-            Stopped::Pixels(error @ PixelError::NotFinite { .. }) => {
-                Failure::Numerical(error.to_string()).into()
+        write_view_image(&exr, (width, height), channels, |first, rows, samples| {
+            context.check_interrupt()?;
+            let pixels = self.band(&mut centres, first..first + rows)?;
+            for (sample, pixel) in samples.chunks_exact_mut(channels.len()).zip(&pixels) {
+                sample.copy_from_slice(&pixel.channels[..channels.len()]);
             }
-            Stopped::Pixels(error) => error.into(),
-            Stopped::Other(error) => error,
+            png.write(&pixels.iter().flat_map(|p| p.colour.map(to_u8)).collect::<Vec<_>>())?;
+            progress.add(rows as u64);
+            anyhow::Ok(())
         })?;
         png.finish().context("cannot write the preview")
     }
@@ -314,18 +303,6 @@ impl Centres {
         let [before, own, after] =
             [at - step, at, at + step].map(|i| self.pixels[i].channels[channel]);
         (before - 2.0 * own + after).abs()
-    }
-}
-
-/// Why writing a view ended early.
-enum Stopped {
-    Pixels(PixelError),
-    Other(anyhow::Error),
-}
-
-impl From<PixelError> for Stopped {
-    fn from(error: PixelError) -> Self {
-        Self::Pixels(error)
     }
 }
 

@@ -26,11 +26,12 @@ use anyhow::Context as _;
 use artifact::{Failure, FailureExt as _, GivenInput};
 use contract::{Input, Output, Rule};
 use nets::Weights;
-use pixels::{
-    Filter, Image, Mask, PixelError, VIEW_CHANNELS, VIEW_NOTE, resize_pillow, write_exr, write_png,
-};
+use pixels::{Filter, Image, Mask, resize_pillow, write_png};
 use rayon::prelude::*;
-use scene::{Camera, Photograph, VIEWS_FILE, View, Views, image_file, mask_file, preview_file};
+use scene::{
+    Camera, Photograph, VIEW_CHANNELS, VIEWS_FILE, View, Views, image_file, mask_file,
+    preview_file, write_view_image,
+};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
@@ -268,13 +269,13 @@ fn write(context: &Context, name: &str, hr: &Image, mask: Option<Mask>) -> anyho
     }
     let channels = &VIEW_CHANNELS[..4];
     let path = context.output_path(&image_file(name))?;
-    write_exr(&path, (hr.width, hr.height), channels, VIEW_NOTE, |first, rows, samples| {
+    write_view_image(&path, (hr.width, hr.height), channels, |first, rows, samples| {
         let pixels = hr.data[first * hr.width * 3..(first + rows) * hr.width * 3].chunks_exact(3);
         for (sample, pixel) in samples.chunks_exact_mut(4).zip(pixels) {
             sample[..3].copy_from_slice(pixel);
             sample[3] = 1.0;
         }
-        Ok::<(), PixelError>(())
+        anyhow::Ok(())
     })?;
     Ok(write_png(&context.output_path(&preview_file(name))?, &hr.to_rgba8())?)
 }

@@ -29,21 +29,6 @@ pub struct Channel {
     pub sample_type: SampleType,
 }
 
-/// The channels of a rendered view: colour and opacity, premultiplied; depth; where it was asked
-/// for, the distance along the ray.
-pub const VIEW_CHANNELS: [Channel; 6] = [
-    Channel { name: "R", sample_type: SampleType::Half },
-    Channel { name: "G", sample_type: SampleType::Half },
-    Channel { name: "B", sample_type: SampleType::Half },
-    Channel { name: "A", sample_type: SampleType::Half },
-    Channel { name: "Z", sample_type: SampleType::Float },
-    Channel { name: "distance", sample_type: SampleType::Float },
-];
-
-/// What a rendered view's file says of them.
-pub const VIEW_NOTE: &str =
-    "display-encoded sRGB, premultiplied; Z: camera-space z-depth in scene units";
-
 /// What an EXR file holds.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExrImage {

@@ -5,7 +5,7 @@
 //! * [`read_premultiplied`]: a view's image, PNG (straight alpha) or EXR (premultiplied), as
 //!   premultiplied RGBA.
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format,
-//!   whose bytes repeat; [`VIEW_CHANNELS`]: what a rendered view's EXR has.
+//!   whose bytes repeat.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's
 //!   `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]:
@@ -41,9 +41,7 @@ mod srgb;
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
 pub use exposure::Exposure;
-pub use exr_file::{
-    Channel, ExrImage, SampleType, VIEW_CHANNELS, VIEW_NOTE, exr_size, read_exr, write_exr,
-};
+pub use exr_file::{Channel, ExrImage, SampleType, exr_size, read_exr, write_exr};
 pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
 pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
 pub use image_file::read_premultiplied;

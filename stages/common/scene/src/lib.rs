@@ -1,4 +1,5 @@
-//! Cameras, poses, rays and bounds, and `views.json`, the list of views that stages exchange.
+//! Cameras, poses, rays and bounds; `views.json`, the list of views that stages exchange, and the
+//! views' image files.
 //!
 //! # Conventions
 //!
@@ -31,6 +32,7 @@ mod camera;
 mod lens;
 mod pose;
 mod space;
+mod view_image;
 mod views;
 mod warp;
 
@@ -38,8 +40,6 @@ pub use camera::{Camera, CameraError, CameraRay, CameraRays, Intrinsics, common_
 pub use lens::Distortion;
 pub use pose::{Pose, looking_at, pose_of};
 pub use space::{Frustum, Space};
-pub use views::{
-    Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError, image_file,
-    mask_file, preview_file,
-};
+pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
+pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Surface, Visibility};

@@ -12,21 +12,6 @@ use crate::space::Space;
 /// Name of the file in every folder of views.
 pub const VIEWS_FILE: &str = "views.json";
 
-/// Path of a view's image in the output of a stage that renders or changes views: EXR.
-pub fn image_file(name: &str) -> String {
-    format!("images/{name}.exr")
-}
-
-/// Path of the same image for people: PNG, over the background. The runner's `--watch` shows it.
-pub fn preview_file(name: &str) -> String {
-    format!("previews/{name}.png")
-}
-
-/// Path of a view's [mask](View::mask): PNG.
-pub fn mask_file(name: &str) -> String {
-    format!("masks/{name}.png")
-}
-
 /// `views.json`: cameras, and the files that belong to them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
