@@ -123,8 +123,7 @@ fn read(path: &Path, turned: bool) -> Result<Rgba8, PixelError> {
     if turned {
         image.apply_orientation(turn);
     }
-    let image = image.into_rgba8();
-    Ok(Rgba8::new(image.width() as usize, image.height() as usize, image.into_raw()))
+    Ok(image.into())
 }
 
 /// An EXR's linear light, display-encoded.

@@ -1,3 +1,5 @@
+use image::DynamicImage;
+
 /// An 8-bit RGBA image with straight alpha, row by row, row 0 on top.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Rgba8 {
@@ -18,6 +20,28 @@ impl Rgba8 {
         assert_eq!(data.len(), width * height * 4, "an RGBA image has four samples a pixel");
         Self { width, height, data }
     }
+}
+
+/// Of a decoded file; one without alpha is opaque.
+impl From<DynamicImage> for Rgba8 {
+    fn from(image: DynamicImage) -> Self {
+        let (width, height) = (image.width() as usize, image.height() as usize);
+        // Most photographs are RGB. `image` compiles with little optimisation (Cargo.toml).
+        let data = match image {
+            DynamicImage::ImageRgb8(image) => opaque(&image),
+            other => other.into_rgba8().into_raw(),
+        };
+        Self::new(width, height, data)
+    }
+}
+
+/// RGB samples with alpha.
+fn opaque(rgb: &[u8]) -> Vec<u8> {
+    let mut rgba = vec![u8::MAX; rgb.len() / 3 * 4];
+    for (to, from) in rgba.chunks_exact_mut(4).zip(rgb.chunks_exact(3)) {
+        to[..3].copy_from_slice(from);
+    }
+    rgba
 }
 
 /// Floating-point samples, row by row, channels interleaved.

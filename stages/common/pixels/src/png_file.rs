@@ -15,10 +15,8 @@ pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {
     reader.limits(limits);
     let image = reader
         .decode()
-        .map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?
-        .into_rgba8();
-    let (width, height) = (image.width() as usize, image.height() as usize);
-    Ok(Rgba8::new(width, height, image.into_raw()))
+        .map_err(|e| format(format!("not a whole PNG of at most {MAX_PIXELS} pixels ({e})")))?;
+    Ok(image.into())
 }
 
 /// Writes RGBA, or RGB where every pixel is opaque.
