@@ -1,4 +1,5 @@
 use crate::simd::{LANES, kernel};
+use crate::spec::{ADAM_BETA, ADAM_EPSILON};
 
 /// Constants of one optimiser step.
 #[derive(Clone, Copy, Debug)]
@@ -16,22 +17,27 @@ impl AdamStep {
     /// Adam (Kingma and Ba 2015) at step 1, 2, …, with the two bias corrections folded into the
     /// rate.
     pub(crate) fn new(step: u64, rate: f64, decay: f32) -> Self {
-        let (beta1, beta2) = (0.9f64, 0.99f64);
+        let [beta1, beta2] = ADAM_BETA;
         let t = step.min(100_000) as i32;
         let corrected = rate * (1.0 - beta2.powi(t)).sqrt() / (1.0 - beta1.powi(t));
         Self {
             rate: corrected as f32,
             beta1: beta1 as f32,
             beta2: beta2 as f32,
-            epsilon: 1e-15,
+            epsilon: ADAM_EPSILON as f32,
             decay,
         }
     }
 }
 
-/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read
-/// before it is set.
+/// Which blocks of 16 numbers a step has touched: a byte each, 0 or 1, since a bit would have to be
+/// read before it is set.
 pub(crate) type Touched = [u8];
+
+/// Blocks whose marks are looked at together.
+const STRETCH: usize = 256;
+/// Blocks by which memory is asked for before it is needed.
+const AHEAD: usize = 8;
 
 kernel! {
     /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came
@@ -45,15 +51,25 @@ kernel! {
             gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
         let most = touched.len().min(weights.len());
-        for start in (0..most).step_by(64) {
-            let marks = &mut touched[start..(start + 64).min(most)];
+        let mut list = [0; STRETCH];
+        for start in (0..most).step_by(STRETCH) {
+            let marks = &mut touched[start..(start + STRETCH).min(most)];
             if marks.iter().fold(0, |any, m| any | m) == 0 {
                 continue;
             }
+            let mut count = 0;
             for (block, mark) in (start..).zip(marks) {
-                if std::mem::take(mark) == 0 {
-                    continue;
-                }
+                list[count] = block;
+                count += usize::from(std::mem::take(mark));
+            }
+            for at in 0..count {
+                // Blocks lie far apart in memory, and there is little to do for each.
+                let ahead = list[(at + AHEAD).min(count - 1)];
+                L::prefetch(&weights[ahead]);
+                L::prefetch(&gradients[ahead]);
+                L::prefetch(&first[ahead]);
+                L::prefetch(&second[ahead]);
+                let block = list[at];
                 let (w, g, m, v) = (&mut weights[block], &mut gradients[block], &mut first[block],
                     &mut second[block]);
                 for i in 0..LANES {

@@ -1,11 +1,12 @@
 //! A few rays at a time through the whole field and back, in buffers that are reused: nothing is
 //! allocated once they have grown.
 
+use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::mlp::After;
 use crate::occupancy::{March, Strides};
 use crate::ray::NormalizedRay;
-use crate::samples::{Counted, RaySum, Round, Samples, fit, gather, rounds_of};
+use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{NetworkGradients, RayGradients, Shading, dot};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
@@ -55,13 +56,13 @@ pub(crate) struct Chunk {
 struct Back {
     /// By the density network's outputs: of the samples that count, then of those chosen.
     gradients: Vec<[f32; DENSITY_OUTPUTS]>,
-    lengths: Vec<f32>,
+    lengths: Aligned,
     /// Samples chosen, round by round.
     chosen: Vec<u32>,
     rounds: Vec<Round>,
-    features: Vec<f32>,
-    hidden: Vec<f32>,
-    rows: [Vec<f32>; 2],
+    features: Aligned,
+    hidden: Aligned,
+    rows: [Aligned; 2],
 }
 
 kernel! {
@@ -76,7 +77,7 @@ impl Back {
     /// Chooses among the samples that count; `gradients` are then those of the chosen ones.
     fn choose(&mut self, samples: &Samples, counted: &Counted, roulette: Roulette) {
         let count = counted.sample.len();
-        lengths_of(&self.gradients, fit(&mut self.lengths, count));
+        lengths_of(&self.gradients, self.lengths.fit(count));
         let limit =
             roulette.limit * self.lengths[..count].iter().sum::<f32>() / count.max(1) as f32;
         let mut sum = roulette.draw;
@@ -117,14 +118,14 @@ impl Back {
         let [first, second] = field.layers.density;
         let widest = first.inputs.max(first.outputs).max(DENSITY_OUTPUTS);
         let [a, b] = &mut self.rows;
-        let (a, b) = (fit(a, widest * m), fit(b, widest * m));
+        let (a, b) = (a.fit(widest * m), b.fit(widest * m));
         for (o, row) in a[..DENSITY_OUTPUTS * m].chunks_exact_mut(m).enumerate() {
             row.iter_mut().zip(&self.gradients).for_each(|(value, gradient)| *value = gradient[o]);
             row[count..].fill(0.0);
         }
-        let features = fit(&mut self.features, first.inputs * m);
+        let features = self.features.fit(first.inputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.features, first.inputs, features, m);
-        let hidden = fit(&mut self.hidden, first.outputs * m);
+        let hidden = self.hidden.fit(first.outputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.hidden, first.outputs, hidden, m);
         network.back(second, hidden, After::Gate(hidden), m, a, b);
         network.back(first, features, After::Linear, m, b, a);

@@ -27,21 +27,18 @@ kernel! {
     }
 }
 
-/// Gradient of a loss by each sample's optical depth, along one ray from back to front.
-///
-/// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) -
-/// T_end·(g·b).
-pub(crate) fn optical_depth_gradients(
-    shade: &[f32],
-    transmittance: &[f32],
-    weight: &[f32],
-    behind: f32,
-    gradient: &mut [f32],
-) {
-    let mut suffix = behind;
-    for i in (0..shade.len()).rev() {
-        gradient[i] = (transmittance[i] - weight[i]).mul_add(shade[i], -suffix);
-        suffix = weight[i].mul_add(shade[i], suffix);
+kernel! {
+    /// Gradient of a loss by each sample's optical depth, along one ray from back to front.
+    ///
+    /// With C = Σ w c + T_end·b and g = dL/dC: dL/dτ_i = T_{i+1}·(g·c_i) - Σ_{j>i} w_j·(g·c_j) -
+    /// T_end·(g·b).
+    pub(crate) fn optical_depth_gradients<L>(shade: &[f32], transmittance: &[f32], weight: &[f32],
+        behind: f32, gradient: &mut [f32]) {
+        let mut suffix = behind;
+        for i in (0..shade.len()).rev() {
+            gradient[i] = (transmittance[i] - weight[i]).mul_add(shade[i], -suffix);
+            suffix = weight[i].mul_add(shade[i], suffix);
+        }
     }
 }
 
@@ -60,6 +57,15 @@ mod tests {
         let (mut transmittance, mut weight) = (before.clone(), before.clone());
         weights(&before, tau, &mut transmittance, &mut weight);
         (transmittance, weight, exp(-sum))
+    }
+
+    fn loss(shade: &[f32], behind: f32, tau: &[f64]) -> f64 {
+        let (mut od, mut sum) = (0.0f64, 0.0f64);
+        for (t, s) in tau.iter().zip(shade) {
+            sum += (-od).exp() * -(-t).exp_m1() * f64::from(*s);
+            od += t;
+        }
+        sum + (-od).exp() * f64::from(behind)
     }
 
     proptest! {
@@ -84,21 +90,13 @@ mod tests {
             let (transmittance, weight, end) = composite(&tau);
             let mut gradient = vec![0.0; tau.len()];
             optical_depth_gradients(&shade, &transmittance, &weight, end * behind, &mut gradient);
-            let loss = |tau: &[f64]| {
-                let (mut od, mut sum) = (0.0f64, 0.0f64);
-                for (t, s) in tau.iter().zip(&shade) {
-                    sum += (-od).exp() * -(-t).exp_m1() * f64::from(*s);
-                    od += t;
-                }
-                sum + (-od).exp() * f64::from(behind)
-            };
             for i in 0..tau.len() {
                 let mut wide: Vec<f64> = tau.iter().map(|&t| f64::from(t)).collect();
                 let h = 1e-5;
                 wide[i] += h;
-                let up = loss(&wide);
+                let up = loss(&shade, behind, &wide);
                 wide[i] -= 2.0 * h;
-                let numeric = (up - loss(&wide)) / (2.0 * h);
+                let numeric = (up - loss(&shade, behind, &wide)) / (2.0 * h);
                 prop_assert!((f64::from(gradient[i]) - numeric).abs() < 3e-6, "{i}: {} {numeric}",
                     gradient[i]);
             }

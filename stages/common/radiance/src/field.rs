@@ -4,10 +4,12 @@ use counter_rng::CounterRng;
 use safetensors::SafeTensors;
 use scene::Bounds;
 
+use crate::aligned::Aligned;
 use crate::architecture::Architecture;
 use crate::grid::{Level, levels};
 use crate::mlp::Layers;
 use crate::occupancy::{CELLS, Cell, Occupancy};
+use crate::simd::LANES;
 use crate::spec::FEATURES;
 use crate::tensors::{FieldError, Tensor, read_f32, read_u8, write_tensors};
 
@@ -20,8 +22,8 @@ pub struct Field {
     pub bounds: Bounds,
     pub(crate) levels: Vec<Level>,
     pub(crate) layers: Layers,
-    pub(crate) grid: Vec<f32>,
-    pub(crate) network: Vec<f32>,
+    pub(crate) grid: Aligned,
+    pub(crate) network: Aligned,
     pub(crate) occupancy: Occupancy,
 }
 
@@ -46,9 +48,9 @@ impl Field {
     fn empty(architecture: Architecture, bounds: Bounds) -> Self {
         let levels = levels(&architecture);
         let layers = Layers::new(levels.len() * FEATURES, architecture.hidden as usize);
-        let grid = vec![0.0; architecture.grid_len()];
+        let grid = Aligned::zeros(architecture.grid_len());
         // Whole vectors, for the optimiser.
-        let network = vec![0.0; layers.len().next_multiple_of(crate::simd::LANES)];
+        let network = Aligned::zeros(layers.len().next_multiple_of(LANES));
         Self { architecture, bounds, levels, layers, grid, network, occupancy: Occupancy::full() }
     }
 
@@ -89,8 +91,8 @@ impl Field {
     /// Where one was trained on from the other, that is nearly what the mean of both's colours is
     /// (Wortsman et al. 2022, "Robust fine-tuning"). Where there may be something stays as it is.
     pub fn average_with(&mut self, other: &Self) {
-        let own = self.grid.iter_mut().chain(&mut self.network);
-        own.zip(other.grid.iter().chain(&other.network))
+        let own = self.grid.iter_mut().chain(&mut *self.network);
+        own.zip(other.grid.iter().chain(&*other.network))
             .for_each(|(own, other)| *own = 0.5 * (*own + other));
     }
 
@@ -114,7 +116,7 @@ impl Field {
 
     /// Whether every parameter is finite.
     pub fn is_finite(&self) -> bool {
-        self.grid.iter().chain(&self.network).all(|x| x.is_finite())
+        self.grid.iter().chain(&*self.network).all(|x| x.is_finite())
     }
 
     /// Writes a safetensors file: `grid`, `network` (f32) and `occupancy` (u8, 128³, x fastest: 0
@@ -161,6 +163,10 @@ impl Field {
 mod tests {
     use super::*;
 
+    fn parameters(field: &Field) -> Vec<f32> {
+        field.grid.iter().chain(&*field.network).copied().collect()
+    }
+
     /// Every parameter is the mean of both fields', and rays are stopped where the field's own
     /// were.
     #[test]
@@ -176,12 +182,13 @@ mod tests {
             [3, 3, 4].map(|seed| Field::new(architecture, Bounds::default(), seed));
         mean.occupancy.set(|cell| if cell % 3 == 0 { Cell::Thin } else { Cell::Empty });
         mean.average_with(&other);
-        let all = |field: &Field| -> Vec<f32> {
-            field.grid.iter().chain(&field.network).copied().collect()
-        };
-        let expected =
-            all(&own).into_iter().zip(all(&other)).map(|(own, other)| 0.5 * (own + other));
-        assert!(all(&mean).into_iter().eq(expected) && all(&own) != all(&other));
+        let expected = parameters(&own)
+            .into_iter()
+            .zip(parameters(&other))
+            .map(|(own, other)| 0.5 * (own + other));
+        assert!(
+            parameters(&mean).into_iter().eq(expected) && parameters(&own) != parameters(&other)
+        );
         assert!(mean.occupancy.cells().all(|cell| cell % 3 == 0));
     }
 }

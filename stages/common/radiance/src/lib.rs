@@ -38,6 +38,7 @@
 //! ```
 
 mod adam;
+mod aligned;
 mod architecture;
 mod chunk;
 mod composite;

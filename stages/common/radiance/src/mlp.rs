@@ -2,7 +2,7 @@
 //! weights are stored input by input (`w[i·outputs + j]`). There are no biases: the first spherical
 //! harmonic is a constant input already.
 
-use crate::simd::{LANES, Lanes, kernel};
+use crate::simd::{LANES, Lanes, Quad as _, kernel};
 use crate::spec::{DENSITY_OUTPUTS, VIEW_INPUTS};
 
 #[inline(always)]
@@ -112,7 +112,7 @@ kernel! {
 fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
     x: &[f32],
     dy: &[f32],
-    lanes: &mut [f32],
+    gradient: &mut [f32],
     (outputs, n): (usize, usize),
     i: usize,
     j: usize,
@@ -129,10 +129,13 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
         }
         s += LANES;
     }
-    for k in 0..TI {
-        for l in 0..TJ {
-            let at = ((i + k) * outputs + j + l) * LANES;
-            put(row::<L>(lanes, at).add(acc[k][l]), lanes, at);
+    for (k, acc) in acc.iter().enumerate() {
+        let to = &mut gradient[(i + k) * outputs + j..][..TJ];
+        for (to, acc) in to.chunks_mut(4).zip(acc.chunks(4)) {
+            let mut sums = [0.0; 4];
+            let four = std::array::from_fn(|l| acc.get(l).copied().unwrap_or(L::splat(0.0)));
+            L::sums(four).store(&mut sums);
+            to.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
         }
     }
 }
@@ -141,58 +144,42 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
 fn outer_row<L: Lanes, const TI: usize, const TJ: usize>(
     x: &[f32],
     dy: &[f32],
-    lanes: &mut [f32],
+    gradient: &mut [f32],
     shape: (usize, usize),
     i: usize,
 ) {
     let mut j = 0;
     while j + TJ <= shape.0 {
-        outer_tile::<L, TI, TJ>(x, dy, lanes, shape, i, j);
+        outer_tile::<L, TI, TJ>(x, dy, gradient, shape, i, j);
         j += TJ;
     }
     while j < shape.0 {
-        outer_tile::<L, TI, 1>(x, dy, lanes, shape, i, j);
+        outer_tile::<L, TI, 1>(x, dy, gradient, shape, i, j);
         j += 1;
     }
 }
 
 kernel! {
-    /// Adds x·dyᵀ, the gradient of the weights, to 16 partial sums a weight (`lanes[(i·outputs +
-    /// j)·16..]`).
-    pub(crate) fn add_outer<L>(x: &[f32], dy: &[f32], lanes: &mut [f32], inputs: usize,
+    /// Adds x·dyᵀ, the gradient of the weights.
+    pub(crate) fn add_outer<L>(x: &[f32], dy: &[f32], gradient: &mut [f32], inputs: usize,
         outputs: usize, n: usize) {
         let shape = (outputs, n);
         let mut i = 0;
         if L::WIDE {
             while i + 4 <= inputs {
-                outer_row::<L, 4, 4>(x, dy, lanes, shape, i);
+                outer_row::<L, 4, 4>(x, dy, gradient, shape, i);
                 i += 4;
             }
         } else {
             while i + 2 <= inputs {
-                outer_row::<L, 2, 2>(x, dy, lanes, shape, i);
+                outer_row::<L, 2, 2>(x, dy, gradient, shape, i);
                 i += 2;
             }
         }
         while i < inputs {
-            outer_row::<L, 1, 1>(x, dy, lanes, shape, i);
+            outer_row::<L, 1, 1>(x, dy, gradient, shape, i);
             i += 1;
         }
-    }
-}
-
-/// Sums the 16 partial sums of each weight, in a fixed order, adds them to `sums`, and clears them.
-pub(crate) fn drain_lanes(lanes: &mut [f32], sums: &mut [f32]) {
-    for (lanes, sum) in lanes.as_chunks_mut::<LANES>().0.iter_mut().zip(sums) {
-        let mut width = LANES / 2;
-        while width > 0 {
-            for k in 0..width {
-                lanes[k] += lanes[k + width];
-            }
-            width /= 2;
-        }
-        *sum += lanes[0];
-        lanes.fill(0.0);
     }
 }
 
@@ -260,7 +247,7 @@ impl Layers {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::{Family, set_family};
+    use crate::simd::by_every_family;
     use counter_rng::uniform;
 
     fn numbers(seed: u64, len: usize) -> Vec<f32> {
@@ -300,10 +287,8 @@ mod tests {
                 }
             }
             let dy = numbers(4, outputs * n);
-            let mut lanes = vec![0.0; inputs * outputs * LANES];
             let mut sums = vec![1.0; inputs * outputs];
-            add_outer(&x, &dy, &mut lanes, inputs, outputs, n);
-            drain_lanes(&mut lanes, &mut sums);
+            add_outer(&x, &dy, &mut sums, inputs, outputs, n);
             for i in 0..inputs {
                 for j in 0..outputs {
                     let sum: f64 =
@@ -311,30 +296,26 @@ mod tests {
                     assert!((f64::from(sums[i * outputs + j]) - 1.0 - sum).abs() < 1e-5);
                 }
             }
-            assert!(lanes.iter().all(|&v| v == 0.0));
         }
+    }
+
+    fn outcome() -> Vec<u32> {
+        let mut bits = Vec::new();
+        for (inputs, outputs, n) in SHAPES {
+            let (w, x, dy) =
+                (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
+            let mut y = vec![0.0; outputs * n];
+            multiply(&w, &x, &mut y, inputs, outputs, n, After::Relu);
+            let mut sums = vec![0.0; inputs * outputs];
+            add_outer(&x, &dy, &mut sums, inputs, outputs, n);
+            bits.extend(y.iter().chain(&sums).map(|v| v.to_bits()));
+        }
+        bits
     }
 
     #[test]
     fn all_families_give_equal_bits() {
-        let outcome = || -> Vec<u32> {
-            let mut bits = Vec::new();
-            for (inputs, outputs, n) in SHAPES {
-                let (w, x, dy) =
-                    (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
-                let mut y = vec![0.0; outputs * n];
-                multiply(&w, &x, &mut y, inputs, outputs, n, After::Relu);
-                let mut lanes = vec![0.0; inputs * outputs * LANES];
-                add_outer(&x, &dy, &mut lanes, inputs, outputs, n);
-                bits.extend(y.iter().chain(&lanes).map(|v| v.to_bits()));
-            }
-            bits
-        };
         let best = outcome();
-        for family in [Family::Avx512, Family::Avx2, Family::Portable] {
-            set_family(family);
-            assert_eq!(outcome(), best, "{family:?}");
-        }
-        [Family::Portable, Family::Avx2, Family::Avx512].into_iter().for_each(set_family);
+        by_every_family(|family| assert_eq!(outcome(), best, "{family:?}"));
     }
 }

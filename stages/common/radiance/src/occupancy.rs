@@ -25,7 +25,7 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 
 /// Steps of a training between updates of the occupancy.
 const EVERY: u64 = 32;
-/// An update looks at one occupied cell in so many, and at one empty cell in so many.
+/// An update looks at one occupied cell in so many, and at one empty cell in so many, a multiple.
 const OCCUPIED_TURNS: usize = 4;
 const EMPTY_TURNS: usize = 16;
 /// Until this step empty cells are looked at as often as occupied ones.
@@ -33,9 +33,29 @@ const WARM_UP: u64 = 512;
 /// Share of a density that is left when its cell is looked at again.
 const DECAY: f32 = 0.7;
 
-/// Which cell along each axis a number means.
-fn corner(cell: usize) -> [usize; 3] {
-    [cell % GRID, cell / GRID % GRID, cell / (GRID * GRID)]
+/// Which cell along each axis of `side` a number means.
+#[inline(always)]
+fn corner(cell: usize, side: usize) -> [usize; 3] {
+    [cell % side, cell / side % side, cell / (side * side)]
+}
+
+/// A word a brick: a bit for each cell that isn't empty, and one for each dense cell.
+fn words(held: impl Fn(usize) -> Cell + Sync) -> (Vec<u64>, Vec<u64>) {
+    let bricks = (0..BRICKS * BRICKS * BRICKS).into_par_iter().with_min_len(256);
+    bricks.map(|brick| words_of(brick, &held)).unzip()
+}
+
+/// A brick's words.
+fn words_of(brick: usize, held: impl Fn(usize) -> Cell) -> (u64, u64) {
+    let first = corner(brick, BRICKS).map(|c| c * SIDE);
+    let (mut occupied, mut dense) = (0, 0);
+    for bit in 0..SIDE * SIDE * SIDE {
+        let [x, y, z] = corner(bit, SIDE);
+        let held = held(first[0] + x + GRID * (first[1] + y + GRID * (first[2] + z)));
+        occupied |= u64::from(held != Cell::Empty) << bit;
+        dense |= u64::from(held == Cell::Dense) << bit;
+    }
+    (occupied, dense)
 }
 
 /// The cell along each axis that a place of the unit cube lies in.
@@ -116,7 +136,7 @@ impl Occupancy {
     /// Whether a cell or one around it is occupied.
     fn is_near_occupied(&self, cell: usize) -> bool {
         let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
-        let [x, y, z] = corner(cell);
+        let [x, y, z] = corner(cell, GRID);
         around(z).any(|k| {
             around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k))))
         })
@@ -136,15 +156,20 @@ impl Occupancy {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
-        let cells = (0..CELLS as u32).into_par_iter();
-        cells.filter(|&cell| self.is_looked_at(cell as usize, step)).collect()
+        // No other cell has its turn; each plane begins with another one.
+        let turn = (step / EVERY) as usize;
+        let planes = (0..GRID).into_par_iter().flat_map_iter(|z| {
+            let first = (turn + GRID - z) % OCCUPIED_TURNS;
+            (z * GRID * GRID + first..(z + 1) * GRID * GRID).step_by(OCCUPIED_TURNS)
+        });
+        planes.filter(|&cell| self.is_looked_at(cell, step)).map(|cell| cell as u32).collect()
     }
 
     /// Whether to look at a cell at a step that looks at some.
     fn is_looked_at(&self, cell: usize, step: u64) -> bool {
         let turn = (step / EVERY) as usize;
         let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-        let [.., z] = corner(cell);
+        let [.., z] = corner(cell, GRID);
         let turns =
             if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
         let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
@@ -154,7 +179,7 @@ impl Occupancy {
     /// Where in a cell to look at that step, in the unit cube.
     pub fn place_in(cell: u32, seed: u64, step: u64) -> [f32; 3] {
         let mut rng = CounterRng::new(seed, 3, step * CELLS as u64 + u64::from(cell));
-        corner(cell as usize).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
+        corner(cell as usize, GRID).map(|c| (c as f32 + rng.uniform()) / GRID as f32)
     }
 
     /// Takes the densities that were found in cells, and decides anew what every cell holds, for
@@ -167,33 +192,43 @@ impl Occupancy {
             let density = &mut self.density[cell as usize];
             *density = (*density * DECAY).max(found);
         }
-        let known = self.density.iter().filter(|d| **d >= 0.0);
-        let (sum, count) = known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1));
-        let mean = (sum / f64::from(count.max(1))) as f32;
+        let mean = self.mean_density();
         // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what
         // is denser than the mean.
         let (empty, thin) = (mean.min(EMPTY / step), THIN / step);
         let allowed = |cell: usize| self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
-        let held = self.density.iter().enumerate().map(|(cell, &density)| match density {
+        let (bricks, dense) = words(|cell| match self.density[cell] {
             _ if !allowed(cell) => Cell::Empty,
             d if d < 0.0 => self.cell(cell),
             d if d < empty => Cell::Empty,
             d if d < thin => Cell::Thin,
             _ => Cell::Dense,
         });
-        let held: Vec<Cell> = held.collect();
-        self.set(|cell| held[cell]);
+        self.set_words(bricks, dense);
+    }
+
+    /// Mean density of the cells that have been looked at; parts are summed in order.
+    fn mean_density(&self) -> f32 {
+        let parts: Vec<(f64, u32)> = (self.density.par_chunks(GRID * GRID))
+            .map(|part| {
+                let known = part.iter().filter(|density| **density >= 0.0);
+                known.fold((0.0, 0), |(sum, count), &d| (sum + f64::from(d), count + 1))
+            })
+            .collect();
+        let (sum, count) =
+            parts.iter().fold((0.0, 0), |(sum, count), part| (sum + part.0, count + part.1));
+        (sum / f64::from(count.max(1))) as f32
     }
 
     /// Whether a cell may hold something.
     pub(crate) fn is_occupied(&self, cell: usize) -> bool {
-        let (word, bit) = place(corner(cell), BRICKS);
+        let (word, bit) = place(corner(cell, GRID), BRICKS);
         self.bricks[word] >> bit & 1 == 1
     }
 
     /// What a cell holds.
     fn cell(&self, cell: usize) -> Cell {
-        let (word, bit) = place(corner(cell), BRICKS);
+        let (word, bit) = place(corner(cell, GRID), BRICKS);
         match (self.bricks[word] >> bit & 1, self.dense[word] >> bit & 1) {
             (0, _) => Cell::Empty,
             (_, 0) => Cell::Thin,
@@ -202,21 +237,18 @@ impl Occupancy {
     }
 
     /// Sets every cell anew.
-    pub(crate) fn set(&mut self, held: impl Fn(usize) -> Cell) {
-        self.bricks = vec![0; BRICKS * BRICKS * BRICKS];
+    pub(crate) fn set(&mut self, held: impl Fn(usize) -> Cell + Sync) {
+        let (bricks, dense) = words(held);
+        self.set_words(bricks, dense);
+    }
+
+    fn set_words(&mut self, bricks: Vec<u64>, dense: Vec<u64>) {
         self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
-        self.dense = vec![0; BRICKS * BRICKS * BRICKS];
-        for cell in 0..CELLS {
-            let held = held(cell);
-            if held != Cell::Empty {
-                let at = corner(cell);
-                let (word, bit) = place(at, BRICKS);
-                self.bricks[word] |= 1 << bit;
-                self.dense[word] |= u64::from(held == Cell::Dense) << bit;
-                let (word, bit) = place(at.map(|c| c / SIDE), BLOCKS);
-                self.blocks[word] |= 1 << bit;
-            }
+        for brick in (0..bricks.len()).filter(|&brick| bricks[brick] != 0) {
+            let (word, bit) = place(corner(brick, BRICKS), BLOCKS);
+            self.blocks[word] |= 1 << bit;
         }
+        (self.bricks, self.dense) = (bricks, dense);
     }
 
     /// Cells that are occupied, in order.
@@ -370,6 +402,19 @@ mod tests {
     use super::*;
     use counter_rng::CounterRng;
 
+    fn sample(occupancy: &Occupancy, ray: &NormalizedRay, step: f32, k: u32) -> Option<(f32, f32)> {
+        let t = (k as f32 + 0.3).mul_add(step, 0.0);
+        let c = [0, 1, 2].map(|i| {
+            (ray.direction[i].mul_add(t, ray.origin[i]) * 128.0).max(0.0).min(127.0) as usize
+        });
+        let middle = (k as f32 + 0.3 + 0.5).mul_add(step, 0.0);
+        match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
+            Cell::Dense if t < ray.leave => Some((t, 1.0)),
+            Cell::Thin if k.is_multiple_of(2) && middle < ray.leave => Some((middle, 2.0)),
+            _ => None,
+        }
+    }
+
     #[test]
     fn skipping_loses_no_sample() {
         let mut occupancy = Occupancy::full();
@@ -411,19 +456,8 @@ mod tests {
                 );
             }
             let found: Vec<(f32, f32)> = found.t.into_iter().zip(found.lengths).collect();
-            let sample = |k: u32| {
-                let t = (k as f32 + 0.3).mul_add(step, 0.0);
-                let c = [0, 1, 2].map(|i| {
-                    (direction[i].mul_add(t, origin[i]) * 128.0).max(0.0).min(127.0) as usize
-                });
-                let middle = (k as f32 + 0.3 + 0.5).mul_add(step, 0.0);
-                match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
-                    Cell::Dense if t < leave => Some((t, 1.0)),
-                    Cell::Thin if k.is_multiple_of(2) && middle < leave => Some((middle, 2.0)),
-                    _ => None,
-                }
-            };
-            let expected: Vec<(f32, f32)> = (0..2000).filter_map(sample).collect();
+            let expected: Vec<(f32, f32)> =
+                (0..2000).filter_map(|k| sample(&occupancy, &ray, step, k)).collect();
             // Rounding at a face may move one sample in a thousand across it.
             let missing = expected.iter().filter(|t| !found.contains(t)).count();
             assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());

@@ -5,7 +5,6 @@ use crate::occupancy::Strides;
 use crate::ray::{Ray, clip};
 use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};
-use crate::simd::LANES;
 
 /// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what
 /// another reading of the field is compared with.
@@ -13,7 +12,7 @@ use crate::simd::LANES;
 pub struct Passes {
     chunk: Chunk,
     transposed: Vec<f32>,
-    lanes: Vec<f32>,
+    network: Vec<f32>,
     into: FeatureGradients,
     touched: Vec<u8>,
 }
@@ -23,12 +22,11 @@ impl Passes {
     pub fn new(field: &Field) -> Self {
         let mut transposed = vec![0.0; field.network.len()];
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
-        let lanes = vec![0.0; field.network.len() * LANES];
         let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
         Self {
             chunk: Chunk::default(),
             transposed,
-            lanes,
+            network: vec![0.0; field.network.len()],
             into: FeatureGradients::default(),
             touched: vec![0; blocks],
         }
@@ -53,7 +51,7 @@ impl Passes {
                     regularisers: Regularisers::default(),
                 };
                 let mut network =
-                    NetworkGradients { transposed: &self.transposed, lanes: &mut self.lanes };
+                    NetworkGradients { transposed: &self.transposed, sums: &mut self.network };
                 self.chunk.backward(
                     field,
                     towards,
@@ -85,9 +83,7 @@ impl Passes {
 
     /// Gradient by the networks, layer after layer, each input by input, summed over all backward
     /// passes so far.
-    pub fn network_gradient(&mut self, field: &Field) -> Vec<f32> {
-        let mut gradient = vec![0.0; field.network.len()];
-        crate::mlp::drain_lanes(&mut self.lanes, &mut gradient);
-        gradient
+    pub fn network_gradient(&self) -> &[f32] {
+        &self.network
     }
 }

@@ -1,5 +1,6 @@
 //! What a field holds at places of its unit cube, without any ray: for whoever bakes it.
 
+use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::math::exp;
 use crate::occupancy::cell_of;
@@ -77,7 +78,7 @@ impl Field {
             let values = features.iter().copied().chain(spherical_harmonics(direction));
             values.enumerate().for_each(|(row, value)| input[row * n + k] = value);
         }
-        let mut added = Vec::new();
+        let mut added = Aligned::default();
         let added = view_network(self, &input, &mut Default::default(), &mut added, n);
         (0..directions.len()).map(|k| [0, 1, 2].map(|c| added[c * n + k])).collect()
     }
@@ -134,10 +135,9 @@ mod tests {
         }
         let added = field.view_colours(&features, &[ray.direction, [0.0, 1.0, 0.0]]);
         let colour: [f32; 3] = std::array::from_fn(|c| {
-            let seen = |(sample, weight): (&PointSample, &f32)| {
-                weight * sigmoid(sample.raw_colour[c] + added[0][c])
-            };
-            samples.iter().zip(&weights).map(seen).sum::<f32>() + through
+            let lights = samples.iter().zip(&weights);
+            lights.map(|(s, weight)| weight * sigmoid(s.raw_colour[c] + added[0][c])).sum::<f32>()
+                + through
         });
         let pixel = field.render(&[ray])[0];
         assert!(through > 0.01 && through < 0.9 && added[0] != added[1], "{through} {added:?}");

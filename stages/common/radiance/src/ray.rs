@@ -283,6 +283,12 @@ mod tests {
         DVec3::from(v).normalize()
     }
 
+    fn contract(scale: f64, p: DVec3) -> DVec3 {
+        let u = p / scale;
+        let u = if u.length() > 1.0 { (2.0 - 1.0 / u.length()) * u.normalize() } else { u };
+        0.25 * u + 0.5
+    }
+
     /// In every space the place at t is the mapped world point at the distance that t stands for,
     /// in the cube all the way, and t grows with the distance.
     #[test]
@@ -299,11 +305,6 @@ mod tests {
             };
             let (near, far) = (0.1 * scale, 90.0 * scale);
             let bounds = |space| Bounds { min: [-scale; 3], max: [scale; 3], near, far, space };
-            let contract = |p: DVec3| {
-                let u = p / scale;
-                let u = if u.length() > 1.0 { (2.0 - 1.0 / u.length()) * u.normalize() } else { u };
-                0.25 * u + 0.5
-            };
             let mut met = [0; 2];
             for k in 0..200 {
                 let mut rng = counter_rng::CounterRng::new(5, 0, k);
@@ -326,7 +327,7 @@ mod tests {
                         let world = from + distance * direction;
                         let expected = match space {
                             Space::Ndc(_) => frustum.to_cube(frustum.to_camera(world)),
-                            _ => contract(world),
+                            _ => contract(scale, world),
                         };
                         let error = (DVec3::from(p.map(f64::from)) - expected).length();
                         assert!(error < 2e-5, "{space:?} {j}: {p:?} {expected} at {distance}");

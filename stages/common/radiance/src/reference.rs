@@ -7,12 +7,11 @@ use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
 use crate::grid::{Level, scatter};
-use crate::mlp::{Layer, drain_lanes};
+use crate::mlp::Layer;
 use crate::occupancy::{Cell, March, Marched, Strides, march};
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::regularisers::{Regularisers, likeness};
 use crate::shading::{NetworkGradients, RayGradients};
-use crate::simd::LANES;
 use crate::spec::{
     BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
 };
@@ -23,6 +22,10 @@ struct Judge<'a> {
     field: &'a Field,
     grid: Vec<f64>,
     network: Vec<f64>,
+}
+
+fn colour_of(outputs: &[f64], added: &[f64]) -> [f64; 3] {
+    [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()))
 }
 
 impl Judge<'_> {
@@ -101,11 +104,8 @@ impl Judge<'_> {
             depth += tau;
         }
         let added = self.added(&composited, ray.direction);
-        let colour = |outputs: &[f64]| {
-            [0, 1, 2].map(|c| 1.0 / (1.0 + (-outputs[RAW_COLOUR + c] - added[c]).exp()))
-        };
         (
-            counted.iter().map(|(weight, outputs)| (*weight, colour(outputs))).collect(),
+            counted.iter().map(|(weight, outputs)| (*weight, colour_of(outputs, &added))).collect(),
             (-depth).exp(),
         )
     }
@@ -160,17 +160,15 @@ fn fused_gradients(
 ) -> (Vec<f32>, Vec<f32>, usize) {
     let mut transposed = vec![0.0; field.network.len()];
     field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
-    let mut lanes = vec![0.0; field.network.len() * LANES];
+    let mut network = vec![0.0; field.network.len()];
     let mut features = FeatureGradients::default();
     chunk.backward(
         field,
         towards,
         roulette,
-        &mut NetworkGradients { transposed: &transposed, lanes: &mut lanes },
+        &mut NetworkGradients { transposed: &transposed, sums: &mut network },
         &mut features,
     );
-    let mut network = vec![0.0; field.network.len()];
-    drain_lanes(&mut lanes, &mut network);
     let mut grid = vec![0.0f32; field.grid.len()];
     for (level, gradients) in field.levels.iter().zip(&features.levels) {
         scatter(
@@ -216,6 +214,10 @@ fn example() -> (Field, Vec<Ray>) {
     (field, rays)
 }
 
+fn wide_likeness(colour: &[f64; 3], background: [f32; 3]) -> f64 {
+    f64::from(likeness(colour.map(|c| c as f32), background))
+}
+
 #[test]
 fn fused_passes_equal_the_plain_ones() {
     let (field, mut rays) = example();
@@ -250,10 +252,10 @@ fn fused_passes_equal_the_plain_ones() {
     let likenesses: Vec<Vec<f64>> = (0..rays.len())
         .map(|i| {
             let (shaded, through) = judge.shaded(&rays[i], &samples[i]);
-            let like = |colour: &[f64; 3]| {
-                f64::from(likeness(colour.map(|c| c as f32), rays[i].background))
-            };
-            shaded.iter().map(|(_, colour)| through * like(colour)).collect()
+            shaded
+                .iter()
+                .map(|(_, colour)| through * wide_likeness(colour, rays[i].background))
+                .collect()
         })
         .collect();
     let like = likenesses.iter().flatten().filter(|l| **l > 0.0).count();
@@ -317,6 +319,17 @@ fn fused_passes_equal_the_plain_ones() {
     }
 }
 
+fn drawn_gradients(
+    field: &Field,
+    clipped: &[NormalizedRay],
+    towards: RayGradients<'_>,
+    roulette: Roulette,
+) -> (Vec<f32>, Vec<f32>, usize) {
+    let mut chunk = Chunk::default();
+    chunk.forward(field, clipped, &[0.5; 20], Strides::ByCell);
+    fused_gradients(field, &mut chunk, towards, roulette)
+}
+
 /// Samples with short gradients are drawn, and the mean over evenly spaced draws is the gradient of
 /// all of them.
 #[test]
@@ -332,19 +345,16 @@ fn roulette_keeps_the_expected_gradient() {
         backgrounds: &backgrounds,
         regularisers: Regularisers::default(),
     };
-    let gradients = |roulette: Roulette| {
-        let mut chunk = Chunk::default();
-        chunk.forward(&field, &clipped, &[0.5; 20], Strides::ByCell);
-        fused_gradients(&field, &mut chunk, towards, roulette)
-    };
-    let (all_grid, all_network, all) = gradients(Roulette::default());
+    let (all_grid, all_network, all) =
+        drawn_gradients(&field, &clipped, towards, Roulette::default());
     let all_gradients: Vec<f64> =
         all_grid.iter().chain(&all_network).map(|&g| f64::from(g)).collect();
     const DRAWS: usize = 400;
     let (mut mean, mut kept) = (vec![0.0f64; all_gradients.len()], 0);
     for draw in 0..DRAWS {
         let draw = (draw as f32 + 0.5) / DRAWS as f32;
-        let (grid, network, chosen) = gradients(Roulette { limit: 1.0, draw });
+        let (grid, network, chosen) =
+            drawn_gradients(&field, &clipped, towards, Roulette { limit: 1.0, draw });
         kept += chosen;
         mean.iter_mut()
             .zip(grid.iter().chain(&network))
@@ -384,33 +394,31 @@ fn stopping_early_loses_no_more_than_the_light_that_was_left() {
     assert!(stopped > 5, "{stopped} rays ended in the dark");
 }
 
+fn outcome(field: &Field, rays: &[Ray]) -> Vec<u32> {
+    let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
+    let mut chunk = Chunk::default();
+    chunk.forward(field, &clipped, &[0.25; 20], Strides::ByCell);
+    let mut bits: Vec<u32> = chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
+    let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
+    let towards = RayGradients {
+        colours: &[[0.3, -0.2, 0.1]; 20],
+        backgrounds: &[[0.5; 3]; 20],
+        regularisers,
+    };
+    let roulette = Roulette { limit: 1.0, draw: 0.7 };
+    let (grid, network, _) = fused_gradients(field, &mut chunk, towards, roulette);
+    bits.extend(grid.iter().chain(&network).map(|x| x.to_bits()));
+    bits
+}
+
 #[test]
 fn every_family_renders_and_trains_to_equal_bits() {
-    use crate::simd::{Family, set_family};
+    use crate::simd::by_every_family;
     let (field, rays) = example();
-    let outcome = || {
-        let clipped: Vec<_> = rays.iter().map(|r| clip(&field.bounds, r)).collect();
-        let mut chunk = Chunk::default();
-        chunk.forward(&field, &clipped, &[0.25; 20], Strides::ByCell);
-        let mut bits: Vec<u32> =
-            chunk.sums.iter().flat_map(|s| s.colour.map(f32::to_bits)).collect();
-        let regularisers = Regularisers { distortion: 0.2, floater_loss: 0.3 };
-        let towards = RayGradients {
-            colours: &[[0.3, -0.2, 0.1]; 20],
-            backgrounds: &[[0.5; 3]; 20],
-            regularisers,
-        };
-        let roulette = Roulette { limit: 1.0, draw: 0.7 };
-        let (grid, network, _) = fused_gradients(&field, &mut chunk, towards, roulette);
-        bits.extend(grid.iter().chain(&network).map(|x| x.to_bits()));
-        bits
-    };
-    let best = outcome();
-    for family in [Family::Avx512, Family::Avx2, Family::Portable] {
-        set_family(family);
-        assert!(outcome() == best, "{family:?} gives other bits");
-    }
-    [Family::Portable, Family::Avx2, Family::Avx512].into_iter().for_each(set_family);
+    let best = outcome(&field, &rays);
+    by_every_family(|family| {
+        assert!(outcome(&field, &rays) == best, "{family:?} gives other bits");
+    });
 }
 
 #[test]

@@ -115,6 +115,13 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    fn exact(t: &[f32], weight: &[f32], factor: f32, i: usize) -> f64 {
+        let apart: f64 = (0..t.len())
+            .map(|j| f64::from(weight[j]) * (f64::from(t[i]) - f64::from(t[j])).abs())
+            .sum();
+        2.0 * f64::from(factor) * (apart + 0.003 / 3.0 * f64::from(weight[i]))
+    }
+
     proptest! {
         #[test]
         fn distortion_gradients_equal_f64_differences(
@@ -138,21 +145,15 @@ mod tests {
             let regularisers = Regularisers { distortion: factor, ..Regularisers::default() };
             regularisers.add_gradients(&ray, &mut gradients);
             prop_assert_eq!(gradients.behind, 0.0);
-            let exact = |i: usize| -> f64 {
-                let apart: f64 = (0..t.len())
-                    .map(|j| f64::from(weight[j]) * (f64::from(t[i]) - f64::from(t[j])).abs())
-                    .sum();
-                2.0 * f64::from(factor) * (apart + 0.003 / 3.0 * f64::from(weight[i]))
-            };
             // Distances are differences of f32 numbers: known to a few parts in 10^7 of how far
             // along the ray they lie.
             let whole: f32 = weight.iter().sum();
             let rounding = 4e-7 * f64::from(factor * whole * t[t.len() - 1]);
-            let largest = (0..t.len()).map(exact).fold(1e-3, f64::max);
+            let largest = (0..t.len()).map(|i| exact(&t, &weight, factor, i)).fold(1e-3, f64::max);
             for i in 0..t.len() {
-                let error = (f64::from(by_weight[i]) - exact(i)).abs();
+                let error = (f64::from(by_weight[i]) - exact(&t, &weight, factor, i)).abs();
                 prop_assert!(error < 1e-5 * largest + rounding, "{i}: {} {}", by_weight[i],
-                    exact(i));
+                    exact(&t, &weight, factor, i));
             }
         }
     }

@@ -5,6 +5,7 @@ use crate::field::Field;
 use crate::occupancy::Strides;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::samples::RaySum;
+use crate::spec::UNSEEN;
 
 /// What a ray sees.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -86,7 +87,7 @@ fn pixel(ray: &Ray, clipped: &NormalizedRay, sum: &RaySum, far: f32) -> Pixel {
         }),
         premultiplied: sum.colour,
         opacity,
-        depth: if sum.weight > 1e-4 { sum.distance / sum.weight } else { far },
+        depth: if sum.weight > UNSEEN { sum.distance / sum.weight } else { far },
         median_depth: sum.median.map_or(far, |t| clipped.distance(t)),
     }
 }

@@ -1,5 +1,6 @@
 //! Samples of a few rays, marched in rounds: where they lie, their density, and their weights.
 
+use crate::aligned::Aligned;
 use crate::composite::{optical_depths, weights};
 use crate::field::Field;
 use crate::grid::encode;
@@ -43,21 +44,13 @@ impl Round {
     }
 }
 
-/// At least `len` floats, with what was in them before.
-pub(crate) fn fit(buffer: &mut Vec<f32>, len: usize) -> &mut [f32] {
-    if buffer.len() < len {
-        buffer.resize(len, 0.0);
-    }
-    &mut buffer[..len]
-}
-
 /// Activations of the density network: rows of all samples of a round, round after round.
 #[derive(Debug, Default)]
 pub(crate) struct DensityRows {
-    positions: Vec<f32>,
-    pub(crate) features: Vec<f32>,
-    pub(crate) hidden: Vec<f32>,
-    pub(crate) outputs: Vec<f32>,
+    positions: Aligned,
+    pub(crate) features: Aligned,
+    pub(crate) hidden: Aligned,
+    pub(crate) outputs: Aligned,
 }
 
 impl DensityRows {
@@ -73,7 +66,7 @@ impl DensityRows {
             (&mut self.hidden, first.outputs),
             (&mut self.outputs, second.outputs),
         ] {
-            fit(buffer, round.range(rows).end);
+            buffer.fit(round.range(rows).end);
         }
         let features = &mut self.features[round.range(first.inputs)];
         for (level, rows) in field.levels.iter().zip(features.chunks_exact_mut(FEATURES * n)) {
@@ -103,7 +96,7 @@ impl DensityRows {
 
     /// Outputs of the network at `n` positions (three rows): a row each.
     pub(crate) fn outputs_at(&mut self, field: &Field, positions: &[f32], n: usize) -> &[f32] {
-        fit(&mut self.positions, 3 * n).copy_from_slice(positions);
+        self.positions.fit(3 * n).copy_from_slice(positions);
         self.run(field, Round { start: 0, n, first: 0 });
         &self.outputs[..DENSITY_OUTPUTS * n]
     }
@@ -128,11 +121,11 @@ pub(crate) struct Samples {
     pub(crate) rows: DensityRows,
     /// Samples without those that fill rounds up.
     pub(crate) count: usize,
-    tau: Vec<f32>,
+    tau: Aligned,
     /// Optical depth before each sample.
-    before: Vec<f32>,
-    pub(crate) transmittance: Vec<f32>,
-    pub(crate) weight: Vec<f32>,
+    before: Aligned,
+    pub(crate) transmittance: Aligned,
+    pub(crate) weight: Aligned,
     /// Optical depth of each ray so far.
     depth: Vec<f32>,
     /// Rays still lit, and the step that each ray's march has come to.
@@ -191,7 +184,7 @@ impl Samples {
         self.marched.t.resize(start + n, 0.0);
         self.marched.lengths.resize(start + n, 0.0);
         self.marched.positions.resize(start + n, [0.0; 3]);
-        fit(&mut self.rows.positions, 3 * n);
+        self.rows.positions.fit(3 * n);
         for (axis, row) in self.rows.positions[..3 * n].chunks_exact_mut(n.max(1)).enumerate() {
             for (value, p) in row.iter_mut().zip(&self.marched.positions[start..]) {
                 *value = p[axis];
@@ -199,7 +192,7 @@ impl Samples {
         }
         self.rows.run(field, round);
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
-            fit(buffer, start + n);
+            buffer.fit(start + n);
         }
         let whole = start..start + n;
         let tau = &mut self.tau[whole.clone()];

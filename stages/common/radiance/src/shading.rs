@@ -2,6 +2,7 @@
 //! composited along a ray, one small network makes of them and the direction what is added to the
 //! raw colours of all the ray's samples. So colours cost a network a ray.
 
+use crate::aligned::Aligned;
 use crate::composite::optical_depth_gradients;
 use crate::field::Field;
 use crate::math::sigmoid;
@@ -9,7 +10,7 @@ use crate::mlp::Layers;
 use crate::mlp::{After, Layer, add_outer, multiply};
 use crate::ray::NormalizedRay;
 use crate::regularisers::{LossGradients, Regularisers, ShadedRay};
-use crate::samples::{Counted, RaySum, Samples, fit};
+use crate::samples::{Counted, RaySum, Samples};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES, VIEW_INPUTS};
 use crate::spherical::spherical_harmonics;
@@ -17,24 +18,24 @@ use crate::spherical::spherical_harmonics;
 /// Buffers of the view network, a column a ray that has samples, and of the samples' colours.
 #[derive(Debug, Default)]
 pub(crate) struct Shading {
-    input: Vec<f32>,
-    hidden: [Vec<f32>; 2],
+    input: Aligned,
+    hidden: [Aligned; 2],
     /// What is added to the raw colours: three rows.
-    added: Vec<f32>,
+    added: Aligned,
     /// Colours: three rows, a column a sample that counts.
-    colour: Vec<f32>,
-    gradient: [Vec<f32>; 2],
+    colour: Aligned,
+    gradient: [Aligned; 2],
     along: AlongRay,
 }
 
 /// One ray's samples from front to back.
 #[derive(Debug, Default)]
 struct AlongRay {
-    transmittance: Vec<f32>,
-    weight: Vec<f32>,
-    t: Vec<f32>,
-    by_weight: Vec<f32>,
-    by_depth: Vec<f32>,
+    transmittance: Aligned,
+    weight: Aligned,
+    t: Aligned,
+    by_weight: Aligned,
+    by_depth: Aligned,
 }
 
 /// What a backward pass starts from, an entry a ray.
@@ -47,11 +48,10 @@ pub(crate) struct RayGradients<'a> {
     pub(crate) regularisers: Regularisers,
 }
 
-/// The networks' weights output by output, and where their gradients are added: 16 partial sums a
-/// weight.
+/// The networks' weights output by output, and where their gradients are added.
 pub(crate) struct NetworkGradients<'a> {
     pub(crate) transposed: &'a [f32],
-    pub(crate) lanes: &'a mut [f32],
+    pub(crate) sums: &'a mut [f32],
 }
 
 impl NetworkGradients<'_> {
@@ -66,8 +66,7 @@ impl NetworkGradients<'_> {
         dx: &mut [f32],
     ) {
         let dy = &dy[..layer.outputs * n];
-        let lanes = &mut self.lanes[layer.offset * LANES..layer.range().end * LANES];
-        add_outer(x, dy, lanes, layer.inputs, layer.outputs, n);
+        add_outer(x, dy, &mut self.sums[layer.range()], layer.inputs, layer.outputs, n);
         multiply(
             &self.transposed[layer.range()],
             dy,
@@ -213,17 +212,17 @@ kernel! {
 pub(crate) fn view_network<'a>(
     field: &Field,
     input: &[f32],
-    hidden: &mut [Vec<f32>; 2],
-    added: &'a mut Vec<f32>,
+    hidden: &mut [Aligned; 2],
+    added: &'a mut Aligned,
     n: usize,
 ) -> &'a mut [f32] {
     let Layers { view, .. } = field.layers;
     let [hidden1, hidden2] = hidden;
-    let hidden1 = fit(hidden1, view[0].outputs * n);
+    let hidden1 = hidden1.fit(view[0].outputs * n);
     run(field, view[0], input, hidden1, n, After::Relu);
-    let hidden2 = fit(hidden2, view[1].outputs * n);
+    let hidden2 = hidden2.fit(view[1].outputs * n);
     run(field, view[1], hidden1, hidden2, n, After::Relu);
-    let added = fit(added, view[2].outputs * n);
+    let added = added.fit(view[2].outputs * n);
     run(field, view[2], hidden2, added, n, After::Linear);
     added
 }
@@ -243,7 +242,7 @@ impl AlongRay {
             &mut self.by_weight,
             &mut self.by_depth,
         ] {
-            fit(buffer, longest);
+            buffer.fit(longest);
         }
     }
 }
@@ -259,13 +258,13 @@ impl Shading {
         sums: &mut [RaySum],
     ) {
         let (m, n) = (counted.sample.len(), counted.rays.len().next_multiple_of(LANES));
-        let input = fit(&mut self.input, VIEW_INPUTS * n);
+        let input = self.input.fit(VIEW_INPUTS * n);
         for row in input.chunks_exact_mut(n.max(1)) {
             row[counted.rays.len()..].fill(0.0);
         }
         composite(samples, counted, rays, sums, input, n);
         let added = view_network(field, input, &mut self.hidden, &mut self.added, n);
-        let colour = fit(&mut self.colour, 3 * m);
+        let colour = self.colour.fit(3 * m);
         raw_colours(counted, added, n, colour, m);
         sigmoids(colour);
         sum_colours(samples, counted, colour, m, sums);
@@ -286,7 +285,7 @@ impl Shading {
         let Layers { view: [first, second, third], .. } = field.layers;
         let widest = first.outputs.max(second.outputs).max(VIEW_INPUTS);
         let [a, b] = &mut self.gradient;
-        let (a, b) = (fit(a, widest * n), fit(b, widest * n));
+        let (a, b) = (a.fit(widest * n), b.fit(widest * n));
         for row in a[..3 * n].chunks_exact_mut(n) {
             row[counted.rays.len()..].fill(0.0);
         }
@@ -324,7 +323,7 @@ impl Shading {
                 loss.behind,
                 &mut along.by_depth[..len],
             );
-            for (&k, &by_depth) in places.iter().zip(&along.by_depth) {
+            for (&k, &by_depth) in places.iter().zip(&*along.by_depth) {
                 gradients[k as usize][0] = by_depth * counted.outputs[k as usize][0];
             }
         }

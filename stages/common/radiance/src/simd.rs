@@ -74,6 +74,21 @@ pub fn set_family(family: Family) {
     }
 }
 
+/// Runs a test by every family that this machine has, and says which it lacks.
+#[cfg(test)]
+pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
+    let best = Family::current();
+    for family in [Family::Avx512, Family::Avx2, Family::Portable] {
+        if family.is_supported() {
+            set_family(family);
+            test(family);
+        } else {
+            eprintln!("skipped: this machine has no {family:?}");
+        }
+    }
+    set_family(best);
+}
+
 /// Four `f32`: the features of a vertex.
 pub(crate) trait Quad: Copy {
     fn splat(value: f32) -> Self;
@@ -111,13 +126,16 @@ pub(crate) trait Lanes: Copy {
     fn splat(value: f32) -> Self;
     fn load(from: &[f32; LANES]) -> Self;
     fn store(self, to: &mut [f32; LANES]);
-    fn add(self, other: Self) -> Self;
     /// self · factor + addend, rounded once.
     fn mul_add(self, factor: Self, addend: Self) -> Self;
     /// self where it is above 0, else 0.
     fn positive(self) -> Self;
     /// self where `gate` is above 0, else 0.
     fn where_positive(self, gate: Self) -> Self;
+    /// The sums of four over their lanes, each by halves: lanes 0 and 8, 1 and 9, … first.
+    fn sums(four: [Self; 4]) -> Self::Quad;
+    /// Asks the memory for numbers that are needed soon.
+    fn prefetch(_soon: &[f32]) {}
 }
 
 #[derive(Clone, Copy)]
@@ -139,10 +157,6 @@ impl Lanes for Portable {
         *to = self.0;
     }
     #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        Self(std::array::from_fn(|i| self.0[i] + other.0[i]))
-    }
-    #[inline(always)]
     fn mul_add(self, factor: Self, addend: Self) -> Self {
         Self(std::array::from_fn(|i| self.0[i].mul_add(factor.0[i], addend.0[i])))
     }
@@ -154,13 +168,26 @@ impl Lanes for Portable {
     fn where_positive(self, gate: Self) -> Self {
         Self(std::array::from_fn(|i| if gate.0[i] > 0.0 { self.0[i] } else { 0.0 }))
     }
+    #[inline(always)]
+    fn sums(four: [Self; 4]) -> Self::Quad {
+        four.map(|Self(mut lanes)| {
+            let mut width = LANES / 2;
+            while width > 0 {
+                for k in 0..width {
+                    lanes[k] += lanes[k + width];
+                }
+                width /= 2;
+            }
+            lanes[0]
+        })
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86 {
     //! `unsafe` here pays with a known vector width: left to the optimiser, the accumulators of a
     //! matrix tile spill. All of it is sound because these types are only used inside functions
-    //! compiled for their features (see `kernel!`).
+    //! compiled for their features (see `kernel!`). A closure doesn't inherit them, so there are none.
 
     use std::arch::x86_64::*;
 
@@ -192,6 +219,29 @@ pub(crate) mod x86 {
         }
     }
 
+    impl Four {
+        /// The sums of four, each of eight floats.
+        ///
+        /// # Safety
+        /// The caller runs with AVX2.
+        #[inline(always)]
+        unsafe fn sums([a, b, c, d]: [__m256; 4]) -> Self {
+            // SAFETY: the caller runs with AVX2.
+            unsafe {
+                let a = _mm_add_ps(_mm256_castps256_ps128(a), _mm256_extractf128_ps::<1>(a));
+                let b = _mm_add_ps(_mm256_castps256_ps128(b), _mm256_extractf128_ps::<1>(b));
+                let c = _mm_add_ps(_mm256_castps256_ps128(c), _mm256_extractf128_ps::<1>(c));
+                let d = _mm_add_ps(_mm256_castps256_ps128(d), _mm256_extractf128_ps::<1>(d));
+                let ab = _mm_add_ps(_mm_movelh_ps(a, b), _mm_movehl_ps(b, a));
+                let cd = _mm_add_ps(_mm_movelh_ps(c, d), _mm_movehl_ps(d, c));
+                Self(_mm_add_ps(
+                    _mm_shuffle_ps::<0b10_00_10_00>(ab, cd),
+                    _mm_shuffle_ps::<0b11_01_11_01>(ab, cd),
+                ))
+            }
+        }
+    }
+
     #[derive(Clone, Copy)]
     pub(crate) struct Avx512(__m512);
 
@@ -214,11 +264,6 @@ pub(crate) mod x86 {
             unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
         }
         #[inline(always)]
-        fn add(self, other: Self) -> Self {
-            // SAFETY: the caller runs with AVX-512.
-            Self(unsafe { _mm512_add_ps(self.0, other.0) })
-        }
-        #[inline(always)]
         fn mul_add(self, factor: Self, addend: Self) -> Self {
             // SAFETY: the caller runs with AVX-512.
             Self(unsafe { _mm512_fmadd_ps(self.0, factor.0, addend.0) })
@@ -237,6 +282,23 @@ pub(crate) mod x86 {
                     self.0,
                 )
             })
+        }
+        #[inline(always)]
+        fn sums([a, b, c, d]: [Self; 4]) -> Four {
+            // SAFETY: the caller runs with AVX-512.
+            unsafe {
+                Four::sums([
+                    _mm256_add_ps(_mm512_castps512_ps256(a.0), _mm512_extractf32x8_ps::<1>(a.0)),
+                    _mm256_add_ps(_mm512_castps512_ps256(b.0), _mm512_extractf32x8_ps::<1>(b.0)),
+                    _mm256_add_ps(_mm512_castps512_ps256(c.0), _mm512_extractf32x8_ps::<1>(c.0)),
+                    _mm256_add_ps(_mm512_castps512_ps256(d.0), _mm512_extractf32x8_ps::<1>(d.0)),
+                ])
+            }
+        }
+        #[inline(always)]
+        fn prefetch(soon: &[f32]) {
+            // SAFETY: it reads nothing that the program sees.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(soon.as_ptr().cast()) }
         }
     }
 
@@ -267,29 +329,50 @@ pub(crate) mod x86 {
             }
         }
         #[inline(always)]
-        fn add(self, other: Self) -> Self {
-            // SAFETY: the caller runs with AVX2.
-            Self([0, 1].map(|i| unsafe { _mm256_add_ps(self.0[i], other.0[i]) }))
-        }
-        #[inline(always)]
         fn mul_add(self, factor: Self, addend: Self) -> Self {
             // SAFETY: the caller runs with FMA.
-            Self([0, 1].map(|i| unsafe { _mm256_fmadd_ps(self.0[i], factor.0[i], addend.0[i]) }))
+            Self(unsafe {
+                [
+                    _mm256_fmadd_ps(self.0[0], factor.0[0], addend.0[0]),
+                    _mm256_fmadd_ps(self.0[1], factor.0[1], addend.0[1]),
+                ]
+            })
         }
         #[inline(always)]
         fn positive(self) -> Self {
             // SAFETY: the caller runs with AVX2. A NaN gives the second operand, 0.
-            Self(self.0.map(|v| unsafe { _mm256_max_ps(v, _mm256_setzero_ps()) }))
+            Self(unsafe {
+                let zero = _mm256_setzero_ps();
+                [_mm256_max_ps(self.0[0], zero), _mm256_max_ps(self.0[1], zero)]
+            })
         }
         #[inline(always)]
         fn where_positive(self, gate: Self) -> Self {
             // SAFETY: the caller runs with AVX2.
-            Self([0, 1].map(|i| unsafe {
-                _mm256_and_ps(
-                    self.0[i],
-                    _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[i], _mm256_setzero_ps()),
-                )
-            }))
+            Self(unsafe {
+                let zero = _mm256_setzero_ps();
+                [
+                    _mm256_and_ps(self.0[0], _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[0], zero)),
+                    _mm256_and_ps(self.0[1], _mm256_cmp_ps::<_CMP_GT_OQ>(gate.0[1], zero)),
+                ]
+            })
+        }
+        #[inline(always)]
+        fn sums([a, b, c, d]: [Self; 4]) -> Four {
+            // SAFETY: the caller runs with AVX2.
+            unsafe {
+                Four::sums([
+                    _mm256_add_ps(a.0[0], a.0[1]),
+                    _mm256_add_ps(b.0[0], b.0[1]),
+                    _mm256_add_ps(c.0[0], c.0[1]),
+                    _mm256_add_ps(d.0[0], d.0[1]),
+                ])
+            }
+        }
+        #[inline(always)]
+        fn prefetch(soon: &[f32]) {
+            // SAFETY: it reads nothing that the program sees.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(soon.as_ptr().cast()) }
         }
     }
 }

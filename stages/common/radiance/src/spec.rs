@@ -26,6 +26,8 @@ pub const MAX_RAW_DENSITY: f32 = 15.0;
 
 /// Samples behind this transmittance, and samples of less weight, have no colour and no gradient.
 pub const FAINT: f32 = 1e-4;
+/// A ray whose samples weigh no more in all has its depth at the far end.
+pub const UNSEEN: f32 = 1e-4;
 /// Optical depth at which a ray ends: -ln([`FAINT`]).
 pub const DARK: f32 = 9.210_34;
 
@@ -36,3 +38,9 @@ pub const OCCUPANCY_CELLS: usize = 128;
 pub const THIN: f32 = 0.05;
 /// Optical depth of a step below which a cell is empty, once the mean is above it.
 pub const EMPTY: f32 = 0.01;
+
+/// Adam's decay of the two moments of gradients. The second moment forgets sooner than usual, since
+/// a grid entry is seen now and then.
+pub const ADAM_BETA: [f64; 2] = [0.9, 0.99];
+/// What keeps Adam's division from 0.
+pub const ADAM_EPSILON: f64 = 1e-15;

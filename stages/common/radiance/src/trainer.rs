@@ -7,6 +7,7 @@ use std::sync::Mutex;
 use rayon::prelude::*;
 
 use crate::adam::{AdamStep, adam};
+use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::scatter;
 use crate::occupancy::Occupancy;
@@ -49,6 +50,9 @@ pub enum TrainingError {
 
 /// Shards of a step: fixed, so that sums have one order at any thread count.
 const SHARDS: usize = 32;
+/// Blocks of a level that the optimiser takes in one piece.
+const ADAM_BLOCKS: usize = 1 << 12;
+
 /// Trains a [`Field`] by Adam.
 pub struct Trainer {
     field: Field,
@@ -61,7 +65,7 @@ pub struct Trainer {
     /// Blocks of each level's gradient that aren't 0.
     touched: Vec<Vec<u8>>,
     touched_network: Vec<u8>,
-    transposed: Vec<f32>,
+    transposed: Aligned,
     tally: Tally,
     samples_per_ray: f64,
     shards: Vec<Shard>,
@@ -70,13 +74,16 @@ pub struct Trainer {
 
 /// One number a parameter.
 struct Moments {
-    grid: Vec<f32>,
-    network: Vec<f32>,
+    grid: Aligned,
+    network: Aligned,
 }
 
 impl Moments {
     fn zeros(field: &Field) -> Self {
-        Self { grid: vec![0.0; field.grid.len()], network: vec![0.0; field.network.len()] }
+        Self {
+            grid: Aligned::zeros(field.grid.len()),
+            network: Aligned::zeros(field.network.len()),
+        }
     }
 }
 
@@ -90,7 +97,7 @@ impl Trainer {
             average: None,
             touched: field.levels.iter().map(|l| vec![0; l.blocks()]).collect(),
             touched_network: vec![0; field.network.len().div_ceil(LANES)],
-            transposed: vec![0.0; field.network.len()],
+            transposed: Aligned::zeros(field.network.len()),
             tally: Tally::default(),
             samples_per_ray: field.architecture.full_ray(),
             shards: (0..SHARDS).map(|_| Shard::default()).collect(),
@@ -159,11 +166,14 @@ impl Trainer {
 
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
         let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
-        for shard in &self.shards {
-            for (sum, g) in self.gradients.network.iter_mut().zip(&shard.network) {
-                *sum += g;
+        let shards = &self.shards;
+        let parts = self.gradients.network.par_chunks_mut(1024).enumerate();
+        parts.for_each(|(i, sums)| {
+            for shard in shards {
+                let part = &shard.network[1024 * i..][..sums.len()];
+                sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
             }
-        }
+        });
         self.tally.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
         let fault = self.fault(loss);
@@ -242,8 +252,13 @@ impl Trainer {
                     scatter(level, g, touched, &shard.features.positions, gradients);
                 }
             }
-            let rate = options.rate_of_level(i, schedule);
-            adam(&AdamStep::new(step, rate, 0.0), touched, w, g, m, v);
+            let adam_step = AdamStep::new(step, options.rate_of_level(i, schedule), 0.0);
+            let len = ADAM_BLOCKS * LANES;
+            // In parts, so that the last level leaves no thread without work.
+            let [w, g, m, v] = [w, g, m, v].map(|numbers| numbers.par_chunks_mut(len));
+            (touched.par_chunks_mut(ADAM_BLOCKS), w, g, m, v)
+                .into_par_iter()
+                .for_each(|(touched, w, g, m, v)| adam(&adam_step, touched, w, g, m, v));
         });
     }
 
@@ -264,7 +279,7 @@ impl Trainer {
             average
                 .par_iter_mut()
                 .with_min_len(1 << 16)
-                .zip(now)
+                .zip(&**now)
                 .for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
         }
     }
@@ -337,6 +352,33 @@ mod tests {
         }
     }
 
+    fn trained(field: Field, background: f32, floater_loss: f32, steps: u64) -> (Field, f32) {
+        let options = TrainingOptions {
+            rays: steps * 256,
+            max_rays_per_step: 256,
+            samples_per_step: 1 << 20,
+            learning_rate: 1e-2,
+            level_rate: 0.8,
+            mlp_learning_rate: 1e-2,
+            learning_rate_decay: 0.25,
+            warm_up: 5,
+            ema_decay: 0.0,
+            regularisers: Regularisers { floater_loss, ..Regularisers::default() },
+            network_decay: 0.0,
+            roulette: 1.0,
+            seed: 9,
+        };
+        let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
+        while trainer.step(&mut white).unwrap().is_some() {}
+        let mut rays = [Ray::default(); 64];
+        (0..)
+            .zip(&mut rays)
+            .for_each(|(bundle, ray)| white.sample_rays(bundle, std::slice::from_mut(ray)));
+        let field = trainer.finish();
+        let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
+        (field, opacity)
+    }
+
     /// A white floater before white is as good as nothing to the images, and stays; by the floater
     /// loss it goes.
     #[test]
@@ -351,32 +393,6 @@ mod tests {
         };
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
-        let trained = |field: Field, background: f32, floater_loss: f32, steps: u64| {
-            let options = TrainingOptions {
-                rays: steps * 256,
-                max_rays_per_step: 256,
-                samples_per_step: 1 << 20,
-                learning_rate: 1e-2,
-                level_rate: 0.8,
-                mlp_learning_rate: 1e-2,
-                learning_rate_decay: 0.25,
-                warm_up: 5,
-                ema_decay: 0.0,
-                regularisers: Regularisers { floater_loss, ..Regularisers::default() },
-                network_decay: 0.0,
-                roulette: 1.0,
-                seed: 9,
-            };
-            let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
-            while trainer.step(&mut white).unwrap().is_some() {}
-            let mut rays = [Ray::default(); 64];
-            (0..)
-                .zip(&mut rays)
-                .for_each(|(bundle, ray)| white.sample_rays(bundle, std::slice::from_mut(ray)));
-            let field = trainer.finish();
-            let opacity = field.render(&rays).iter().map(|pixel| pixel.opacity).sum::<f32>() / 64.0;
-            (field, opacity)
-        };
         let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0, 40);
         let ((_, without), (_, with)) =
             (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));

@@ -112,6 +112,15 @@ fn sampling_and_compositing_in_f64() {
     close("fine.colour", &seen.fine.colour, 1e-8);
 }
 
+fn flat(tensors: &[Tensor]) -> Tensor {
+    Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0)
+}
+
+fn image_loss(colour: &Tensor, target: &Tensor) -> Tensor {
+    let mean = colour.reshape([2, 4, 3]).mean_dim([1i64].as_slice(), false, Kind::Double);
+    (mean - target).square().mean(Kind::Double)
+}
+
 /// Loss, every parameter's gradient, and all parameters after three steps of Adam.
 #[test]
 fn gradients_and_three_steps_in_f64() {
@@ -127,16 +136,10 @@ fn gradients_and_three_steps_in_f64() {
     };
     let mut trainer = MlpTrainer::new(field, options).unwrap();
     let target = draw(6, &[2, 3]);
-    let flat = |tensors: &[Tensor]| {
-        Tensor::cat(&tensors.iter().map(|t| t.reshape([-1])).collect::<Vec<_>>(), 0)
-    };
     for step in 0..3 {
         let seen = trainer.field().see(&batch, Some(&draws)).unwrap();
-        let part = |colour: &Tensor| {
-            let mean = colour.reshape([2, 4, 3]).mean_dim([1i64].as_slice(), false, Kind::Double);
-            (mean - &target).square().mean(Kind::Double)
-        };
-        let loss = part(&seen.coarse.colour) + part(&seen.fine.colour);
+        let loss =
+            image_loss(&seen.coarse.colour, &target) + image_loss(&seen.fine.colour, &target);
         let parameters: Vec<Tensor> = trainer.field().parameters().collect();
         let gradients = Tensor::run_backward(&[&loss], &parameters, false, false);
         if step == 0 {

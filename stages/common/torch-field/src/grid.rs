@@ -1,6 +1,6 @@
 use radiance::spec::{
     BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS,
-    RAW_COLOUR, VIEW_FEATURE, VIEW_FEATURES,
+    RAW_COLOUR, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
 };
 use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
 use scene::Bounds;
@@ -424,7 +424,7 @@ impl TorchGrid {
                 }),
                 premultiplied: own,
                 opacity: 1.0 - transmittance[i],
-                depth: if weight[i] > 1e-4 { distance[i] / weight[i] } else { far },
+                depth: if weight[i] > UNSEEN { distance[i] / weight[i] } else { far },
                 median_depth: if is_half[i] > 0.0 { median[i] } else { far },
             }
         });
@@ -445,17 +445,18 @@ mod tests {
 
     use super::*;
 
+    fn random_ray(i: u64, reach: f32) -> Ray {
+        let mut rng = CounterRng::new(3, 1, i);
+        let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
+        let (from, to) = (around(1.0), around(reach));
+        let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
+        let origin = from.map(|x| 4.0 * x / length(from));
+        let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
+        Ray { origin, direction: d.map(|x| x / length(d)), background: [1.0; 3] }
+    }
+
     fn rays(count: u64, reach: f32) -> Vec<Ray> {
-        let ray = |i| {
-            let mut rng = CounterRng::new(3, 1, i);
-            let mut around = |reach: f32| [0, 1, 2].map(|_| reach * (2.0 * rng.uniform() - 1.0));
-            let (from, to) = (around(1.0), around(reach));
-            let length = |v: [f32; 3]| v.iter().map(|x| x * x).sum::<f32>().sqrt().max(1e-6);
-            let origin = from.map(|x| 4.0 * x / length(from));
-            let d: [f32; 3] = std::array::from_fn(|k| to[k] - origin[k]);
-            Ray { origin, direction: d.map(|x| x / length(d)), background: [1.0; 3] }
-        };
-        (0..count).map(ray).collect()
+        (0..count).map(|i| random_ray(i, reach)).collect()
     }
 
     /// A field whose features spread so far.
@@ -469,6 +470,10 @@ mod tests {
         let norm = |of: &mut dyn Iterator<Item = f64>| of.map(|x| x * x).sum::<f64>().sqrt();
         let difference = norm(&mut ours.iter().zip(judge).map(|(a, b)| f64::from(a - b)));
         difference / norm(&mut judge.iter().map(|&b| f64::from(b))).max(1e-12)
+    }
+
+    fn values_of(pixels: &[Pixel], of: &dyn Fn(&Pixel) -> Vec<f32>) -> Vec<f32> {
+        pixels.iter().flat_map(of).collect()
     }
 
     /// Colours and gradients of the hand-written field and of libtorch's autograd, over dense and
@@ -499,7 +504,7 @@ mod tests {
             passes.run(&field, &rays, true);
             let mut table = vec![0.0; field.grid_len()];
             passes.scatter(&field, &mut table);
-            let network = passes.network_gradient(&field);
+            let network = passes.network_gradient();
             let own = field.render(&rays);
             for &device in &devices {
                 let judge = TorchGrid::new(&field, device).unwrap();
@@ -524,22 +529,23 @@ mod tests {
                     "{said}: gradients {by_table} {by_network}"
                 );
                 let theirs = judge.render(&rays).unwrap();
-                let all = |pixels: &[Pixel], of: &dyn Fn(&Pixel) -> Vec<f32>| {
-                    pixels.iter().flat_map(of).collect::<Vec<f32>>()
-                };
                 for (what, of) in [
                     ("colour", &(|p: &Pixel| p.colour.to_vec()) as &dyn Fn(&Pixel) -> Vec<f32>),
                     ("opacity", &|p| vec![p.opacity]),
                     ("depth", &|p| vec![p.depth]),
                     ("median depth", &|p| vec![p.median_depth]),
                 ] {
-                    let error = error(&all(&own, of), &all(&theirs, of));
+                    let error = error(&values_of(&own, of), &values_of(&theirs, of));
                     // A median may fall on the next sample.
                     let tolerance = if what == "median depth" { 5e-3 } else { 1e-4 };
                     assert!(error < tolerance, "{said}: {what} {error}");
                 }
             }
         }
+    }
+
+    fn is_finite(p: &Pixel) -> bool {
+        p.colour.iter().chain(&[p.opacity, p.depth, p.median_depth]).all(|x| x.is_finite())
     }
 
     /// What misses the box, runs along its faces, begins inside, has no length or isn't finite.
@@ -572,10 +578,7 @@ mod tests {
         for (i, (ours, theirs)) in
             field.render(&rays).iter().zip(judge.render(&rays).unwrap()).enumerate()
         {
-            let finite = |p: &Pixel| {
-                p.colour.iter().chain(&[p.opacity, p.depth, p.median_depth]).all(|x| x.is_finite())
-            };
-            assert!(finite(ours) && finite(&theirs), "{i}: {ours:?} {theirs:?}");
+            assert!(is_finite(ours) && is_finite(&theirs), "{i}: {ours:?} {theirs:?}");
             let close = ours.colour.iter().zip(&theirs.colour).all(|(a, b)| (a - b).abs() < 1e-4);
             assert!(close, "{i}: {ours:?} {theirs:?}");
         }

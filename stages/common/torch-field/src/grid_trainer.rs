@@ -1,6 +1,7 @@
 use std::ops::Range;
 use std::path::Path;
 
+use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
 use radiance::{Field, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
 use tch::{Device, TchError, Tensor, no_grad};
 
@@ -26,10 +27,6 @@ pub struct GridTrainer {
     samples_per_ray: f64,
 }
 
-/// Adam's constants in `radiance`: for a grid whose entries are seen now and then, the second
-/// moment forgets sooner.
-const BETA: [f64; 2] = [0.9, 0.99];
-const EPSILON: f64 = 1e-15;
 /// Places that are looked at together.
 const LOOKS: usize = 1 << 18;
 
@@ -328,12 +325,12 @@ fn lazy_adam(
     [mut first, mut second]: [Tensor; 2],
 ) -> Result<(), TchError> {
     let t = t.min(100_000) as i32;
-    let rate = rate * (1.0 - BETA[1].powi(t)).sqrt() / (1.0 - BETA[0].powi(t));
+    let rate = rate * (1.0 - ADAM_BETA[1].powi(t)).sqrt() / (1.0 - ADAM_BETA[0].powi(t));
     let touched = gradient.f_ne(0.0)?;
     let gradient = parameter.f_mul_scalar(f64::from(decay))?.f_add(gradient)?;
-    let first1 = gradient.f_lerp(&first, BETA[0])?;
-    let second1 = gradient.f_square()?.f_lerp(&second, BETA[1])?;
-    let by = first1.f_div(&second1.f_sqrt()?.f_add_scalar(EPSILON)?)?.f_mul_scalar(rate)?;
+    let first1 = gradient.f_lerp(&first, ADAM_BETA[0])?;
+    let second1 = gradient.f_square()?.f_lerp(&second, ADAM_BETA[1])?;
+    let by = first1.f_div(&second1.f_sqrt()?.f_add_scalar(ADAM_EPSILON)?)?.f_mul_scalar(rate)?;
     let moved = parameter.f_sub(&by)?.f_where_self(&touched, &parameter)?;
     parameter.f_copy_(&moved)?;
     let kept = first1.f_where_self(&touched, &first)?;
@@ -427,6 +424,11 @@ mod tests {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 40.0, space }
     }
 
+    /// The middle of the cube alone: looks are slow on a CPU.
+    fn is_in_the_middle(cell: usize) -> bool {
+        [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c))
+    }
+
     fn field(space: Space) -> Field {
         let architecture = Architecture {
             finest: 32,
@@ -436,12 +438,8 @@ mod tests {
             steps: 64,
             ..Architecture::default()
         };
-        // The middle of the cube alone: looks are slow on a CPU.
-        let middle = |cell: usize| {
-            [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c))
-        };
         let mut field = Field::new(architecture, bounds(space), 5);
-        field.limit_to((0..128 * 128 * 128).map(middle).collect());
+        field.limit_to((0..128 * 128 * 128).map(is_in_the_middle).collect());
         field
     }
 
@@ -515,24 +513,25 @@ mod tests {
         assert_eq!(judge.field().unwrap().parts().0, start.parts().0);
     }
 
+    fn run_until(mut judge: GridTrainer, steps: u64) -> GridTrainer {
+        while judge.steps() < steps
+            && judge.step(&mut Painted { seen: Vec::new() }).unwrap().is_some()
+        {}
+        judge
+    }
+
     /// What goes on from a checkpoint ends in the same numbers.
     #[test]
     fn a_checkpoint_holds_all() {
-        let run = |mut judge: GridTrainer, steps: u64| {
-            while judge.steps() < steps
-                && judge.step(&mut Painted { seen: Vec::new() }).unwrap().is_some()
-            {}
-            judge
-        };
         let new = || GridTrainer::new(&field(Space::Box), options(), Device::Cpu).unwrap();
         let path = tempfile::tempdir().unwrap().keep().join("checkpoint.safetensors");
         for at in [3, 33] {
-            run(new(), at).write_checkpoint(&path).unwrap();
+            run_until(new(), at).write_checkpoint(&path).unwrap();
             assert_eq!(GridTrainer::checkpoint_step(&path).unwrap(), at);
             let mut resumed = new();
             resumed.resume(&path).unwrap();
             let (through, on) =
-                (run(new(), 36).field().unwrap(), run(resumed, 36).field().unwrap());
+                (run_until(new(), 36).field().unwrap(), run_until(resumed, 36).field().unwrap());
             assert!(
                 through.parts().0 == on.parts().0 && through.parts().1 == on.parts().1,
                 "from step {at}"

@@ -2,6 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use counter_rng::CounterRng;
+use radiance::spec::UNSEEN;
 use radiance::{MlpArchitecture, Pixel, Ray, RayField, RenderError};
 use rayon::prelude::*;
 use scene::{Bounds, Space};
@@ -331,7 +332,7 @@ impl Mlp {
                 colour: three(&colour),
                 premultiplied: three(&premultiplied),
                 opacity: opacity.clamp(0.0, 1.0),
-                depth: if opacity > 1e-4 { distance / opacity } else { far },
+                depth: if opacity > UNSEEN { distance / opacity } else { far },
                 median_depth: median.map_or(far, |(_, &t)| t),
             }
         });

@@ -349,10 +349,8 @@ mod tests {
         }
     }
 
-    /// Whatever keeps a network from learning is told: nothing stops the light, or all of it is
-    /// stopped at once. A sound field goes on.
-    #[test]
-    fn collapses_are_told() {
+    /// How a training ends of which one network's raw densities are shifted, if not well.
+    fn collapse(network: fn(&Mlp) -> &MlpNetwork, shift: f64) -> Option<String> {
         let architecture = MlpArchitecture {
             depth: 5,
             width: 16,
@@ -375,23 +373,26 @@ mod tests {
             .iter()
             .position(|(name, ..)| name == "sigma")
             .unwrap();
-        // A training of which one network's raw densities are shifted.
-        let train = |network: fn(&Mlp) -> &MlpNetwork, shift: f64| {
-            let field = Mlp::new(architecture, bounds, 1, Device::Cpu).unwrap();
-            let _ = no_grad(|| {
-                network(&field).parameters[2 * raw_density + 1].shallow_clone().f_add_scalar_(shift)
-            })
-            .unwrap();
-            let mut trainer = MlpTrainer::new(field, options).unwrap();
-            loop {
-                match trainer.step(&mut Stripes) {
-                    Ok(Some(_)) => {}
-                    Ok(None) => return None,
-                    Err(error) => return Some(error.to_string()),
-                }
+        let field = Mlp::new(architecture, bounds, 1, Device::Cpu).unwrap();
+        let _ = no_grad(|| {
+            network(&field).parameters[2 * raw_density + 1].shallow_clone().f_add_scalar_(shift)
+        })
+        .unwrap();
+        let mut trainer = MlpTrainer::new(field, options).unwrap();
+        loop {
+            match trainer.step(&mut Stripes) {
+                Ok(Some(_)) => {}
+                Ok(None) => return None,
+                Err(error) => return Some(error.to_string()),
             }
-        };
-        assert_eq!(train(|f| &f.fine, 0.5), None);
+        }
+    }
+
+    /// Whatever keeps a network from learning is told: nothing stops the light, or all of it is
+    /// stopped at once. A sound field goes on.
+    #[test]
+    fn collapses_are_told() {
+        assert_eq!(collapse(|f| &f.fine, 0.5), None);
         for (network, shift, said) in [
             (
                 (|f| &f.coarse) as fn(&Mlp) -> &MlpNetwork,
@@ -404,7 +405,7 @@ mod tests {
                 "the fine network has collapsed: it sees a wall right before every camera",
             ),
         ] {
-            let error = train(network, shift).expect("a collapse");
+            let error = collapse(network, shift).expect("a collapse");
             assert!(error.contains("step 200") && error.contains(said), "{error}");
         }
     }

@@ -105,6 +105,11 @@ mod tests {
 
     use super::*;
 
+    fn view_of(bounds: &Bounds, ray: Ray, ndc: bool) -> [f64; 3] {
+        let maps = RayMaps::new(bounds, &[ray], Device::Cpu, ndc).unwrap();
+        [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
+    }
+
     /// In NDC a direction goes from the near to the far plane, as the reference computes it: d' =
     /// to - from with z from -1 to 1.
     #[test]
@@ -121,10 +126,6 @@ mod tests {
             direction: direction.as_vec3().to_array(),
             background: [1.0; 3],
         };
-        let view = |ndc: bool| {
-            let maps = RayMaps::new(&bounds, &[ray], Device::Cpu, ndc).unwrap();
-            [0, 1, 2].map(|i| maps.view.double_value(&[0, i]))
-        };
         // Shifted to the near plane, then as Mildenhall et al. 2020 have it, appendix C; f / (W /
         // 2) is 1 / 0.5, which our NDC, as wide as high, has for y, too.
         let start = origin + direction * ((-1.0 - origin.z) / direction.z);
@@ -134,10 +135,15 @@ mod tests {
         ];
         let expected = [-slope[0] / 0.5, -slope[1] / 0.5, 2.0];
         assert!(
-            view(true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5),
+            view_of(&bounds, ray, true).iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-5),
             "{:?} {expected:?}",
-            view(true)
+            view_of(&bounds, ray, true)
         );
-        assert!(view(false).iter().zip(direction.to_array()).all(|(a, b)| (a - b).abs() < 1e-6));
+        assert!(
+            view_of(&bounds, ray, false)
+                .iter()
+                .zip(direction.to_array())
+                .all(|(a, b)| (a - b).abs() < 1e-6)
+        );
     }
 }

@@ -108,18 +108,19 @@ impl Step {
 mod tests {
     use super::*;
 
+    fn three_at_most(range: Range<usize>) -> Result<Range<usize>, TchError> {
+        if range.len() > 3 {
+            Err(TchError::Torch("CUDA out of memory. Tried".to_owned()))
+        } else {
+            Ok(range)
+        }
+    }
+
     /// Memory that holds three bundles at most: nothing is lost, nothing done twice.
     #[test]
     fn pieces_get_smaller_until_they_fit() {
         let step = Step::new(&Tally::default(), 17, 4);
-        let run = |range: Range<usize>| {
-            if range.len() > 3 {
-                Err(TchError::Torch("CUDA out of memory. Tried".to_owned()))
-            } else {
-                Ok(range)
-            }
-        };
-        let pieces = step.in_pieces(run).unwrap();
+        let pieces = step.in_pieces(three_at_most).unwrap();
         assert!(pieces.iter().all(|p| p.len() <= 3) && pieces.len() < 10);
         assert_eq!(pieces.into_iter().flatten().collect::<Vec<_>>(), (0..17).collect::<Vec<_>>());
         let never = |_| -> Result<(), _> { Err(TchError::Torch("CUDA out of memory".to_owned())) };

@@ -44,10 +44,7 @@ impl Trainer {
         read_counters(path, |tensors, counters| {
             let field = &mut self.field;
             let averaged = tensors.names().contains(&"average.grid");
-            self.average = averaged.then(|| Moments {
-                grid: vec![0.0; field.grid.len()],
-                network: vec![0.0; field.network.len()],
-            });
+            self.average = averaged.then(|| Moments::zeros(field));
             if let Some(average) = &mut self.average {
                 read_f32(tensors, "average.grid", &mut average.grid)?;
                 read_f32(tensors, "average.network", &mut average.network)?;

@@ -3,11 +3,9 @@ use std::ops::Range;
 use super::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
-use crate::mlp::drain_lanes;
 use crate::occupancy::Strides;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
-use crate::simd::LANES;
 use crate::supervisor::Supervisor;
 
 /// What all shards of a step read.
@@ -37,7 +35,6 @@ pub(super) struct Shard {
 #[derive(Default)]
 pub(super) struct Worker {
     chunk: Chunk,
-    lanes: Vec<f32>,
     rays: Vec<Ray>,
     clipped: Vec<NormalizedRay>,
     offsets: Vec<f32>,
@@ -59,7 +56,6 @@ impl Shard {
         self.network.resize(work.field.network.len(), 0.0);
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
-        worker.lanes.resize(work.field.network.len() * LANES, 0.0);
         let chunk_bundles = (CHUNK_RAYS / work.supervision.rays_per_bundle()).max(1);
         let mut next = range.start;
         while next < range.end {
@@ -67,7 +63,6 @@ impl Shard {
             next = here.end;
             self.run_chunk(worker, work, here);
         }
-        drain_lanes(&mut worker.lanes, &mut self.network);
     }
 
     /// Takes a few bundles forward and back.
@@ -115,8 +110,7 @@ impl Shard {
             backgrounds: &worker.backgrounds,
             regularisers: options.regularisers.of_ray(scale, bundle),
         };
-        let mut network =
-            NetworkGradients { transposed: work.transposed, lanes: &mut worker.lanes };
+        let mut network = NetworkGradients { transposed: work.transposed, sums: &mut self.network };
         worker.chunk.backward(
             field,
             towards,
