@@ -77,7 +77,7 @@ fn schemas() -> BTreeMap<String, Value> {
         ("field", of::<radiance::FieldFile>()),
         ("training", of::<train_ss::TrainingLog>()),
         ("refiner", of::<refinement::RefinerFile>()),
-        ("metrics", of::<eval::Metrics>()),
+        ("metrics", of::<metrics::Metrics>()),
         ("results", of::<Vec<report::ResultRow>>()),
         ("export", of::<export::ExportSummary>()),
         ("degradation", of::<pixels::Degradation>()),
@@ -204,28 +204,30 @@ fn renames_lead_to_names_that_are_there() {
     }
 }
 
+fn read_json(path: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+}
+
+fn assert_fits(schema: &str, file: &Path) {
+    let folder = common::root().join("schemas");
+    let validator = jsonschema::validator_for(&read_json(&folder.join(schema))).unwrap();
+    let errors: Vec<String> =
+        validator.iter_errors(&read_json(file)).map(|e| e.to_string()).collect();
+    assert!(errors.is_empty(), "{}: {errors:?}", file.display());
+}
+
 /// What the stages write is what the schemas say.
 #[test]
 fn artifacts_fit_their_schemas() {
     let project = common::Project::tiny();
     project.ok(&["run"]);
-    let folder = common::root().join("schemas");
-    let check = |schema: &str, file: &Path| {
-        let read = |path: &Path| -> serde_json::Value {
-            serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
-        };
-        let validator = jsonschema::validator_for(&read(&folder.join(schema))).unwrap();
-        let errors: Vec<String> =
-            validator.iter_errors(&read(file)).map(|e| e.to_string()).collect();
-        assert!(errors.is_empty(), "{}: {errors:?}", file.display());
-    };
     let object = |stage: &str| project.artifact(stage, &[]);
     let (scene, field, views, metrics) =
         (object("prep"), object("train-ss"), object("render-depth"), object("eval"));
     for folder in [&scene, &field, &views, &metrics] {
-        check("artifact.json", &folder.join("artifact.json"));
+        assert_fits("artifact.json", &folder.join("artifact.json"));
     }
-    check("scene.json", &scene.join("scene.json"));
+    assert_fits("scene.json", &scene.join("scene.json"));
     for views in [
         scene.join("train"),
         scene.join("truth"),
@@ -233,15 +235,15 @@ fn artifacts_fit_their_schemas() {
         scene.join("references"),
         views,
     ] {
-        check("views.json", &views.join("views.json"));
+        assert_fits("views.json", &views.join("views.json"));
     }
-    check("field.json", &field.join("field.json"));
-    check("training.json", &field.join("training.json"));
-    check("metrics.json", &metrics.join("metrics.json"));
+    assert_fits("field.json", &field.join("field.json"));
+    assert_fits("training.json", &field.join("training.json"));
+    assert_fits("metrics.json", &metrics.join("metrics.json"));
     for action in std::fs::read_dir(project.path(".nerf-sr/actions")).unwrap() {
         let path = action.unwrap().path();
         if path.extension().is_some_and(|e| e == "json") {
-            check("action.json", &path);
+            assert_fits("action.json", &path);
         }
     }
 }

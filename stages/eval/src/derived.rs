@@ -1,25 +1,13 @@
 //! Figures over all views that another result is needed for.
 
+use ::metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};
 use artifact::{Failure, GivenInput};
 use scene::{Camera, Views};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 use crate::metric::value;
-use crate::{Metrics, ViewScores};
 
 /// Views count as near a reference within this angle between the optical axes, in degrees.
 const NEAR: f64 = 60.0;
-
-/// Scores of the views that look the way an HR reference does, within 60°.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct NearReferences {
-    /// Number of these views.
-    pub views: usize,
-    /// Their mean PSNR in dB.
-    pub psnr: f64,
-}
 
 /// What the view that fares worst gains over the same view of another result, in dB. Views without
 /// HR truth are left out.
@@ -27,7 +15,7 @@ pub(crate) fn least_gain(
     scored: &[ViewScores],
     baseline: &GivenInput,
 ) -> anyhow::Result<Option<f64>> {
-    let other: Metrics = baseline.read_json("metrics.json")?;
+    let other: Metrics = baseline.read_json(METRICS_FILE)?;
     let mut least: Option<f64> = None;
     for view in scored {
         let Some(before) = other.views.iter().find(|before| before.name == view.name) else {
@@ -72,10 +60,10 @@ fn cosine(one: &Camera, other: &Camera) -> f64 {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
+    use std::path::Path;
 
     use super::*;
-    use crate::Scores;
-    use crate::metric::Score;
+    use ::metrics::{Score, Scores};
     use scene::{Background, Bounds, Distortion, Intrinsics, View};
 
     fn scores(name: &str, psnr: Option<f64>) -> ViewScores {
@@ -87,23 +75,24 @@ mod tests {
         }
     }
 
+    fn camera(degrees: f64) -> Camera {
+        let (sine, cosine) = degrees.to_radians().sin_cos();
+        let pose = [[cosine, 0.0, sine, 0.0], [0.0, 1.0, 0.0, 0.0], [-sine, 0.0, cosine, 0.0]];
+        let intrinsics = Intrinsics {
+            width: 4,
+            height: 4,
+            fx: 4.0,
+            fy: 4.0,
+            cx: 2.0,
+            cy: 2.0,
+            distortion: Distortion::default(),
+        };
+        Camera { name: degrees.to_string(), intrinsics, camera_to_world: pose }
+    }
+
     /// Cameras that look along z, each turned about y by so many degrees.
     fn views(turns: &[f64]) -> Views {
-        let camera = |degrees: &f64| {
-            let (sine, cosine) = degrees.to_radians().sin_cos();
-            let pose = [[cosine, 0.0, sine, 0.0], [0.0, 1.0, 0.0, 0.0], [-sine, 0.0, cosine, 0.0]];
-            let intrinsics = Intrinsics {
-                width: 4,
-                height: 4,
-                fx: 4.0,
-                fy: 4.0,
-                cx: 2.0,
-                cy: 2.0,
-                distortion: Distortion::default(),
-            };
-            Camera { name: degrees.to_string(), intrinsics, camera_to_world: pose }
-        };
-        let view = |degrees: &f64| View::camera_only(camera(degrees));
+        let view = |degrees: &f64| View::camera_only(camera(*degrees));
         Views::new(Background::White, Bounds::default(), turns.iter().map(view).collect())
     }
 
@@ -122,27 +111,29 @@ mod tests {
         assert_eq!(near_references(&[scores("0", None)], &views(&[0.0]), &views(&[0.0])), None);
     }
 
+    fn baseline_of(folder: &Path, names: &[(&str, f64)]) -> GivenInput {
+        let views: Vec<ViewScores> =
+            names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
+        let metrics = Metrics {
+            conventions: BTreeMap::new(),
+            figures: Vec::new(),
+            mean: Scores::new(),
+            least_gain: None,
+            near_references: None,
+            views,
+        };
+        artifact::write_json(&folder.join(METRICS_FILE), &metrics).unwrap();
+        GivenInput::open("baseline", folder).unwrap()
+    }
+
     #[test]
     fn the_least_gain_is_the_worst_views() {
         let folder = tempfile::tempdir().unwrap();
-        let write = |names: &[(&str, f64)]| {
-            let views: Vec<ViewScores> =
-                names.iter().map(|(name, psnr)| scores(name, Some(*psnr))).collect();
-            let metrics = Metrics {
-                conventions: BTreeMap::new(),
-                figures: Vec::new(),
-                mean: Scores::new(),
-                least_gain: None,
-                near_references: None,
-                views,
-            };
-            artifact::write_json(&folder.path().join("metrics.json"), &metrics).unwrap();
-            GivenInput::open("baseline", folder.path()).unwrap()
-        };
         let now = [scores("a", Some(31.0)), scores("b", Some(29.5)), scores("c", None)];
-        let baseline = write(&[("a", 30.0), ("b", 30.0), ("c", 1.0)]);
+        let baseline = baseline_of(folder.path(), &[("a", 30.0), ("b", 30.0), ("c", 1.0)]);
         assert_eq!(least_gain(&now, &baseline).unwrap(), Some(-0.5));
-        let problem = least_gain(&now, &write(&[("a", 30.0)])).unwrap_err().to_string();
+        let problem =
+            least_gain(&now, &baseline_of(folder.path(), &[("a", 30.0)])).unwrap_err().to_string();
         assert!(problem.contains("input baseline: it has no view b"), "{problem}");
     }
 }

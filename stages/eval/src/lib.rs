@@ -8,7 +8,10 @@
 //!   HR truth exists, and this alone can be known.
 //! * [`depth_error`]: where the truth has depth. [`WarpScore`]: a view's neighbour, brought over by the
 //!   rendered depths, against the view.
-//! * [`NearReferences`] and the least gain: over all views.
+//! * `derived`: the scores near references and the least gain, over all views.
+//!
+//! The crate `metrics` has the types of `metrics.json`. A module here has this name, too, so paths
+//! into the crate begin with `::`.
 //!
 //! Means over views are means of per-view values. Open backgrounds are scored on white. Where a
 //! view has a mask, what doesn't count is taken as right, and PSNR is that of the rest.
@@ -20,6 +23,7 @@ mod scored_view;
 
 use std::collections::BTreeMap;
 
+use ::metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
 use contract::{Input, Output};
 use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, heat, write_png};
 use rayon::prelude::*;
@@ -28,14 +32,12 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
-pub use derived::NearReferences;
-use derived::{least_gain, near_references};
-pub use metric::{Figure, Score, Scores};
-use metric::{Metric, mean_of};
 #[cfg(feature = "torch")]
-pub use metrics::Lpips;
-pub use metrics::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
-use metrics::{Perceptual, metrics};
+pub use self::metrics::Lpips;
+pub use self::metrics::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
+use self::metrics::{Perceptual, metrics};
+use derived::{least_gain, near_references};
+use metric::{Metric, mean_of};
 use scored_view::{ScoredScene, ScoredView};
 
 /// Parameters of `eval`.
@@ -51,42 +53,6 @@ impl Default for Params {
     fn default() -> Self {
         Self { error_range: 0.25 }
     }
-}
-
-/// `metrics.json`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Metrics {
-    /// How the figures were made, in words, by metric; also what was behind the scene (`background`)
-    /// and what error maps show (`error_maps`).
-    pub conventions: BTreeMap<String, String>,
-    /// The figures, and how they are shown, the most important first.
-    pub figures: Vec<Figure>,
-    /// Means of the per-view values.
-    pub mean: Scores,
-    /// Gain in dB of the view that fares worst over input `baseline`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub least_gain: Option<f64>,
-    /// Scores of the views near an HR reference, where input `references` is given.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub near_references: Option<NearReferences>,
-    /// Every view.
-    pub views: Vec<ViewScores>,
-}
-
-/// One view's scores.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ViewScores {
-    /// The view.
-    pub name: String,
-    /// Its scores.
-    pub scores: Scores,
-    /// Its error map.
-    pub error_map: String,
-    /// Files of pictures that metrics made, by metric.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub pictures: BTreeMap<String, String>,
 }
 
 /// The stage.
@@ -158,7 +124,7 @@ impl Stage for Eval {
             near_references: near,
             views: scored,
         };
-        context.write_json("metrics.json", &found)?;
+        context.write_json(METRICS_FILE, &found)?;
         let words = metrics.iter().filter_map(|metric| metric.in_words(&found.mean));
         let views = artifact::counted(found.views.len(), "view");
         context.write_summary(&words.chain([views]).collect::<Vec<_>>().join(" · "))

@@ -1,8 +1,7 @@
 use std::collections::BTreeMap;
 
+use ::metrics::{Figure, Score, Scores};
 use pixels::Rgba8;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
@@ -23,55 +22,6 @@ pub(crate) trait Metric: Sync {
         None
     }
 }
-
-/// A figure of `metrics.json`, and how it is shown.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Figure {
-    /// Its place among the scores: keys from the outermost on, `/` between them.
-    pub path: String,
-    /// What it is called, with its unit.
-    pub label: String,
-    /// Digits after the point.
-    pub digits: usize,
-    /// Whether more of it is better.
-    pub higher_is_better: bool,
-    /// What stands where it is missing from views that have others; without it, only results that
-    /// have the figure show it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub missing: Option<String>,
-}
-
-impl Figure {
-    pub(crate) fn new(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Self {
-        Self {
-            path: path.to_owned(),
-            label: label.to_owned(),
-            digits,
-            higher_is_better,
-            missing: None,
-        }
-    }
-}
-
-/// A score: a number, or several that belong together.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(untagged)]
-pub enum Score {
-    /// One number.
-    One(f64),
-    /// Numbers by name.
-    Several(BTreeMap<String, f64>),
-}
-
-impl Score {
-    pub(crate) fn several<const N: usize>(parts: [(&str, f64); N]) -> Self {
-        Self::Several(parts.map(|(name, value)| (name.to_owned(), value)).into())
-    }
-}
-
-/// Scores of a view, or their means, by name.
-pub type Scores = BTreeMap<String, Score>;
 
 /// What a metric found of a view.
 #[derive(Default)]

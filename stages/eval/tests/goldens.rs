@@ -8,12 +8,13 @@ mod pattern;
 use eval::ssim;
 use pixels::Image;
 
+fn levels(width: usize, height: usize, seed: u32) -> Vec<f64> {
+    pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect()
+}
+
 /// f64 in the goldens, f32 in an image: the blend is rounded here, which costs about 1e-8.
 fn images(width: usize, height: usize, seed: u32) -> (Image, Image) {
-    let bytes = |seed| -> Vec<f64> {
-        pattern::pattern(width, height, 3, seed).iter().map(|&v| f64::from(v) / 255.0).collect()
-    };
-    let (a, other) = (bytes(seed), bytes(seed + 100));
+    let (a, other) = (levels(width, height, seed), levels(width, height, seed + 100));
     let b = a.iter().zip(&other).map(|(a, o)| (0.7 * a + 0.3 * o) as f32).collect();
     (
         Image::new(width, height, 3, a.iter().map(|&v| v as f32).collect()),

@@ -6,6 +6,7 @@ use serde_json::Value;
 use stage::Context;
 
 use crate::Params;
+use crate::figures::is_known;
 use crate::gather::Report;
 use crate::layers::{Group, Layer, layers, pixels_of};
 use crate::pictures::{Picture, Wanted, pictures};
@@ -227,11 +228,11 @@ impl Scales {
 /// Without HR truth, error maps show errors at LR.
 fn error_scale(row: &Row<'_>) -> Scale {
     let range = row.node.parameters.get("error_range").and_then(Value::as_f64);
-    Scale::error(range.unwrap_or(0.25), !row.metrics["mean"]["psnr"].is_number())
+    Scale::error(range.unwrap_or(0.25), !row.metrics.mean()["psnr"].is_number())
 }
 
 fn figures(report: &Report<'_>) -> Vec<FigureData> {
-    let known = report.figures.iter().filter(|figure| figure.is_known(&report.rows));
+    let known = report.figures.iter().filter(|figure| is_known(figure, &report.rows));
     known
         .map(|figure| FigureData {
             label: figure.label.clone(),
@@ -242,7 +243,7 @@ fn figures(report: &Report<'_>) -> Vec<FigureData> {
 }
 
 fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
-    let known = || report.figures.iter().filter(|figure| figure.is_known(&report.rows));
+    let known = || report.figures.iter().filter(|figure| is_known(figure, &report.rows));
     let views = report.scenes.iter().enumerate();
     let views = views.flat_map(|(scene, views)| views.views.iter().map(move |name| (scene, name)));
     let scores = views.map(|(scene, name)| {
@@ -255,7 +256,7 @@ fn row_data(report: &Report<'_>, row: &Row<'_>) -> RowData {
         training: row.training,
         rendering: row.rendering,
         axes: row.node.values.clone(),
-        mean: known().map(|figure| figure.mean(row)).collect(),
+        mean: known().map(|figure| row.mean(figure)).collect(),
         scores: scores.collect(),
     }
 }

@@ -1,8 +1,8 @@
 use artifact::{RunNode, RunRecord};
-use serde_json::Value;
+use metrics::{AnyMetrics, Figure};
 
-use crate::figures::{Figure, figures};
-use crate::results::{metrics, scored};
+use crate::figures::figures;
+use crate::results::scored;
 use crate::row::Row;
 
 /// What a page shows of a run.
@@ -31,9 +31,9 @@ impl<'a> Report<'a> {
         let mut report =
             Self { run, rows: vec![], scenes: vec![], figures: vec![], unread: vec![] };
         for (index, node) in scored(run) {
-            match metrics(node) {
+            match AnyMetrics::read(&node.folder) {
                 Ok(metrics) => report.add(index, node, metrics),
-                Err(error) => report.unread.push(format!("{error:#}")),
+                Err(error) => report.unread.push(error.to_string()),
             }
         }
         report.figures = figures(&report.rows);
@@ -41,7 +41,7 @@ impl<'a> Report<'a> {
         report
     }
 
-    fn add(&mut self, index: usize, node: &'a RunNode, metrics: Value) {
+    fn add(&mut self, index: usize, node: &'a RunNode, metrics: AnyMetrics) {
         let data_set = data_set(self.run, index);
         let scene = self.scenes.iter().position(|scene| scene.data_set == data_set);
         let scene = scene.unwrap_or_else(|| {
@@ -80,7 +80,7 @@ impl<'a> Report<'a> {
     /// The row that is best by the first figure; the first one without figures.
     pub(crate) fn best(&self) -> Option<&Row<'a>> {
         let by = self.figures.first();
-        let value = |row: &Row<'_>| by.and_then(|figure| figure.mean(row));
+        let value = |row: &Row<'_>| by.and_then(|figure| row.mean(figure));
         let lower_is_better = by.and_then(|f| f.higher_is_better) == Some(false);
         let is_better = |a: f64, b: f64| if lower_is_better { a < b } else { a > b };
         self.rows.iter().reduce(|best, row| match (value(best), value(row)) {
@@ -91,21 +91,8 @@ impl<'a> Report<'a> {
     }
 }
 
-impl Row<'_> {
-    /// The scores of a view.
-    pub(crate) fn view(&self, name: &str) -> Option<&Value> {
-        self.metrics["views"].as_array()?.iter().find(|view| view["name"] == name)
-    }
-
-    /// Number of views.
-    pub(crate) fn view_count(&self) -> usize {
-        self.metrics["views"].as_array().map_or(0, Vec::len)
-    }
-}
-
-fn view_names(metrics: &Value) -> Vec<String> {
-    let views = metrics["views"].as_array().into_iter().flatten();
-    views.filter_map(|view| view["name"].as_str().map(str::to_owned)).collect()
+fn view_names(metrics: &AnyMetrics) -> Vec<String> {
+    metrics.views().iter().filter_map(|view| view["name"].as_str().map(str::to_owned)).collect()
 }
 
 /// The data set that a node was made of.

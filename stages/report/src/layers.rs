@@ -198,8 +198,8 @@ fn of_method<'a>(report: &Report<'_>, index: usize, group: Group, source: Source
 }
 
 fn names_files(row: &Row<'_>, pointer: &str) -> bool {
-    let views = row.metrics["views"].as_array();
-    views.into_iter().flatten().any(|view| view.pointer(pointer).is_some_and(Value::is_string))
+    let mut views = row.metrics.views().iter();
+    views.any(|view| view.pointer(pointer).is_some_and(Value::is_string))
 }
 
 fn folder_of(report: &Report<'_>, row: &Row<'_>, input: &str) -> Option<PathBuf> {

@@ -1,8 +1,8 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use anyhow::Context as _;
 use artifact::{RunNode, RunRecord, warnings_of};
+use metrics::AnyMetrics;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -38,13 +38,6 @@ pub struct StageResult {
     pub folder: PathBuf,
 }
 
-/// A `metrics` node's file.
-pub(crate) fn metrics(node: &RunNode) -> anyhow::Result<Value> {
-    let path = node.folder.join("metrics.json");
-    let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
-    serde_json::from_slice(&bytes).with_context(|| path.display().to_string())
-}
-
 /// What each node's stage warned of in its summary, with the node's name, in the order of the run.
 pub(crate) fn warnings_by_node(run: &RunRecord) -> Vec<(String, String)> {
     run.nodes.iter().flat_map(warnings_of_node).collect()
@@ -72,7 +65,7 @@ pub(crate) fn scored(run: &RunRecord) -> Vec<(usize, &RunNode)> {
 pub(crate) fn results(run: &RunRecord) -> Vec<ResultRow> {
     let rows = scored(run).into_iter().map(|(index, node)| {
         // The page says why scores can't be read; here they are null.
-        let metrics = metrics(node).unwrap_or_default();
+        let metrics = AnyMetrics::read(&node.folder).unwrap_or_default();
         let stages = run.ancestors(index).into_iter().chain([index]).map(|i| {
             let node = &run.nodes[i];
             let (seconds, threads) = (node.seconds, node.threads);
@@ -87,8 +80,8 @@ pub(crate) fn results(run: &RunRecord) -> Vec<ResultRow> {
         ResultRow {
             stage: node.stage.clone(),
             point: node.point.clone(),
-            mean: metrics["mean"].clone(),
-            views: metrics["views"].as_array().map_or(0, Vec::len),
+            mean: metrics.mean().clone(),
+            views: metrics.views().len(),
             stages: stages.collect(),
         }
     });
@@ -98,32 +91,33 @@ pub(crate) fn results(run: &RunRecord) -> Vec<ResultRow> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::Path;
+
+    fn node(work: &Path, stage: &str, point: &str, summary: Option<&str>) -> RunNode {
+        let folder = work.join(stage);
+        std::fs::create_dir(&folder).unwrap();
+        summary.iter().for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
+        let node = serde_json::json!({
+            "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "",
+            "folder": folder, "parameters": {},
+            "inputs": {}, "started_unix": 0, "seconds": 0.0, "threads": 1
+        });
+        serde_json::from_value(node).unwrap()
+    }
 
     #[test]
     fn warnings_stand_in_summaries() {
         let folder = tempfile::tempdir().unwrap();
-        let node = |stage: &str, point: &str, summary: Option<&str>| {
-            let folder = folder.path().join(stage);
-            std::fs::create_dir(&folder).unwrap();
-            summary
-                .iter()
-                .for_each(|text| std::fs::write(folder.join(SUMMARY_FILE), text).unwrap());
-            let node = serde_json::json!({
-                "stage": stage, "point": point, "kind": "cameras", "key": "", "output": "",
-                "folder": folder, "parameters": {},
-                "inputs": {}, "started_unix": 0, "seconds": 0.0, "threads": 1
-            });
-            serde_json::from_value(node).unwrap()
-        };
         let nodes = vec![
             node(
+                folder.path(),
                 "register",
                 "seed=1",
                 Some("2 of 2 cameras registered\nwarning: cameras have turned far\n"),
             ),
-            node("prep", "", Some("8 training views\n")),
-            node("train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
-            node("script", "", None),
+            node(folder.path(), "prep", "", Some("8 training views\n")),
+            node(folder.path(), "train-ss", "", Some("9 rays\nwarning: one\nwarning: two\n")),
+            node(folder.path(), "script", "", None),
         ];
         let found = warnings_by_node(&RunRecord { nodes, ..RunRecord::default() });
         let expected = [

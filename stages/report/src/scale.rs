@@ -73,11 +73,12 @@ fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
 mod tests {
     use super::*;
 
+    fn texts(scale: &Scale) -> Vec<String> {
+        scale.ticks.iter().map(|(_, text)| text.clone()).collect()
+    }
+
     #[test]
     fn scales_have_round_numbers() {
-        let texts = |scale: &Scale| -> Vec<String> {
-            scale.ticks.iter().map(|(_, text)| text.clone()).collect()
-        };
         let error = Scale::error(0.25, false);
         assert_eq!(texts(&error), ["0.00", "0.05", "0.10", "0.15", "0.20", "≥ 0.25"]);
         assert_eq!((error.ticks[0].0, error.ticks[5].0), (0.0, 1.0));

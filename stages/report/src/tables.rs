@@ -1,7 +1,8 @@
 use maud::{Markup, html};
+use metrics::Figure;
 use stage_call::seconds;
 
-use crate::figures::Figure;
+use crate::figures::{is_best, is_known};
 use crate::gather::Report;
 use crate::row::Row;
 
@@ -15,7 +16,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
     let Some(best) = report.best() else {
         return html! { p class="note" { "There are no scores." } };
     };
-    let known = report.figures.iter().filter_map(|figure| Some((figure, figure.mean(best)?)));
+    let known = report.figures.iter().filter_map(|figure| Some((figure, best.mean(figure)?)));
     html! {
         section class="summary" aria-label="Summary" {
             @if report.rows.len() > 1 {
@@ -45,7 +46,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
     if rows.is_empty() {
         return html! {};
     }
-    let known: Vec<&Figure> = report.figures.iter().filter(|f| f.is_known(rows)).collect();
+    let known: Vec<&Figure> = report.figures.iter().filter(|f| is_known(f, rows)).collect();
     let with_data_sets = report.scenes.len() > 1;
     html! {
         section id="scores" aria-labelledby="scores-heading" {
@@ -87,14 +88,14 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
 
 /// A cell of that table.
 fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
-    let Some(value) = figure.mean(row) else {
+    let Some(value) = row.mean(figure) else {
         // Without HR truth no weights would help.
-        let has_truth = row.metrics["mean"]["psnr"].is_number();
+        let has_truth = row.metrics.mean()["psnr"].is_number();
         let missing = figure.missing.as_deref().filter(|_| has_truth);
         return html! { td class="n" { (missing.unwrap_or("–")) } };
     };
     html! {
-        @if figure.is_best(row, rows) {
+        @if is_best(figure, row, rows) {
             td class="n best" {
                 span class="star" aria-label="best" role="img" { "★" } " " (figure.text(value))
             }
@@ -106,8 +107,8 @@ fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
 
 /// Figures that no result has, and why.
 fn missing(report: &Report<'_>) -> Markup {
-    let has_truth = report.rows.iter().any(|row| row.metrics["mean"]["psnr"].is_number());
-    let unknown = report.figures.iter().filter(|figure| !figure.is_known(&report.rows));
+    let has_truth = report.rows.iter().any(|row| row.metrics.mean()["psnr"].is_number());
+    let unknown = report.figures.iter().filter(|figure| !is_known(figure, &report.rows));
     let unknown: Vec<_> = unknown.filter_map(|f| Some((f, f.missing.as_ref()?))).collect();
     html! {
         @if has_truth && !unknown.is_empty() {
@@ -126,7 +127,7 @@ fn missing(report: &Report<'_>) -> Markup {
 /// Every view's figures, for reading without a pointer or a script.
 pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
     let known: Vec<&Figure> =
-        report.figures.iter().filter(|figure| figure.is_known(&report.rows)).collect();
+        report.figures.iter().filter(|figure| is_known(figure, &report.rows)).collect();
     let views: usize = report.rows.iter().map(Row::view_count).sum();
     if views == 0 || views * known.len() > MAX_CELLS {
         return html! {};
@@ -145,7 +146,7 @@ pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
                     }
                     tbody {
                         @for row in &report.rows {
-                            @for view in row.metrics["views"].as_array().into_iter().flatten() {
+                            @for view in row.metrics.views() {
                                 tr {
                                     th scope="row" { (view["name"].as_str().unwrap_or_default()) }
                                     @if report.rows.len() > 1 { td { (row.label) } }
@@ -167,7 +168,7 @@ pub(crate) fn numbers_of_views(report: &Report<'_>) -> Markup {
 /// How figures were made, in the metrics' own words.
 pub(crate) fn conventions(report: &Report<'_>) -> Markup {
     let Some(row) = report.rows.first() else { return html! {} };
-    let said = row.metrics["conventions"].as_object();
+    let said = row.metrics.conventions().as_object();
     html! {
         @if let Some(said) = said {
             details class="more" {

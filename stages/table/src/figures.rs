@@ -2,18 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::Deserialize;
-use serde_json::Value;
-
-/// A figure of `metrics.json`, and how its metric says that it is shown.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-struct Figure {
-    /// Its place among the scores: keys from the outermost on, `/` between them.
-    path: String,
-    label: String,
-    digits: usize,
-    higher_is_better: bool,
-}
+use metrics::{AnyMetrics, Figure};
 
 /// Figures by their names in rows: their paths with `.` between keys.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -32,17 +21,18 @@ const ADDED: [(&str, &str, usize, bool); 8] = [
 ];
 
 impl Figures {
-    /// Takes those of a `metrics.json`; none where it says nothing of figures.
-    pub(crate) fn add(&mut self, metrics: &Value) {
-        let said: Vec<Figure> =
-            serde_json::from_value(metrics["figures"].clone()).unwrap_or_default();
+    /// Takes those of a `metrics.json`; none where it says nothing of figures, or leaves out which
+    /// way one of them is better.
+    pub(crate) fn add(&mut self, metrics: &AnyMetrics) {
+        let is_whole = |said: &Vec<Figure>| said.iter().all(|f| f.higher_is_better.is_some());
+        let said = metrics.figures().filter(is_whole).unwrap_or_default();
         self.0.extend(said.into_iter().map(|figure| (figure.path.replace('/', "."), figure)));
     }
 
     /// Whether less of it is better.
     pub(crate) fn is_less_better(&self, name: &str) -> bool {
         match self.0.get(name) {
-            Some(figure) => !figure.higher_is_better,
+            Some(figure) => figure.higher_is_better == Some(false),
             None => !added(name).is_some_and(|(.., higher)| higher),
         }
     }
@@ -50,7 +40,7 @@ impl Figures {
     /// A value as people read it.
     pub(crate) fn shown(&self, name: &str, value: f64) -> String {
         if let Some(figure) = self.0.get(name) {
-            return format!("{value:.*}", figure.digits);
+            return figure.text(value);
         }
         match (name, added(name)) {
             ("rays_per_s", _) => format!("{:.0} k", value / 1e3),
@@ -101,10 +91,10 @@ mod tests {
     #[test]
     fn a_new_metric_says_how_it_is_shown() {
         let mut figures = Figures::default();
-        figures.add(&json!({"figures": [
+        figures.add(&AnyMetrics::from(json!({"figures": [
             {"path": "sharpness/mean", "label": "sharpness ↑", "digits": 1, "higher_is_better": true},
             {"path": "blur", "label": "blur ↓", "digits": 3, "higher_is_better": false},
-        ]}));
+        ]})));
         assert_eq!(figures.titles(&[&"sharpness.mean".to_owned()]), ["sharpness"]);
         assert_eq!(figures.shown("sharpness.mean", 2.34), "2.3");
         assert!(!figures.is_less_better("sharpness.mean") && figures.is_less_better("blur"));

@@ -2,34 +2,38 @@
 
 use super::*;
 use crate::{Gain, Group};
-use serde_json::json;
+use metrics::AnyMetrics;
+use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
 /// As `metrics.json` describes them.
 fn figures() -> Figures {
     let figure = |path: &str, label: &str, digits: usize, higher: bool| json!({"path": path, "label": label, "digits": digits, "higher_is_better": higher});
     let mut figures = Figures::default();
-    figures.add(&json!({"figures": [
+    figures.add(&AnyMetrics::from(json!({"figures": [
         figure("psnr", "PSNR", 2, true),
         figure("ssim", "SSIM", 4, true),
         figure("lpips", "LPIPS", 4, false),
-    ]}));
+    ]})));
     figures
 }
 
+fn row(
+    scene: &str,
+    variant: &str,
+    protocol: &str,
+    psnr: f64,
+    lpips: Option<f64>,
+    train_s: f64,
+) -> Row {
+    let mut row = json!({"scene": scene, "variant": variant, "protocol": protocol,
+        "method": "eval", "psnr": psnr, "train_s": train_s,
+        "commit": "abc1234", "machine": "2 cores"});
+    lpips.iter().for_each(|value| row["lpips"] = json!(value));
+    row.as_object().cloned().unwrap()
+}
+
 fn rows() -> Vec<Row> {
-    let row = |scene: &str,
-               variant: &str,
-               protocol: &str,
-               psnr: f64,
-               lpips: Option<f64>,
-               train_s: f64| {
-        let mut row = json!({"scene": scene, "variant": variant, "protocol": protocol,
-            "method": "eval", "psnr": psnr, "train_s": train_s,
-            "commit": "abc1234", "machine": "2 cores"});
-        lpips.iter().for_each(|value| row["lpips"] = json!(value));
-        row.as_object().cloned().unwrap()
-    };
     vec![
         row("lego", "as it is", "100x2", 30.0, Some(0.05), 100.0),
         row("chair", "as it is", "100x2", 32.0, Some(0.04), 140.0),
@@ -123,26 +127,27 @@ fn params(text: serde_json::Value) -> Params {
     serde_json::from_value(text).unwrap()
 }
 
+fn method_row(method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64) -> Value {
+    let places = json!({"commit": "abc1234", "machine": "vm"});
+    let mut row = json!({"method": method, "has seen": seen, "scene": scene,
+        "protocol": protocol, "psnr": psnr});
+    row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
+    row
+}
+
 /// Rows of two methods in two groups at two protocols, as `rows` makes them.
 fn methods() -> Vec<Row> {
-    let row = |method: &str, seen: &str, scene: &str, protocol: &str, psnr: f64| {
-        let places = json!({"commit": "abc1234", "machine": "vm"});
-        let mut row = json!({"method": method, "has seen": seen, "scene": scene,
-            "protocol": protocol, "psnr": psnr});
-        row.as_object_mut().unwrap().extend(places.as_object().cloned().unwrap());
-        row
-    };
     let missing = json!({"method": "liif", "has seen": "HR", "scene": "lego", "protocol": "100x2",
         "missing": "no liif"});
     let rows = [
-        row("nerf", "LR", "lego", "100x2", 30.0),
-        row("nerf", "LR", "chair", "100x2", 32.0),
-        row("nerf", "LR", "lego", "100x4", 28.0),
-        row("ss", "LR", "lego", "100x2", 31.0),
-        row("ss", "LR", "chair", "100x2", 33.5),
-        row("ss", "LR", "lego", "100x4", 27.0),
+        method_row("nerf", "LR", "lego", "100x2", 30.0),
+        method_row("nerf", "LR", "chair", "100x2", 32.0),
+        method_row("nerf", "LR", "lego", "100x4", 28.0),
+        method_row("ss", "LR", "lego", "100x2", 31.0),
+        method_row("ss", "LR", "chair", "100x2", 33.5),
+        method_row("ss", "LR", "lego", "100x4", 27.0),
         missing,
-        row("hr", "HR", "lego", "100x2", 35.0),
+        method_row("hr", "HR", "lego", "100x2", 35.0),
     ];
     rows.map(|row| row.as_object().cloned().unwrap()).into()
 }
@@ -227,15 +232,16 @@ Means over lego, chair:
     );
 }
 
+fn node(stage: &str) -> Value {
+    json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true,
+        "kind": "other", "key": "",
+        "output": "", "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0,
+        "seconds": 1.0, "threads": 1, "host": "vm"})
+}
+
 /// Methods stand in the order of their groups, and what was left out in its place.
 #[test]
 fn rows_follow_the_groups() {
-    let node = |stage: &str| {
-        json!({"stage": stage, "point": "", "values": {"protocol": "100x2"}, "is_shown": true,
-            "kind": "other", "key": "",
-            "output": "", "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0,
-            "seconds": 1.0, "threads": 1, "host": "vm"})
-    };
     let left_out = json!({"stage": "eval-liif", "point": "", "values": {"protocol": "100x2"},
         "reason": "no liif"});
     let failed = json!({"stage": "eval-nerf", "point": ""});

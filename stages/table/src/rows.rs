@@ -3,6 +3,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
+use metrics::AnyMetrics;
 use serde_json::{Map, Value, json};
 
 use crate::Params;
@@ -106,18 +107,18 @@ fn scores(node: &RunNode, figures: &mut Figures) -> anyhow::Result<Row> {
     if node.kind != "metrics" {
         return Ok(found);
     }
-    let file = read(&node.folder.join("metrics.json"))?;
+    let file = AnyMetrics::read(&node.folder)?;
     figures.add(&file);
-    numbers("", &file["mean"], &mut found);
-    let near = &file["near_references"];
+    numbers("", file.mean(), &mut found);
+    let near = file.near_references();
     for (name, value) in [
-        ("least_gain", &file["least_gain"]),
+        ("least_gain", file.least_gain()),
         ("near_psnr", &near["psnr"]),
         ("near_views", &near["views"]),
     ] {
         numbers(name, value, &mut found);
     }
-    found.insert("views".to_owned(), json!(file["views"].as_array().map_or(0, Vec::len)));
+    found.insert("views".to_owned(), json!(file.views().len()));
     Ok(found)
 }
 

@@ -1,8 +1,9 @@
+use ::metrics::{Figure, Score, Scores};
 use anyhow::Context as _;
 use artifact::FailureExt as _;
 use pixels::{ExrImage, read_exr};
 
-use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 /// How far depth is off, in scene units.
@@ -89,13 +90,16 @@ impl Metric for DepthMetric {
 mod tests {
     use super::*;
 
-    #[test]
-    fn only_surfaces_count() {
-        let image = |z: [f32; 4], a: [f32; 4]| ExrImage {
+    fn image(z: [f32; 4], a: [f32; 4]) -> ExrImage {
+        ExrImage {
             width: 2,
             height: 2,
             channels: vec![("A".into(), a.to_vec()), ("Z".into(), z.to_vec())],
-        };
+        }
+    }
+
+    #[test]
+    fn only_surfaces_count() {
         let truth = image([4.0, 5.0, 3.0, 0.0], [1.0, 1.0, 1.0, 0.0]);
         let error =
             depth_error(&image([4.5, 5.0, 3.1, 9.0], [1.0, 0.2, 1.0, 1.0]), &truth).unwrap();

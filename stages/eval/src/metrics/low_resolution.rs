@@ -1,4 +1,6 @@
-use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use ::metrics::{Figure, Score, Scores};
+
+use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 use super::psnr::masked_psnr;

@@ -1,10 +1,11 @@
+use ::metrics::{Figure, Score, Scores};
 use artifact::{Failure, GivenInput};
 use pixels::Image;
 
 #[cfg(feature = "torch")]
 use super::lpips::Lpips;
 use super::lpips_network::LpipsNetwork;
-use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 /// LPIPS by every network whose weights are given.

@@ -1,6 +1,7 @@
+use ::metrics::{Figure, Score, Scores};
 use pixels::{Image, psnr_of};
 
-use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 /// Peak signal-to-noise ratio in dB, peak 1, of the mean squared error over all samples. Predictions

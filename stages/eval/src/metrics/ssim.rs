@@ -1,6 +1,7 @@
+use ::metrics::{Figure, Score, Scores};
 use pixels::Image;
 
-use crate::metric::{Figure, Measured, Metric, Score, Scores, value};
+use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};
 
 /// Mean structural similarity, by what the window does at the border.

@@ -1,8 +1,9 @@
+use ::metrics::{Figure, Score};
 use artifact::{FailureExt as _, GivenInput};
 use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
-use crate::metric::{Figure, Measured, Metric, Score};
+use crate::metric::{Measured, Metric};
 use crate::scored_view::{ScoredScene, ScoredView, read_image};
 
 /// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
@@ -137,22 +138,24 @@ mod tests {
         ExrImage { width: 40, height: 4, channels }
     }
 
+    fn wall(shift: usize) -> Image {
+        let level = |i: usize| ((i % 40 + shift) as f32 * 0.7).sin() * 0.4 + 0.5;
+        Image::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
+    }
+
+    fn walls_warped(depth: f32) -> (WarpScore, Rgba8) {
+        let (a, b) = (camera("a", 0.0), camera("b", 0.1));
+        warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap()
+    }
+
     /// A step of a tenth to the side before a wall at distance 2 moves its image by two pixels.
     #[test]
     fn right_depth_agrees_and_wrong_depth_does_not() {
-        let wall = |shift: usize| {
-            let level = |i: usize| ((i % 40 + shift) as f32 * 0.7).sin() * 0.4 + 0.5;
-            Image::new(40, 4, 3, (0..160).flat_map(|i| [level(i); 3]).collect())
-        };
-        let (a, b) = (camera("a", 0.0), camera("b", 0.1));
-        let score = |depth: f32| {
-            warp((&a, &image(depth), &wall(0)), (&b, &image(depth), &wall(2))).unwrap()
-        };
-        let (right, shown) = score(2.0);
+        let (right, shown) = walls_warped(2.0);
         assert!(right.psnr > 60.0 && (right.seen - 0.95).abs() < 0.03, "{right:?}");
         // What lies left of the neighbour's shown isn't seen.
         assert_eq!(shown.data[..3], [120, 20, 30]);
-        let (wrong, _) = score(3.0);
+        let (wrong, _) = walls_warped(3.0);
         assert!(wrong.psnr < 25.0, "{wrong:?}");
     }
 
