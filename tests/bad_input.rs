@@ -47,6 +47,18 @@ fn edit(file: &Path, from: &str, to: &str) {
     std::fs::write(file, text.replacen(from, to, 1)).unwrap();
 }
 
+fn first_number(d: &Path) -> String {
+    let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
+    let at = text.find("\"transform_matrix\"").unwrap();
+    let rest = &text[at..];
+    rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..]
+        .split(',')
+        .next()
+        .unwrap()
+        .trim()
+        .to_owned()
+}
+
 #[test]
 fn datasets_that_cannot_be_used() {
     refused(
@@ -76,17 +88,6 @@ fn datasets_that_cannot_be_used() {
         3,
         &["frame r_1", "train/r_1.png", "not a whole image"],
     );
-    let first_number = |d: &Path| {
-        let text = std::fs::read_to_string(d.join("transforms_train.json")).unwrap();
-        let at = text.find("\"transform_matrix\"").unwrap();
-        let rest = &text[at..];
-        rest[rest.find(|c: char| c.is_ascii_digit() || c == '-').unwrap()..]
-            .split(',')
-            .next()
-            .unwrap()
-            .trim()
-            .to_owned()
-    };
     refused(
         |_, d| edit(&d.join("transforms_train.json"), &first_number(d), "NaN"),
         &[],

@@ -62,24 +62,30 @@ fn a_checkpoint_of_the_reference_is_rendered() {
     assert_eq!(views.join("images").read_dir().unwrap().count(), 1);
 }
 
+fn assert_no_checkpoint(fine: &Path, out: &Path, coarse: &Path, words: &[&str]) {
+    let said = convert(coarse, fine, out);
+    said.fails(1, words);
+    assert_eq!(said.stderr.lines().count(), 1, "{}", said.stderr);
+    assert!(!out.exists());
+}
+
 #[test]
 fn what_is_no_checkpoint_is_one_line() {
     let project = Project::tiny();
     let [coarse, fine] = ["tests/data/7_net_Coarse.pth", "tests/data/7_net_Fine.pth"].map(here);
     let out = project.path("out");
-    let fails = |coarse: &Path, words: &[&str]| {
-        let said = convert(coarse, &fine, &out);
-        said.fails(1, words);
-        assert_eq!(said.stderr.lines().count(), 1, "{}", said.stderr);
-        assert!(!out.exists());
-    };
-    fails(&project.path("nowhere.pth"), &["nowhere.pth", "No such file"]);
-    fails(&here("Cargo.toml"), &["Cargo.toml", "not a checkpoint"]);
+    assert_no_checkpoint(
+        &fine,
+        &out,
+        &project.path("nowhere.pth"),
+        &["nowhere.pth", "No such file"],
+    );
+    assert_no_checkpoint(&fine, &out, &here("Cargo.toml"), &["Cargo.toml", "not a checkpoint"]);
     let bytes = std::fs::read(&coarse).unwrap();
     let cut = project.path("cut.pth");
     for length in [0, 1, bytes.len() / 3, bytes.len() - 1] {
         std::fs::write(&cut, &bytes[..length]).unwrap();
-        fails(&cut, &["cut.pth", "not a"]);
+        assert_no_checkpoint(&fine, &out, &cut, &["cut.pth", "not a"]);
     }
     // A pickle that would run something.
     let hostile = project.path("hostile.pth");
@@ -88,8 +94,21 @@ fn what_is_no_checkpoint_is_one_line() {
                  + '.ran',)\n\
                  zipfile.ZipFile(sys.argv[1], 'w').writestr('x/data.pkl', pickle.dumps(Run()))\n";
     assert!(Command::new("python3").args(["-c", write]).arg(&hostile).status().unwrap().success());
-    fails(&hostile, &["hostile.pth", "system"]);
+    assert_no_checkpoint(&fine, &out, &hostile, &["hostile.pth", "system"]);
     assert!(!hostile.with_extension("pth.ran").exists());
+}
+
+fn convert_weights(network: &str, from: &str, out: &Path) -> Finished {
+    let script = here("scripts/convert-weights.py");
+    Finished::of(
+        Command::new("python3").arg(script).arg(network).arg(here(from)).arg(out).output().unwrap(),
+    )
+}
+
+fn assert_no_weights(out: &Path, network: &str, from: &str, words: &[&str]) {
+    let said = convert_weights(network, from, out);
+    said.fails(1, words);
+    assert!(said.stderr.lines().count() == 1 && !out.exists(), "{}", said.stderr);
 }
 
 /// Weights as their projects release them become files that hold the same tensors; those of another
@@ -97,21 +116,9 @@ fn what_is_no_checkpoint_is_one_line() {
 #[test]
 fn released_weights_become_what_upsample_reads() {
     let project = Project::tiny();
-    let convert = |network: &str, from: &str, out: &Path| {
-        let script = here("scripts/convert-weights.py");
-        Finished::of(
-            Command::new("python3")
-                .arg(script)
-                .arg(network)
-                .arg(here(from))
-                .arg(out)
-                .output()
-                .unwrap(),
-        )
-    };
     for (network, golden) in [("imdn", "imdn"), ("liif", "liif"), ("swinir", "swinir_light")] {
         let out = project.path(&format!("{network}.safetensors"));
-        let done = convert(network, &format!("tests/data/{network}.pth"), &out);
+        let done = convert_weights(network, &format!("tests/data/{network}.pth"), &out);
         assert_eq!(done.code, 0, "{}", done.stderr);
         let expected =
             std::fs::read(here(&format!("stages/upsample/tests/goldens/{golden}.safetensors")))
@@ -127,12 +134,12 @@ fn released_weights_become_what_upsample_reads() {
         }
     }
     let out = project.path("none.safetensors");
-    let fails = |network: &str, from: &str, words: &[&str]| {
-        let said = convert(network, from, &out);
-        said.fails(1, words);
-        assert!(said.stderr.lines().count() == 1 && !out.exists(), "{}", said.stderr);
-    };
-    fails("imdn", "tests/data/liif.pth", &["liif.pth", "fea_conv.weight is missing", "imdn"]);
-    fails("swinir", "tests/data/imdn.pth", &["conv_first.weight is missing"]);
-    fails("liif", "Cargo.toml", &["Cargo.toml", "not a checkpoint"]);
+    assert_no_weights(
+        &out,
+        "imdn",
+        "tests/data/liif.pth",
+        &["liif.pth", "fea_conv.weight is missing", "imdn"],
+    );
+    assert_no_weights(&out, "swinir", "tests/data/imdn.pth", &["conv_first.weight is missing"]);
+    assert_no_weights(&out, "liif", "Cargo.toml", &["Cargo.toml", "not a checkpoint"]);
 }

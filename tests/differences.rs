@@ -53,15 +53,16 @@ fn said(project: &Project, arguments: &[&str]) -> Vec<String> {
     project.ok(arguments).lines().map(plain).collect()
 }
 
-fn plain(line: &str) -> String {
+fn hidden(word: &str) -> String {
     let is_hash = |word: &str| word.len() == 10 && word.bytes().all(|b| b.is_ascii_hexdigit());
-    let hidden = |word: &str| {
-        if is_hash(word.trim_end_matches(';')) {
-            word.replace(|c: char| c.is_ascii_hexdigit(), "#")
-        } else {
-            word.to_owned()
-        }
-    };
+    if is_hash(word.trim_end_matches(';')) {
+        word.replace(|c: char| c.is_ascii_hexdigit(), "#")
+    } else {
+        word.to_owned()
+    }
+}
+
+fn plain(line: &str) -> String {
     let line = line.split(' ').map(hidden).collect::<Vec<_>>().join(" ");
     match line.split_once("cached (") {
         Some((before, _)) => format!("{before}cached (…)"),
@@ -221,19 +222,20 @@ fn diff_tells_each_difference() {
     assert_eq!(diff("one", "two"), gone);
 }
 
+fn pin(project: &Project, name: &str, mode: &str) {
+    for verb in [&["run", "first"][..], &["pin", name, "first"]] {
+        assert!(project.command(verb).env("MIX_MODE", mode).output().unwrap().status.success());
+    }
+}
+
 /// What isn't set by the pipeline is told, too.
 #[test]
 fn diff_tells_of_code_environment_and_sources() {
     let project = project();
-    let pin = |name: &str, mode: &str| {
-        for verb in [&["run", "first"][..], &["pin", name, "first"]] {
-            assert!(project.command(verb).env("MIX_MODE", mode).output().unwrap().status.success());
-        }
-    };
-    pin("one", "");
+    pin(&project, "one", "");
     project.write("source/unread.md", "more\n");
     project.program("mix", &format!("{PROGRAM}# changed\n"));
-    pin("two", " ");
+    pin(&project, "two", " ");
     let told = said(&project, &["diff", "one", "two"]);
     let starts: Vec<&str> = told
         .iter()

@@ -9,13 +9,13 @@ use std::process::Command;
 
 use artifact::GivenInput;
 use common::browser::run_in_browser;
-use common::splats::{read_ply, read_splats, render_splats, vectors};
+use common::splats::{Splat, read_ply, read_splats, render_splats, vectors};
 use common::surfaces::{Compared, Glb, compare, true_surface};
 use common::{Finished, Project, stage};
 use demo_scene::World;
 use glam::DVec3;
 use pixels::{Filter, Image, Resampling, psnr_of, read_premultiplied};
-use scene::{Camera, Views};
+use scene::{Camera, View, Views};
 use serde_json::Value;
 
 /// Grid of points of the true surface.
@@ -81,6 +81,12 @@ fn turned_below(camera: &Camera) -> Camera {
     Camera { camera_to_world: [x, y.map(|v| -v), z.map(|v| -v)], ..camera.clone() }
 }
 
+fn splats_score(splats: &[Splat], input: &GivenInput, background: f32, view: &View) -> f64 {
+    let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
+    let drawn = render_splats(splats, &enlarged(&view.camera), f64::from(background));
+    psnr(&image.over(background), &shrunk(&drawn))
+}
+
 impl Exported {
     /// What the training cameras see of the true surface.
     fn true_surface(&self) -> Vec<(DVec3, DVec3)> {
@@ -111,12 +117,7 @@ impl Exported {
         let splats = read_splats(&self.files.join("splats.ply"));
         let input = GivenInput::open("truth", &self.truth).unwrap();
         let views = Views::read(&input).unwrap().views;
-        let score = |view: &scene::View| {
-            let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
-            let drawn = render_splats(&splats, &enlarged(&view.camera), f64::from(background));
-            psnr(&image.over(background), &shrunk(&drawn))
-        };
-        views.iter().map(score).collect()
+        views.iter().map(|view| splats_score(&splats, &input, background, view)).collect()
     }
 }
 
@@ -151,6 +152,15 @@ fn assert_shown(scores: &[f64], least: f64) {
     assert!(scores.iter().sum::<f64>() >= least * scores.len() as f64, "{}", in_words(scores));
 }
 
+fn viewer_score(input: &GivenInput, drawn: &Path, view: &View) -> f64 {
+    let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
+    let path = drawn.join(format!("{}.png", view.camera.name));
+    let shown = read_premultiplied(&path).unwrap().over(0.0);
+    // Nothing of the scene is in the corner.
+    let background = shown.data[0];
+    psnr(&image.over(background), &shrunk(&shown))
+}
+
 /// PSNR of each test view, as a viewer of others draws it, over the background that it draws. None
 /// without a browser.
 fn seen_in_viewer(exported: &Exported) -> Option<Vec<f64>> {
@@ -165,15 +175,7 @@ fn seen_in_viewer(exported: &Exported) -> Option<Vec<f64>> {
         run_in_browser("splats.mjs", files.iter().map(PathBuf::as_path).chain([drawn.path()]))?;
     let count = read_ply(&files[0])["x"].len();
     assert_eq!(said, serde_json::json!({"count": count, "problems": []}));
-    let score = |view: &scene::View| {
-        let image = read_premultiplied(&input.path(view.image.as_ref().unwrap())).unwrap();
-        let path = drawn.path().join(format!("{}.png", view.camera.name));
-        let shown = read_premultiplied(&path).unwrap().over(0.0);
-        // Nothing of the scene is in the corner.
-        let background = shown.data[0];
-        psnr(&image.over(background), &shrunk(&shown))
-    };
-    Some(views.views.iter().map(score).collect())
+    Some(views.views.iter().map(|view| viewer_score(&input, drawn.path(), view)).collect())
 }
 
 /// Points of the true surface with their normals, as PLY text.

@@ -179,18 +179,19 @@ fn modified(file: &Path) -> Option<SystemTime> {
     file.metadata().ok()?.modified().ok()
 }
 
+fn run_small(programs: &Path, project: &Project, arguments: &[&str]) -> Finished {
+    let mut command = Command::new(programs.join("nerf-sr"));
+    command.args(arguments).current_dir(project.path(".")).env_remove("NERF_SR_STORE");
+    Finished::of(command.output().unwrap())
+}
+
 /// What a stage made without libtorch has the same key where it is built with it, and the same
 /// bytes: after `make demo`, `make build` leaves the demo cached.
 #[test]
 fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
     let Some(programs) = without_libtorch() else { return };
     let project = Project::fast();
-    let small = |arguments: &[&str]| {
-        let mut command = Command::new(programs.join("nerf-sr"));
-        command.args(arguments).current_dir(project.path(".")).env_remove("NERF_SR_STORE");
-        Finished::of(command.output().unwrap())
-    };
-    let made = small(&["run"]);
+    let made = run_small(&programs, &project, &["run"]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert!(project.ok(&["run"]).contains("all 5 stages are cached"));
     let names = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
@@ -204,13 +205,23 @@ fn a_build_without_libtorch_makes_what_the_whole_one_makes() {
         &["run", "-p", "train-ss.field=mlp"],
         &["run", "--device", "cuda:0"],
     ] {
-        small(arguments).fails(2, &["libtorch", "run `make build`"]);
+        run_small(&programs, &project, arguments).fails(2, &["libtorch", "run `make build`"]);
     }
     project.replace("default: [report]", "default: [refine]");
     project.replace("  eval:\n", "  refine:\n    inputs: {views: render-depth}\n  eval:\n");
-    small(&["run"])
+    run_small(&programs, &project, &["run"])
         .fails(2, &["pipeline.yaml:", "stage refine: ", "refine isn't built; run `make build`"]);
-    assert_eq!(small(&["run", "eval"]).code, 0, "no matter to what doesn't use it");
+    assert_eq!(
+        run_small(&programs, &project, &["run", "eval"]).code,
+        0,
+        "no matter to what doesn't use it"
+    );
+}
+
+fn run_bare(prefix: &Path, project: &Project, program: &str, arguments: &[&str]) -> Finished {
+    let mut command = Command::new(prefix.join(program));
+    command.env_clear().args(arguments).current_dir(project.path("."));
+    Finished::of(command.output().unwrap())
 }
 
 /// Installed programs run from any folder, with nothing of the environment.
@@ -232,21 +243,16 @@ fn installed_programs_run_from_any_folder() {
         .unwrap();
     let install = Finished::of(install);
     assert_eq!(install.code, 0, "{}", install.stderr);
-    let bare = |program: &str, arguments: &[&str]| {
-        let mut command = Command::new(prefix.join(program));
-        command.env_clear().args(arguments).current_dir(project.path("."));
-        Finished::of(command.output().unwrap())
-    };
-    let ran = bare("bin/nerf-sr", &["run"]);
+    let ran = run_bare(&prefix, &project, "bin/nerf-sr", &["run"]);
     assert_eq!(ran.code, 0, "{}", ran.stderr);
     assert!(project.ok(&["run"]).contains("all 5 stages are cached"), "one key, wherever it lies");
     // A program that can't do without libtorch.
-    let described = bare("lib/nerf-sr/refine", &["describe"]);
+    let described = run_bare(&prefix, &project, "lib/nerf-sr/refine", &["describe"]);
     assert_eq!(described.code, 0, "{}", described.stderr);
     let is_there = |file: &str| assert!(prefix.join("share").join(file).is_file(), "{file}");
     let remote = bin("nerf-sr").with_file_name("nerf-sr-remote").exists();
     for name in ["nerf-sr"].into_iter().chain(remote.then_some("nerf-sr-remote")) {
-        assert_eq!(bare(&format!("bin/{name}"), &["--version"]).code, 0);
+        assert_eq!(run_bare(&prefix, &project, &format!("bin/{name}"), &["--version"]).code, 0);
         is_there(&format!("bash-completion/completions/{name}"));
         is_there(&format!("zsh/site-functions/_{name}"));
         is_there(&format!("fish/vendor_completions.d/{name}.fish"));

@@ -44,15 +44,16 @@ fn arguments<'a>(verb: &'a str, point: &'a [String; 2]) -> Vec<&'a str> {
     vec![verb, &point[0], &point[1]]
 }
 
+fn cached_stage(line: &str) -> Option<(String, String)> {
+    let mut words = line.split_whitespace();
+    let (stage, state, hash) = (words.next()?, words.next()?, words.next()?);
+    (state == "cached").then(|| (stage.to_owned(), hash.to_owned()))
+}
+
 /// The finished stages of a point with their artifacts.
 fn finished(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> {
     let status = project.ok(&arguments("status", point));
-    let line = |line: &str| {
-        let mut words = line.split_whitespace();
-        let (stage, state, hash) = (words.next()?, words.next()?, words.next()?);
-        (state == "cached").then(|| (stage.to_owned(), hash.to_owned()))
-    };
-    status.lines().filter_map(line).collect()
+    status.lines().filter_map(cached_stage).collect()
 }
 
 /// The processes that a process has started.

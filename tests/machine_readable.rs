@@ -20,18 +20,19 @@ fn read(project: &Project, arguments: &[&str]) -> Value {
     serde_json::from_str(&project.ok(arguments)).unwrap()
 }
 
+fn states(report: &Value) -> Vec<String> {
+    report["nodes"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|node| node["state"].as_str().unwrap().to_owned())
+        .collect()
+}
+
 #[test]
 fn plan_status_and_why_say_the_same_to_programs() {
     let project = Project::new(PIPELINE);
     let before = read(&project, &["plan", "--json", "-p", "kernel=lanczos,box"]);
-    let states = |report: &Value| -> Vec<String> {
-        report["nodes"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|node| node["state"].as_str().unwrap().to_owned())
-            .collect()
-    };
     assert_eq!(states(&before), ["will run", "waits", "waits"]);
     assert_eq!(before["nodes"][2]["point"], "kernel=box");
     assert_eq!(
@@ -72,6 +73,11 @@ fn path_leads_into_an_artifact() {
     project.run(&["path", "perp"]).fails(2, &["did you mean prep?"]);
 }
 
+fn hash_of(project: &Project, arguments: &[&str]) -> String {
+    let folder = project.ok(&[&["path", "prep"], arguments].concat());
+    folder.trim().rsplit('/').next().unwrap()[..12].to_owned()
+}
+
 /// Every kind of difference has its line, and nothing is told twice.
 #[test]
 fn diff_tells_what_differs() {
@@ -90,12 +96,11 @@ fn diff_tells_what_differs() {
     );
     assert_eq!(lines.len(), 2, "{kernels}");
     // By hashes, and as JSON.
-    let hash = |arguments: &[&str]| {
-        let folder = project.ok(&[&["path", "prep"], arguments].concat());
-        folder.trim().rsplit('/').next().unwrap()[..12].to_owned()
-    };
-    let by_hash =
-        project.ok(&["diff", &hash(&["-p", "kernel=lanczos"]), &hash(&["-p", "kernel=box"])]);
+    let by_hash = project.ok(&[
+        "diff",
+        &hash_of(&project, &["-p", "kernel=lanczos"]),
+        &hash_of(&project, &["-p", "kernel=box"]),
+    ]);
     assert_eq!(by_hash, kernels);
     let told: Value =
         read(&project, &["diff", "--json", "prep -p kernel=lanczos", "prep -p kernel=box"]);

@@ -429,29 +429,30 @@ fn what_a_stage_leaves_running_does_not_hold_up_the_runner() {
     project.ok(&["run"]);
 }
 
+fn run_in_a_group(project: &Project, more: &[(&str, &str)]) -> Finished {
+    let mut command = Command::new("sh");
+    command
+        .args(["-c", "umask 002; exec \"$0\" run"])
+        .arg(bin("nerf-sr"))
+        .current_dir(project.path("."));
+    let finished = Finished::of(
+        command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap(),
+    );
+    for entry in walkdir::WalkDir::new(project.path(".nerf-sr")) {
+        let entry = entry.unwrap();
+        let mode = entry.metadata().unwrap().permissions().mode();
+        assert_eq!(mode & 0o020, 0o020, "{}: {mode:o}", entry.path().display());
+    }
+    finished
+}
+
 #[test]
 fn a_group_can_share_a_store() {
     let project = Project::tiny();
-    let run = |more: &[(&str, &str)]| {
-        let mut command = Command::new("sh");
-        command
-            .args(["-c", "umask 002; exec \"$0\" run"])
-            .arg(bin("nerf-sr"))
-            .current_dir(project.path("."));
-        let finished = Finished::of(
-            command.env_remove("NERF_SR_STORE").envs(more.iter().copied()).output().unwrap(),
-        );
-        for entry in walkdir::WalkDir::new(project.path(".nerf-sr")) {
-            let entry = entry.unwrap();
-            let mode = entry.metadata().unwrap().permissions().mode();
-            assert_eq!(mode & 0o020, 0o020, "{}: {mode:o}", entry.path().display());
-        }
-        finished
-    };
     // Once with checkpoints and parts lying there, once whole.
-    let stopped = run(&[("NERF_SR_STOP_AFTER", "30000")]);
+    let stopped = run_in_a_group(&project, &[("NERF_SR_STOP_AFTER", "30000")]);
     assert_eq!(stopped.code, 130, "{}", stopped.stderr);
-    let whole = run(&[]);
+    let whole = run_in_a_group(&project, &[]);
     assert_eq!(whole.code, 0, "{}", whole.stderr);
 }
 

@@ -3,11 +3,17 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use common::{Project, demo_train, manifest, stage, stage_command};
+use std::path::Path;
+
+use common::{Finished, Project, demo_train, manifest, stage, stage_command};
 
 /// All of the published shape, in miniature; long enough to be stopped on the way.
 const PARAMS: &str = r#"{"field": "mlp", "hidden_dim": 16, "layers": 5, "position_frequencies": 4, "direction_frequencies": 1, "coarse_samples": 8,
     "fine_samples": 8, "max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1}"#;
+
+fn weights(folder: &Path, member: u32) -> Option<Vec<u8>> {
+    std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok()
+}
 
 /// Equal bytes at one and two threads, and after an interruption.
 #[test]
@@ -47,9 +53,6 @@ fn trains_to_the_same_bytes_however_it_is_run() {
         .code,
         0
     );
-    let weights = |folder: &std::path::Path, member: u32| {
-        std::fs::read(folder.join(format!("field-{member}.safetensors"))).ok()
-    };
     let [initial, trained, mean] = [weights(&one, 0), weights(&beside, 1), weights(&averaged, 0)];
     assert!(weights(&beside, 0) == initial && weights(&averaged, 1).is_none());
     assert!(initial != trained && initial != mean && trained != mean);
@@ -62,29 +65,33 @@ fn trains_to_the_same_bytes_however_it_is_run() {
     assert!(views.join("images").read_dir().unwrap().count() == 1);
 }
 
+fn trained(project: &Project, train: &Path, name: &str, seed: u64, restarts: u32) -> Finished {
+    let more = format!(
+        r#""learning_rate": 0.03, "seed": {seed}, "restarts": {restarts}, "max_rays_per_step": 16"#
+    );
+    let params = PARAMS.replace(
+        r#""max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1"#,
+        &more,
+    );
+    let params = params
+        .replace(r#""learning_rate""#, r#""rays": 4000, "precrop_steps": 0, "learning_rate""#);
+    stage("train-ss", &params, &[("scene", train)], &project.path(name), &[])
+}
+
 /// A high rate kills a network under some seeds: the stage says so, and another seed is tried where
 /// that is allowed.
 #[test]
 fn a_collapse_is_told_and_starts_over_when_asked_to() {
     let project = Project::tiny();
     let train = demo_train(&project, 6);
-    let run = |name: &str, seed: u64, restarts: u32| {
-        let more = format!(
-            r#""learning_rate": 0.03, "seed": {seed}, "restarts": {restarts}, "max_rays_per_step": 16"#
-        );
-        let params =
-            PARAMS.replace(r#""max_rays_per_step": 128, "rays": 40000, "precrop_steps": 20, "density_noise_std": 0.1"#, &more);
-        let params = params
-            .replace(r#""learning_rate""#, r#""rays": 4000, "precrop_steps": 0, "learning_rate""#);
-        stage("train-ss", &params, &[("scene", &train)], &project.path(name), &[])
-    };
-    let alone = |seed: u64| run(&format!("alone-{seed}"), seed, 0);
+    let alone = |seed: u64| trained(&project, &train, &format!("alone-{seed}"), seed, 0);
     let seed = (0..20).find(|&seed| alone(seed).code == 4).expect("some seed collapses");
-    run("told", seed, 0).fails(4, &["network has collapsed", "try another seed"]);
+    trained(&project, &train, "told", seed, 0)
+        .fails(4, &["network has collapsed", "try another seed"]);
     assert!(!project.path("told").exists());
     let after =
         (1..20).find(|after| alone(seed + after).code == 0).expect("some seed doesn't collapse");
-    assert_eq!(run("again", seed, after as u32).code, 0);
+    assert_eq!(trained(&project, &train, "again", seed, after as u32).code, 0);
     assert_eq!(
         manifest(&project.path("again")),
         manifest(&project.path(&format!("alone-{}", seed + after)))

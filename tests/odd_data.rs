@@ -92,21 +92,21 @@ fn names_that_are_not_utf8_are_passed_over_or_named() {
     );
 }
 
+fn prepared(project: &Project, folder: &Path, name: &str) -> String {
+    let scene = project.path(name);
+    let made = stage("prep", "{}", &[("dataset", folder)], &scene, &[]);
+    assert_eq!(made.code, 0, "{}", made.stderr);
+    manifest(&scene)
+}
+
 #[test]
 fn text_as_other_editors_save_it() {
     let (project, folder) = project(16, 4);
-    let inputs = [("dataset", folder.as_path())];
-    let prepared = |name: &str| {
-        let scene = project.path(name);
-        let made = stage("prep", "{}", &inputs, &scene, &[]);
-        assert_eq!(made.code, 0, "{}", made.stderr);
-        manifest(&scene)
-    };
-    let plain = prepared("plain");
+    let plain = prepared(&project, &folder, "plain");
     let path = folder.join("transforms_train.json");
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, format!("\u{feff}{}", text.replace('\n', "\r\n"))).unwrap();
-    assert_eq!(prepared("marked"), plain);
+    assert_eq!(prepared(&project, &folder, "marked"), plain);
     let wide: Vec<u8> =
         format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
     std::fs::write(&path, wide).unwrap();
@@ -203,21 +203,22 @@ fn poses_that_look_wrong_are_warned_of() {
     }
 }
 
+fn counts(project: &Project, settings: &[&str]) -> (u64, u64) {
+    project.ok(&[&["run"], settings].concat());
+    let scene = project.json("prep", "scene.json", settings);
+    (scene["train"].as_u64().unwrap(), scene["test"].as_u64().unwrap())
+}
+
 #[test]
 fn training_views_alone_are_a_data_set() {
     let (project, folder) = project(16, 10);
     let test = folder.join("transforms_test.json");
     std::fs::write(&test, r#"{"camera_angle_x": 0.69, "frames": []}"#).unwrap();
-    let counts = |settings: &[&str]| {
-        project.ok(&[&["run"], settings].concat());
-        let scene = project.json("prep", "scene.json", settings);
-        (scene["train"].as_u64().unwrap(), scene["test"].as_u64().unwrap())
-    };
-    assert_eq!(counts(&[]), (8, 2), "without frames, every eighth is held out");
+    assert_eq!(counts(&project, &[]), (8, 2), "without frames, every eighth is held out");
     std::fs::remove_file(&test).unwrap();
-    assert_eq!(counts(&[]), (8, 2));
-    assert_eq!(counts(&["-p", "split=holdout"]), (8, 2));
-    assert_eq!(counts(&["-p", "split=paper"]), (10, 9));
+    assert_eq!(counts(&project, &[]), (8, 2));
+    assert_eq!(counts(&project, &["-p", "split=holdout"]), (8, 2));
+    assert_eq!(counts(&project, &["-p", "split=paper"]), (10, 9));
     project
         .run(&["run", "-p", "split=given"])
         .fails(2, &["parameter split", "choose holdout or paper"]);
@@ -302,30 +303,30 @@ fn a_reference_has_the_exposure_of_its_own_lr_photograph() {
     }
 }
 
+fn trained_with(project: &Project, refined: &str) -> (Vec<u8>, String, Value, String) {
+    let settings = ["-p", refined];
+    let run = project.run(&[&["run"], &settings[..]].concat());
+    assert_eq!(run.code, 0, "{}", run.stderr);
+    let weights =
+        std::fs::read(project.artifact("train-ss", &settings).join(radiance::FieldFile::member(0)))
+            .unwrap();
+    let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
+    (weights, run.stderr, project.json("train-ss", "training.json", &settings), page)
+}
+
 /// So few rays say nothing of poses: cameras wander off, photographs don't meet their neighbours,
 /// and the field is the one with the given poses.
 #[test]
 fn poses_stay_where_refined_ones_are_no_better() {
     let project = Project::new(TRAINED);
-    let weights = |refined: &str| {
-        let settings = ["-p", refined];
-        let run = project.run(&[&["run"], &settings[..]].concat());
-        assert_eq!(run.code, 0, "{}", run.stderr);
-        let weights = std::fs::read(
-            project.artifact("train-ss", &settings).join(radiance::FieldFile::member(0)),
-        )
-        .unwrap();
-        let page = std::fs::read_to_string(project.path("out/report/index.html")).unwrap();
-        (weights, run.stderr, project.json("train-ss", "training.json", &settings), page)
-    };
-    let (given, said, training, page) = weights("pose_refinement=false");
+    let (given, said, training, page) = trained_with(&project, "pose_refinement=false");
     assert!(
         !said.contains("warning: ")
             && training.get("warnings").is_none()
             && !page.contains("id=\"warnings\""),
         "{said}"
     );
-    let (kept, said, training, page) = weights("pose_refinement=true");
+    let (kept, said, training, page) = trained_with(&project, "pose_refinement=true");
     let words =
         "the given poses stay: photographs meet their neighbours no better with refined poses";
     assert!(said.contains(&format!("warning: {words}")), "{said}");

@@ -37,19 +37,24 @@ fn seen(page: &Path, sizes: &str, count: usize) -> Option<Vec<Value>> {
     Some(looks)
 }
 
+fn scored_figure(view: &Value, figure: &Value) -> Option<(String, String)> {
+    let place = format!("/scores/{}", figure["path"].as_str().unwrap());
+    let value = view.pointer(&place)?.as_f64()?;
+    let digits = figure["digits"].as_u64().unwrap() as usize;
+    Some((figure["label"].as_str().unwrap().to_owned(), format!("{value:.digits$}")))
+}
+
+fn scored_figures(view: &Value, figures: &[Value]) -> (String, BTreeMap<String, String>) {
+    (
+        view["name"].as_str().unwrap().to_owned(),
+        figures.iter().filter_map(|figure| scored_figure(view, figure)).collect(),
+    )
+}
+
 /// `metrics.json` as the page should show it: by view and label of a figure, rounded.
 fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
     let figures = metrics["figures"].as_array().unwrap();
-    let of_view = |view: &Value| {
-        let number = |figure: &Value| {
-            let place = format!("/scores/{}", figure["path"].as_str().unwrap());
-            let value = view.pointer(&place)?.as_f64()?;
-            let digits = figure["digits"].as_u64().unwrap() as usize;
-            Some((figure["label"].as_str().unwrap().to_owned(), format!("{value:.digits$}")))
-        };
-        (view["name"].as_str().unwrap().to_owned(), figures.iter().filter_map(number).collect())
-    };
-    metrics["views"].as_array().unwrap().iter().map(of_view).collect()
+    metrics["views"].as_array().unwrap().iter().map(|view| scored_figures(view, figures)).collect()
 }
 
 #[track_caller]
@@ -94,31 +99,32 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
     glance(&alone);
 }
 
+fn record_node(project: &Project, stage: &str, kind: &str, point: &str, inputs: &Value) -> Value {
+    let folder = project.artifact(stage, &[]);
+    json!({"stage": stage, "program": stage, "point": point, "kind": kind, "key": "k",
+        "values": if point.is_empty() { json!({}) } else { json!({"rays": point[5..]}) },
+        "is_cached": point.is_empty(), "peak_memory": 100_000_000,
+        "output": folder.file_name().unwrap().to_str().unwrap(), "folder": folder,
+        "parameters": {"rays": 4000, "seed": null}, "inputs": inputs,
+        "started_unix": 1_790_000_000, "seconds": 3.5, "threads": 2})
+}
+
 /// A run's record, as the runner writes it, with the same result many times.
 fn record(project: &Project, results: usize) -> Value {
-    let node = |stage: &str, kind: &str, point: &str, inputs: Value| {
-        let folder = project.artifact(stage, &[]);
-        json!({"stage": stage, "program": stage, "point": point, "kind": kind, "key": "k",
-            "values": if point.is_empty() { json!({}) } else { json!({"rays": point[5..]}) },
-            "is_cached": point.is_empty(), "peak_memory": 100_000_000,
-            "output": folder.file_name().unwrap().to_str().unwrap(), "folder": folder,
-            "parameters": {"rays": 4000, "seed": null}, "inputs": inputs,
-            "started_unix": 1_790_000_000, "seconds": 3.5, "threads": 2})
-    };
     let mut nodes = vec![
-        node("demo-scene", "dataset", "", json!({})),
-        node("prep", "scene", "", json!({"dataset": {"node": 0}})),
+        record_node(project, "demo-scene", "dataset", "", &json!({})),
+        record_node(project, "prep", "scene", "", &json!({"dataset": {"node": 0}})),
     ];
     for result in 0..results {
         let point = if results == 1 { String::new() } else { format!("rays={}", 1000 + result) };
         let first = nodes.len();
         let prep = |folder: &str| json!({"node": 1, "subtree": folder});
         let inputs = json!({"scene": prep("train")});
-        nodes.push(node("train-ss", "field", &point, inputs));
+        nodes.push(record_node(project, "train-ss", "field", &point, &inputs));
         let inputs = json!({"field": {"node": first}, "cameras": prep("cameras")});
-        nodes.push(node("render-depth", "views", &point, inputs));
+        nodes.push(record_node(project, "render-depth", "views", &point, &inputs));
         let inputs = json!({"views": {"node": first + 1}, "truth": prep("truth")});
-        nodes.push(node("eval", "metrics", &point, inputs));
+        nodes.push(record_node(project, "eval", "metrics", &point, &inputs));
     }
     json!({"home": project.path("out"), "command": ["nerf-sr", "run"], "data_sets": ["demo-scene"],
         "nodes": nodes})
@@ -151,27 +157,37 @@ fn one_result_and_a_hundred_have_readable_pages() {
     }
 }
 
+fn camera(name: &str, side: usize) -> Value {
+    json!({"name": name, "intrinsics": {"width": side, "height": side, "fx": side, "fy": side,
+            "cx": side / 2, "cy": side / 2},
+        "camera_to_world": [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]]})
+}
+
+fn write_image(folder: &Path, file: &str, image: &pixels::Rgba8) {
+    let path = folder.join(file);
+    std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+    pixels::write_png(&path, image).unwrap();
+}
+
 /// Views of photographs, which no filter shrinks to nothing: detail at every size, and noise.
 fn photographs(folder: &Path, count: usize, side: usize) -> Value {
-    let camera = |name: &str, side: usize| {
-        json!({"name": name, "intrinsics": {"width": side, "height": side, "fx": side, "fy": side,
-                "cx": side / 2, "cy": side / 2},
-            "camera_to_world": [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]]})
-    };
     let (mut truths, mut renders, mut scores) = (vec![], vec![], vec![]);
     for number in 0..count {
         let name = format!("r_{number}");
         let sharp = texture(side, number as u64, 1.0);
-        let write = |file: &str, image: &pixels::Rgba8| {
-            let path = folder.join(file);
-            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
-            pixels::write_png(&path, image).unwrap();
-        };
-        write(&format!("truth/images/{name}.png"), &sharp);
-        write(&format!("views/images/{name}.png"), &texture(side, number as u64, 0.5));
+        write_image(folder, &format!("truth/images/{name}.png"), &sharp);
+        write_image(
+            folder,
+            &format!("views/images/{name}.png"),
+            &texture(side, number as u64, 0.5),
+        );
         let small = pixels::resize_pillow(&sharp, side / 2, side / 2, pixels::Filter::Lanczos);
-        write(&format!("truth/low/{name}.png"), &small);
-        write(&format!("metrics/errors/{name}.png"), &texture(side, 1000 + number as u64, 1.0));
+        write_image(folder, &format!("truth/low/{name}.png"), &small);
+        write_image(
+            folder,
+            &format!("metrics/errors/{name}.png"),
+            &texture(side, 1000 + number as u64, 1.0),
+        );
         let view = json!({"camera": camera(&name, side), "image": format!("images/{name}.png")});
         let mut truth = view.clone();
         truth["low_resolution"] = json!(format!("low/{name}.png"));
@@ -193,35 +209,44 @@ fn photographs(folder: &Path, count: usize, side: usize) -> Value {
     json!({"conventions": {}, "figures": [figure], "mean": {"psnr": 22.45}, "views": scores})
 }
 
+fn noise(number: u64, x: usize, y: usize, c: usize) -> f64 {
+    let mut bits = (x as u64) << 40 | (y as u64) << 16 | number << 4 | c as u64;
+    for factor in [0xff51_afd7_ed55_8ccd_u64, 0xc4ce_b9fe_1a85_ec53] {
+        bits = (bits ^ (bits >> 33)).wrapping_mul(factor);
+    }
+    (bits >> 56) as f64 / 255.0 - 0.5
+}
+
+fn waves(number: u64, x: usize, y: usize) -> f64 {
+    let phase = number as f64;
+    (1..7)
+        .map(|octave| {
+            let length = f64::from(1 << octave) * 0.012;
+            let (u, v) = (x as f64 * length, y as f64 * length);
+            ((u + phase).sin() * (v * 1.3 - phase).cos()) / f64::from(octave)
+        })
+        .sum::<f64>()
+}
+
+fn texture_pixel(number: u64, detail: f64, x: usize, y: usize) -> [u8; 4] {
+    let level = 0.5 + 0.2 * waves(number, x, y);
+    let [r, g, b] = [0, 1, 2].map(|c| {
+        let value = level + 0.12 * detail * noise(number, x, y, c) + 0.05 * c as f64;
+        (value.clamp(0.0, 1.0) * 255.0) as u8
+    });
+    [r, g, b, 255]
+}
+
 /// Waves of every length with phases that depend on the number, and noise.
 fn texture(side: usize, number: u64, detail: f64) -> pixels::Rgba8 {
-    let noise = |x: usize, y: usize, c: usize| {
-        let mut bits = (x as u64) << 40 | (y as u64) << 16 | number << 4 | c as u64;
-        for factor in [0xff51_afd7_ed55_8ccd_u64, 0xc4ce_b9fe_1a85_ec53] {
-            bits = (bits ^ (bits >> 33)).wrapping_mul(factor);
-        }
-        (bits >> 56) as f64 / 255.0 - 0.5
-    };
-    let waves = |x: usize, y: usize| {
-        let phase = number as f64;
-        (1..7)
-            .map(|octave| {
-                let length = f64::from(1 << octave) * 0.012;
-                let (u, v) = (x as f64 * length, y as f64 * length);
-                ((u + phase).sin() * (v * 1.3 - phase).cos()) / f64::from(octave)
-            })
-            .sum::<f64>()
-    };
-    let pixel = |i: usize| {
-        let (x, y) = (i % side, i / side);
-        let level = 0.5 + 0.2 * waves(x, y);
-        let channel = |c: usize| {
-            let value = level + 0.12 * detail * noise(x, y, c) + 0.05 * c as f64;
-            (value.clamp(0.0, 1.0) * 255.0) as u8
-        };
-        [channel(0), channel(1), channel(2), 255]
-    };
+    let pixel = |i: usize| texture_pixel(number, detail, i % side, i / side);
     pixels::Rgba8::new(side, side, (0..side * side).flat_map(pixel).collect())
+}
+
+fn folder_node(dir: &Path, stage: &str, kind: &str, folder: &str, inputs: &Value) -> Value {
+    json!({"stage": stage, "point": "", "kind": kind, "key": "", "output": "",
+        "folder": dir.join(folder), "parameters": {}, "inputs": inputs,
+        "started_unix": 1, "seconds": 1.0, "threads": 1})
 }
 
 #[test]
@@ -229,15 +254,16 @@ fn fifty_views_of_800_pixels_have_room() {
     let dir = tempfile::tempdir().unwrap();
     let metrics = photographs(dir.path(), 50, 800);
     std::fs::write(dir.path().join("metrics/metrics.json"), metrics.to_string()).unwrap();
-    let node = |stage: &str, kind: &str, folder: &str, inputs: Value| {
-        json!({"stage": stage, "point": "", "kind": kind, "key": "", "output": "",
-            "folder": dir.path().join(folder), "parameters": {}, "inputs": inputs,
-            "started_unix": 1, "seconds": 1.0, "threads": 1})
-    };
     let nodes = [
-        node("truth", "views", "truth", json!({})),
-        node("views", "views", "views", json!({})),
-        node("eval", "metrics", "metrics", json!({"views": {"node": 1}, "truth": {"node": 0}})),
+        folder_node(dir.path(), "truth", "views", "truth", &json!({})),
+        folder_node(dir.path(), "views", "views", "views", &json!({})),
+        folder_node(
+            dir.path(),
+            "eval",
+            "metrics",
+            "metrics",
+            &json!({"views": {"node": 1}, "truth": {"node": 0}}),
+        ),
     ];
     let page = page_of(dir.path(), &json!({"nodes": nodes}));
     let bytes = page.metadata().unwrap().len();
@@ -302,6 +328,11 @@ fn a_page_without_scores_to_read_says_so() {
     looks.into_iter().flatten().for_each(|look| assert_eq!(look["summary"][0], summary[0]));
 }
 
+fn heading(project: &Project, folder: &str) -> String {
+    let text = std::fs::read_to_string(project.path(folder).join("index.html")).unwrap();
+    text.split_once("<h1>").unwrap().1.split_once("</h1>").unwrap().0.to_owned()
+}
+
 #[test]
 fn another_data_set_has_its_own_page() {
     let project = Project::fast();
@@ -318,11 +349,7 @@ fn another_data_set_has_its_own_page() {
     assert!(!run("first").contains("before"));
     let said = run("second");
     assert!(said.contains("out/report-first/index.html"), "{said}");
-    let heading = |folder: &str| {
-        let text = std::fs::read_to_string(project.path(folder).join("index.html")).unwrap();
-        text.split_once("<h1>").unwrap().1.split_once("</h1>").unwrap().0.to_owned()
-    };
-    assert_eq!(heading("out/report"), "second");
-    assert_eq!(heading("out/report-first"), "first");
+    assert_eq!(heading(&project, "out/report"), "second");
+    assert_eq!(heading(&project, "out/report-first"), "first");
     assert!(run("second").contains("up to date"));
 }

@@ -14,18 +14,19 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 use serde_json::{Value, json};
 
+fn numbers(v: &Value) -> Vec<f64> {
+    let pose = v["camera"]["camera_to_world"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .flat_map(|r| r.as_array().unwrap().clone());
+    let inside =
+        v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
+    pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
+}
+
 /// The largest difference between the numbers of two views' cameras.
 fn difference(a: &Value, b: &Value) -> f64 {
-    let numbers = |v: &Value| -> Vec<f64> {
-        let pose = v["camera"]["camera_to_world"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .flat_map(|r| r.as_array().unwrap().clone());
-        let inside =
-            v["camera"]["intrinsics"].as_object().unwrap().values().cloned().collect::<Vec<_>>();
-        pose.chain(inside).map(|n| n.as_f64().unwrap()).collect()
-    };
     numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
@@ -139,6 +140,31 @@ fn one_command_makes_hr_views_of_lr_photographs() {
     );
 }
 
+fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
+    // Each exposure has a grey of its own behind the things: that looks like a scene that goes
+    // on.
+    let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
+    project.ok(&[&["run"], &settings[..]].concat());
+    let read = |stage: &str, file: &str| project.json(stage, file, &settings);
+    (
+        read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(),
+        read("train-ss", "training.json"),
+    )
+}
+
+/// What a photograph's channels are multiplied by.
+fn exposure_factors(photograph: usize) -> [f32; 3] {
+    [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[photograph % 2]
+}
+
+fn off_by(found: &[[f32; 3]]) -> f32 {
+    found
+        .iter()
+        .enumerate()
+        .flat_map(|(i, e)| (0..3).map(move |c| (e[c] / exposure_factors(i)[c]).ln().abs()))
+        .sum()
+}
+
 /// Photographs of one scene with exposures and white balances of their own: the field has one, and
 /// it is that of the untouched ones.
 #[test]
@@ -148,7 +174,6 @@ fn exposures_are_found() {
     let file = folder.join("transforms.json");
     let transforms: Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     // Every eighth is held out and stays as it is; the others' factors have 1 as their mean.
-    let factors = |i: usize| [0.7f32, 1.0 / 0.7].map(|f| [f, f.sqrt(), 1.0 / f.sqrt()])[i % 2];
     let frames =
         transforms["frames"].as_array().unwrap().iter().enumerate().filter(|(i, _)| i % 8 != 0);
     for (taken, (_, frame)) in frames.enumerate() {
@@ -156,41 +181,43 @@ fn exposures_are_found() {
         let mut image = pixels::read_png(&path).unwrap();
         for pixel in image.data.chunks_exact_mut(4) {
             (0..3).for_each(|c| {
-                pixel[c] = (f32::from(pixel[c]) * factors(taken)[c]).round().min(255.0) as u8;
+                pixel[c] =
+                    (f32::from(pixel[c]) * exposure_factors(taken)[c]).round().min(255.0) as u8;
             });
         }
         pixels::write_png(&path, &image).unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 500000");
-    let scored = |exposure: &str| {
-        // Each exposure has a grey of its own behind the things: that looks like a scene that goes
-        // on.
-        let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
-        project.ok(&[&["run"], &settings[..]].concat());
-        let read = |stage: &str, file: &str| project.json(stage, file, &settings);
-        (
-            read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(),
-            read("train-ss", "training.json"),
-        )
-    };
-    let ((found, training), (ignored, _)) = (scored("exposure=true"), scored("exposure=false"));
+    let ((found, training), (ignored, _)) =
+        (scored_with(&project, "exposure=true"), scored_with(&project, "exposure=false"));
     let exposures: Vec<[f32; 3]> = serde_json::from_value(training["exposures"].clone()).unwrap();
     println!("{found:.2} dB with exposures, {ignored:.2} dB without; {exposures:?}");
     // Against having found nothing: all factors 1.
-    let off = |found: &[[f32; 3]]| -> f32 {
-        found
-            .iter()
-            .enumerate()
-            .flat_map(|(i, e)| (0..3).map(move |c| (e[c] / factors(i)[c]).ln().abs()))
-            .sum()
-    };
-    let (off, was) = (off(&exposures), off(&vec![[1.0; 3]; exposures.len()]));
+    let (off, was) = (off_by(&exposures), off_by(&vec![[1.0; 3]; exposures.len()]));
     assert!(!exposures.is_empty() && off < 0.5 * was, "off by {off} of {was}: {exposures:?}");
     assert!(found > ignored + 2.0, "{found} dB with exposures, {ignored} dB without");
     let open =
         ["run", "-i", "dataset=./transforms", "-p", "exposure=true", "-p", "background=alpha"];
     project.run(&open).fails(2, &["parameter exposure", "open background"]);
+}
+
+fn levels(image: &pixels::Rgba8, column: usize, row: usize) -> [f64; 4] {
+    [0, 1, 2, 3].map(|c| f64::from(image.data[4 * (row * image.width + column) + c]))
+}
+
+fn through(lens: &Intrinsics, pinhole: &pixels::Rgba8, i: usize) -> [u8; 4] {
+    let (width, height) = (pinhole.width, pinhole.height);
+    let at = lens.undistort([(i % width) as f64 + 0.5, (i / width) as f64 + 0.5]);
+    pixels::sample_cubic((width, height), at, |x, y| levels(pinhole, x, y)).map(|v| (v + 0.5) as u8)
+}
+
+fn lens_psnr(project: &Project, lens: &str) -> f64 {
+    // Seen through it the things touch the border: that looks like a scene that goes on.
+    let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", lens];
+    project.ok(&[&["run"], &settings[..]].concat());
+    let metrics = project.json("eval", "metrics.json", &settings);
+    metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
 }
 
 /// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores
@@ -210,29 +237,20 @@ fn lenses_are_followed_or_undone() {
     for frame in transforms["frames"].as_array().unwrap() {
         let path = folder.join(frame["file_path"].as_str().unwrap());
         let pinhole = pixels::read_png(&path).unwrap();
-        let pixel = |column: usize, row: usize| {
-            [0, 1, 2, 3].map(|c| f64::from(pinhole.data[4 * (row * size + column) + c]))
-        };
-        let seen = |i: usize| {
-            let at = lens.undistort([(i % size) as f64 + 0.5, (i / size) as f64 + 0.5]);
-            pixels::sample_cubic((size, size), at, pixel).map(|v| (v + 0.5) as u8)
-        };
         pixels::write_png(
             &path,
-            &pixels::Rgba8::new(size, size, (0..size * size).flat_map(seen).collect()),
+            &pixels::Rgba8::new(
+                size,
+                size,
+                (0..size * size).flat_map(|i| through(&lens, &pinhole, i)).collect(),
+            ),
         )
         .unwrap();
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 400000");
-    let psnr = |lens: &str| {
-        // Seen through it the things touch the border: that looks like a scene that goes on.
-        let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", lens];
-        project.ok(&[&["run"], &settings[..]].concat());
-        let metrics = project.json("eval", "metrics.json", &settings);
-        metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
-    };
-    let [followed, undone, ignored] = ["lens=follow", "lens=undo", "lens=ignore"].map(psnr);
+    let [followed, undone, ignored] =
+        ["lens=follow", "lens=undo", "lens=ignore"].map(|lens| lens_psnr(&project, lens));
     println!("{followed:.2} dB followed, {undone:.2} dB undone, {ignored:.2} dB ignored");
     assert!(
         followed > ignored + 1.0 && undone > ignored + 1.0,
@@ -257,6 +275,15 @@ fn lenses_are_followed_or_undone() {
         .run(&["run", "-i", "dataset=./transforms"])
         .fails(3, &["frame r_0", "k1 -1.1", "lens: undo"]);
     project.ok(&["run", "prep", "-i", "dataset=./transforms", "-p", "lens=undo"]);
+}
+
+fn scored_registered(project: &Project, refined: &str) -> [f64; 2] {
+    let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
+    project.ok(&[&["run"], &settings[..]].concat());
+    ["eval", "eval-registered"].map(|stage| {
+        let metrics = project.json(stage, "metrics.json", &settings);
+        metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+    })
 }
 
 /// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those
@@ -284,16 +311,10 @@ fn poses_are_refined_and_test_views_registered() {
     std::fs::write(&file, transforms.to_string()).unwrap();
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 600000");
-    let scored = |refined: &str| {
-        let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
-        project.ok(&[&["run"], &settings[..]].concat());
-        ["eval", "eval-registered"].map(|stage| {
-            let metrics = project.json(stage, "metrics.json", &settings);
-            metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
-        })
-    };
-    let ([as_given, only_registered], [only_refined, both]) =
-        (scored("pose_refinement=false"), scored("pose_refinement=true"));
+    let ([as_given, only_registered], [only_refined, both]) = (
+        scored_registered(&project, "pose_refinement=false"),
+        scored_registered(&project, "pose_refinement=true"),
+    );
     println!(
         "{as_given:.2} dB as given, {only_registered:.2} registered, {only_refined:.2} refined, \
         {both:.2} both"
@@ -312,6 +333,16 @@ fn poses_are_refined_and_test_views_registered() {
         "background=alpha",
     ];
     project.run(&open).fails(2, &["parameter pose_refinement", "open background"]);
+}
+
+fn scored_masked(project: &Project, file: &Path, transforms: &mut Value, masked: bool) -> f64 {
+    for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !masked) {
+        frame.as_object_mut().unwrap().remove("mask_path");
+    }
+    std::fs::write(file, transforms.to_string()).unwrap();
+    project.ok(&["run", "-i", "dataset=./transforms"]);
+    let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./transforms"]);
+    metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
 }
 
 /// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor
@@ -345,16 +376,7 @@ fn what_masks_leave_out_is_not_learnt() {
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 600000");
-    let mut scored = |masked: bool| {
-        for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !masked) {
-            frame.as_object_mut().unwrap().remove("mask_path");
-        }
-        std::fs::write(&file, transforms.to_string()).unwrap();
-        project.ok(&["run", "-i", "dataset=./transforms"]);
-        let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./transforms"]);
-        metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
-    };
-    let masked = scored(true);
+    let masked = scored_masked(&project, &file, &mut transforms, true);
     // With HR truth: PSNR is that of the pixels that count.
     let small = ["-i", "dataset=./transforms", "-p", "lr_width=16", "-p", "train-ss.rays=20000"];
     project.ok(&[&["run", "eval"], &small[..]].concat());
@@ -389,7 +411,7 @@ fn what_masks_leave_out_is_not_learnt() {
         let psnr = scores["scores"]["psnr"].as_f64().unwrap();
         assert!((psnr - by_hand).abs() < 1e-3, "{name}: {psnr}, by hand {by_hand}");
     }
-    let spoiled = scored(false);
+    let spoiled = scored_masked(&project, &file, &mut transforms, false);
     println!("{masked:.2} dB with masks, {spoiled:.2} dB without");
     assert!(
         masked > 17.0 && masked > spoiled + 3.0,
@@ -397,23 +419,37 @@ fn what_masks_leave_out_is_not_learnt() {
     );
 }
 
+fn refused(folder: &Path, out: &Path, params: &str, words: &[&str]) {
+    stage("prep", params, &[("dataset", folder)], out, &[]).fails(2, words);
+}
+
 #[test]
 fn contradictions_are_refused() {
     let project = Project::tiny();
     let folder = as_transforms(&project);
     let out = project.path("out");
-    let refused = |params: &str, words: &[&str]| {
-        stage("prep", params, &[("dataset", &folder)], &out, &[]).fails(2, words);
-    };
     refused(
+        &folder,
+        &out,
         r#"{"lr_source": "photographs", "lr_width": 16}"#,
         &["parameter lr_width", "leave lr_width out"],
     );
     refused(
+        &folder,
+        &out,
         r#"{"lr_source": "photographs", "kernel": "average"}"#,
         &["parameter kernel", "choose box"],
     );
-    refused(r#"{"lr_source": "photographs", "hr_width": 16}"#, &["32", "larger than", "16"]);
+    refused(
+        &folder,
+        &out,
+        r#"{"lr_source": "photographs", "hr_width": 16}"#,
+        &["32", "larger than", "16"],
+    );
+}
+
+fn names(scene: &Path, subtree: &str) -> Vec<Value> {
+    views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect()
 }
 
 /// The paper's split: all views for training and all but the references for testing.
@@ -431,14 +467,19 @@ fn the_papers_split_leaves_references_out() {
     );
     assert_eq!(made.code, 0, "{}", made.stderr);
     assert_eq!((views(&scene.join("train")).len(), views(&scene.join("truth")).len()), (20, 17));
-    let names = |subtree: &str| -> Vec<Value> {
-        views(&scene.join(subtree)).iter().map(|v| v["camera"]["name"].clone()).collect()
-    };
-    let (references, tested) = (names("references"), names("truth"));
+    let (references, tested) = (names(&scene, "references"), names(&scene, "truth"));
     // The first view, and others far from it, of which none is tested.
     assert_eq!((references.len(), &references[0]), (3, &json!("r_0")));
     assert!(references.iter().all(|name| !tested.contains(name)), "{references:?} of {tested:?}");
     assert_ne!(references[1], json!("r_1"));
+}
+
+fn mean(project: &Project, settings: [&str; 2]) -> (f64, f64) {
+    let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
+    let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
+    project.ok(&[&["run"], &all[..]].concat());
+    let mean = project.json("eval", "metrics.json", &all)["mean"].take();
+    (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
 }
 
 /// A world without end, seen from the front and from all around: trained in NDC and in a
@@ -449,19 +490,12 @@ fn worlds_without_end_have_a_space_of_their_own() {
     let project = Project::tiny();
     project.replace("train: 12", "train: 30");
     project.replace("rays: 60000", "rays: 400000");
-    let mean = |settings: [&str; 2]| -> (f64, f64) {
-        let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
-        let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
-        project.ok(&[&["run"], &all[..]].concat());
-        let mean = project.json("eval", "metrics.json", &all)["mean"].take();
-        (mean["psnr"].as_f64().unwrap(), mean["depth"]["median_absolute"].as_f64().unwrap())
-    };
     for (layout, space, least, depth_error) in [
         ("layout=forward", "space=ndc", 22.0, 0.7),
         ("layout=around", "space=contraction", 18.0, 0.7),
     ] {
-        let (psnr, depth) = mean([layout, space]);
-        let (psnr_of_box, _) = mean([layout, "space=box"]);
+        let (psnr, depth) = mean(&project, [layout, space]);
+        let (psnr_of_box, _) = mean(&project, [layout, "space=box"]);
         println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");
         assert!(psnr > least && depth < depth_error, "{space}: {psnr} dB, depth off by {depth}");
         assert!(psnr > psnr_of_box, "{space}: {psnr} dB, box {psnr_of_box}");

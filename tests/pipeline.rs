@@ -3,7 +3,12 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::path::Path;
+use std::process::{Child, Stdio};
+
 use common::{Finished, Project};
+use safetensors::Dtype;
+use safetensors::tensor::TensorView;
 
 #[test]
 fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
@@ -67,6 +72,19 @@ fn a_sweep_shares_what_it_can() {
     assert!(project.ok(&["run", "-p", "supersample=1"]).contains("nothing to run"));
 }
 
+fn tensor_of<'a>(zeros: &'a [u8], shape: &[usize]) -> TensorView<'a> {
+    let length = 4 * shape.iter().product::<usize>();
+    TensorView::new(Dtype::F32, shape.to_vec(), &zeros[..length]).unwrap()
+}
+
+/// Tensors of zeros.
+fn write_zeros(file: &Path, shapes: &[(String, Vec<usize>)]) {
+    let longest = shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max();
+    let zeros = vec![0u8; 4 * longest.unwrap()];
+    let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), tensor_of(&zeros, shape)));
+    std::fs::write(file, safetensors::serialize(tensors, None).unwrap()).unwrap();
+}
+
 /// LPIPS stands for each network that is there with its heads, and what lacks for the others is
 /// said.
 #[test]
@@ -78,24 +96,6 @@ fn every_network_given_scores() {
     project
         .run(&arguments)
         .fails(3, &["input weights", "no network is there", "alexnet.safetensors"]);
-    let write = |file: &str, shapes: &[(String, Vec<usize>)]| {
-        let zeros =
-            vec![
-                0u8;
-                4 * shapes.iter().map(|(_, shape)| shape.iter().product::<usize>()).max().unwrap()
-            ];
-        let view = |shape: &Vec<usize>| {
-            let length = 4 * shape.iter().product::<usize>();
-            safetensors::tensor::TensorView::new(
-                safetensors::Dtype::F32,
-                shape.clone(),
-                &zeros[..length],
-            )
-            .unwrap()
-        };
-        let tensors = shapes.iter().map(|(name, shape)| (name.as_str(), view(shape)));
-        std::fs::write(folder.join(file), safetensors::serialize(tensors, None).unwrap()).unwrap();
-    };
     let layers =
         [(0, 64, 3, 11), (3, 192, 64, 5), (6, 384, 192, 3), (8, 256, 384, 3), (10, 256, 256, 3)];
     let network = layers.iter().flat_map(|&(i, outputs, inputs, size)| {
@@ -104,14 +104,14 @@ fn every_network_given_scores() {
             (format!("features.{i}.bias"), vec![outputs]),
         ]
     });
-    write("alexnet.safetensors", &network.collect::<Vec<_>>());
+    write_zeros(&folder.join("alexnet.safetensors"), &network.collect::<Vec<_>>());
     // Without its heads it isn't whole.
     project.run(&arguments).fails(3, &["no network is there"]);
     let heads = layers
         .iter()
         .enumerate()
         .map(|(k, layer)| (format!("lin{k}.model.1.weight"), vec![1, layer.1, 1, 1]));
-    write("lpips_linear_alex_v0.1.safetensors", &heads.collect::<Vec<_>>());
+    write_zeros(&folder.join("lpips_linear_alex_v0.1.safetensors"), &heads.collect::<Vec<_>>());
     project.ok(&arguments);
     let metrics = project.json("eval", "metrics.json", &arguments[1..]);
     assert!(
@@ -199,18 +199,15 @@ fn a_stage_in_python_takes_evals_place() {
     assert!(project.ok(&["run"]).contains("1 of 5 stages ran, 4 were cached"));
 }
 
+fn spawn(project: &Project) -> Child {
+    project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
 #[test]
 fn two_runners_at_once_make_everything_once() {
     let project = Project::tiny();
-    let spawn = || {
-        project
-            .command(&["run"])
-            .stdout(std::process::Stdio::piped())
-            .stderr(std::process::Stdio::piped())
-            .spawn()
-            .unwrap()
-    };
-    let runners = [spawn(), spawn()].map(|child| Finished::of(child.wait_with_output().unwrap()));
+    let runners = [spawn(&project), spawn(&project)]
+        .map(|child| Finished::of(child.wait_with_output().unwrap()));
     let mut ran = 0;
     for runner in &runners {
         assert_eq!(runner.code, 0, "{}", runner.stderr);
@@ -302,6 +299,10 @@ fn every_option_goes_through() {
     }
 }
 
+fn weights(stage: &Path, m: usize) -> Vec<u8> {
+    std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap()
+}
+
 /// Member m of several is what seed + m gives alone, and what is rendered is their mean.
 #[test]
 fn members_are_fields_of_their_own_and_average() {
@@ -325,9 +326,6 @@ fn members_are_fields_of_their_own_and_average() {
     let mut images = Vec::new();
     for (m, single) in singles.iter().enumerate() {
         project.ok(&[&["run"], &single[..]].concat());
-        let weights = |stage: &std::path::Path, m: usize| {
-            std::fs::read(stage.join(format!("field-{m}.safetensors"))).unwrap()
-        };
         assert!(
             weights(&of("train-ss", &both), m) == weights(&of("train-ss", single), 0),
             "member {m}"
@@ -336,7 +334,7 @@ fn members_are_fields_of_their_own_and_average() {
     }
     for entry in std::fs::read_dir(views.join("images")).unwrap() {
         let name = entry.unwrap().file_name();
-        let read = |folder: &std::path::Path| pixels::read_exr(&folder.join(&name)).unwrap();
+        let read = |folder: &Path| pixels::read_exr(&folder.join(&name)).unwrap();
         let (mean, a, b) = (read(&views.join("images")), read(&images[0]), read(&images[1]));
         for channel in ["R", "G", "B", "A"] {
             let samples = |image: &pixels::ExrImage| image.channel(channel).unwrap().to_vec();

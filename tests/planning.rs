@@ -138,6 +138,16 @@ fn asking_can_be_watched_and_interrupted() {
     assert_eq!(finished.code, 0, "{}", finished.stderr);
 }
 
+fn run_installed(project: &Project, arguments: &[&str]) -> Finished {
+    Finished::of(
+        Command::new(project.path("bin/nerf-sr"))
+            .args(arguments)
+            .current_dir(project.path(""))
+            .output()
+            .unwrap(),
+    )
+}
+
 /// A program that isn't there is no matter to targets that don't use it; to others the one command
 /// that builds it is said.
 #[test]
@@ -145,31 +155,23 @@ fn a_missing_program_is_missed_where_it_is_needed() {
     let project = Project::tiny();
     let own = |name: &str| -> PathBuf { project.path("bin").join(name) };
     ["nerf-sr", "demo-scene", "prep"].into_iter().for_each(|name| install(&bin(name), &own(name)));
-    let run = |arguments: &[&str]| {
-        Finished::of(
-            Command::new(own("nerf-sr"))
-                .args(arguments)
-                .current_dir(project.path(""))
-                .output()
-                .unwrap(),
-        )
-    };
     for arguments in
         [&["plan", "prep"][..], &["run", "demo-scene"], &["plan", "prep", "-p", "kernel=box"]]
     {
-        let finished = run(arguments);
+        let finished = run_installed(&project, arguments);
         assert_eq!(finished.code, 0, "{arguments:?}: {}", finished.stderr);
     }
-    run(&["plan"])
+    run_installed(&project, &["plan"])
         .fails(2, &["pipeline.yaml:9: stage train-ss: ", "train-ss isn't built; run `make build`"]);
-    run(&["plan", "prep", "-p", "rays=1"])
+    run_installed(&project, &["plan", "prep", "-p", "rays=1"])
         .fails(2, &["no stage has such a parameter", "couldn't be asked"]);
     project.replace("  demo-scene:\n", "  demo-secne:\n");
     project.replace("{dataset: demo-scene}", "{dataset: demo-secne}");
-    run(&["plan"]).fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
+    run_installed(&project, &["plan"])
+        .fails(2, &["pipeline.yaml:4: stage demo-secne", "did you mean demo-scene?"]);
     // The rest of the file is checked, needed or not.
     project.replace("lr_width: 24", "ir_width: 24");
-    run(&["plan", "demo-secne"]).fails(
+    run_installed(&project, &["plan", "demo-secne"]).fails(
         2,
         &["pipeline.yaml:8: stage prep: parameter ir_width: unknown; did you mean hr_width?"],
     );

@@ -65,6 +65,13 @@ pub(crate) fn stage_page(description: &Description) -> String {
     page
 }
 
+fn choice((word, meaning): &(String, String)) -> String {
+    match meaning.as_str() {
+        "" => format!("`{word}`"),
+        meaning => format!("`{word}`: {meaning}"),
+    }
+}
+
 fn parameters(section: &ParameterSection) -> String {
     let title = section
         .variant
@@ -77,10 +84,6 @@ fn parameters(section: &ParameterSection) -> String {
         }
         text += "\n| parameter | meaning | values | default |\n| --- | --- | --- | --- |\n";
         for member in members {
-            let choice = |(word, meaning): &(String, String)| match meaning.as_str() {
-                "" => format!("`{word}`"),
-                meaning => format!("`{word}`: {meaning}"),
-            };
             let values = match member.choices[..] {
                 [] => member.allowed.clone(),
                 ref choices => choices.iter().map(choice).collect::<Vec<_>>().join("<br>"),

@@ -3,7 +3,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::time::SystemTime;
 
@@ -29,6 +29,10 @@ const REFINED: &str = "
 
 fn project() -> Project {
     Project::shipped(&["sisr-fuse", "paper-refine"], REFINED)
+}
+
+fn green(file: &Path) -> Vec<f32> {
+    pixels::read_exr(file).unwrap().channel("G").unwrap().to_vec()
 }
 
 #[test]
@@ -70,15 +74,31 @@ fn refined_views_stand_beside_rendered_ones() {
     let none = project.path("none");
     let inputs = [("views", rendered.as_path()), ("refiner", &folder("train-refine"))];
     assert_eq!(stage("refine", r#"{"residual_weight": 0}"#, &inputs, &none, &[]).code, 0);
-    let file = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap().file_name();
-    let green = |folder: &Path| {
-        pixels::read_exr(&folder.join("images").join(&file)).unwrap().channel("G").unwrap().to_vec()
-    };
-    assert!(green(&none).iter().zip(green(&rendered)).all(|(a, b)| (a - b).abs() < 2e-3));
+    let first = rendered.join("images").read_dir().unwrap().next().unwrap().unwrap();
+    let file = Path::new("images").join(first.file_name());
+    assert!(
+        green(&none.join(&file))
+            .iter()
+            .zip(green(&rendered.join(&file)))
+            .all(|(a, b)| (a - b).abs() < 2e-3)
+    );
     // The network is for views.
     let views = rendered.as_path();
     stage("refine", "{}", &[("views", views), ("refiner", views)], &project.path("no"), &[])
         .fails(3, &["refiner.json"]);
+}
+
+/// Rows of the page of refined views.
+fn refined_rows(project: &Project, more: &[&str]) -> Vec<serde_json::Value> {
+    project.ok(&[&["run", "refined"], more].concat());
+    let text = std::fs::read(project.path("out/refined/results.json")).unwrap();
+    serde_json::from_slice(&text).unwrap()
+}
+
+fn parameters(project: &Project, stage: &str, name: &str, more: &[&str]) -> Vec<String> {
+    let rows = refined_rows(project, more);
+    let refined = rows.iter().filter(|row| row["stage"] == "eval-refined");
+    refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
 }
 
 /// What a block extends reaches it from the file and from the command line, save what it says
@@ -86,22 +106,13 @@ fn refined_views_stand_beside_rendered_ones() {
 #[test]
 fn a_block_follows_the_one_it_extends() {
     let project = project();
-    let parameters = |stage: &str, name: &str, more: &[&str]| -> Vec<String> {
-        project.ok(&[&["run", "refined"], more].concat());
-        let rows: serde_json::Value = serde_json::from_slice(
-            &std::fs::read(project.path("out/refined/results.json")).unwrap(),
-        )
-        .unwrap();
-        let refined = rows.as_array().unwrap().iter().filter(|row| row["stage"] == "eval-refined");
-        refined.map(|row| row["stages"][stage]["parameters"][name].to_string()).collect()
-    };
-    assert_eq!(parameters("downscaled-field", "n_levels", &[]), ["4"]);
+    assert_eq!(parameters(&project, "downscaled-field", "n_levels", &[]), ["4"]);
     let both = ["-p", "supersample=1,2", "-p", "rays=50000"];
-    assert_eq!(parameters("downscaled-field", "supersample", &both), ["1.0", "2.0"]);
-    assert_eq!(parameters("train-ss", "rays", &both), ["50000", "50000"]);
-    assert_eq!(parameters("downscaled-field", "rays", &both), ["40000", "40000"]);
+    assert_eq!(parameters(&project, "downscaled-field", "supersample", &both), ["1.0", "2.0"]);
+    assert_eq!(parameters(&project, "train-ss", "rays", &both), ["50000", "50000"]);
+    assert_eq!(parameters(&project, "downscaled-field", "rays", &both), ["40000", "40000"]);
     assert_eq!(
-        parameters("downscaled-field", "rays", &["-p", "downscaled-field.rays=30000"]),
+        parameters(&project, "downscaled-field", "rays", &["-p", "downscaled-field.rays=30000"]),
         ["30000"]
     );
     let own = "parameters: {rays: 40000}";
@@ -118,39 +129,40 @@ fn a_block_follows_the_one_it_extends() {
     }
 }
 
+fn at_lr(project: &Project, more: &[&str]) -> Vec<f64> {
+    let rows = refined_rows(project, more);
+    rows.iter().map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap()).collect()
+}
+
+fn refine_summary(project: &Project, more: &[&str]) -> String {
+    let folder = project.artifact("refine", &[&["refined"], more].concat());
+    std::fs::read_to_string(folder.join("summary.txt")).unwrap()
+}
+
+fn is_agreeing(project: &Project, more: &[&str]) -> bool {
+    project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"]
+        .as_bool()
+        .unwrap()
+}
+
 /// In the paper's split all views are trained on, so each one's LR image is known; where views are
 /// withheld, none is.
 #[test]
 fn views_are_consistent_with_their_own_photographs() {
     let project = project();
-    let at_lr = |more: &[&str]| -> Vec<f64> {
-        project.ok(&[&["run", "refined"], more].concat());
-        let rows: serde_json::Value = serde_json::from_slice(
-            &std::fs::read(project.path("out/refined/results.json")).unwrap(),
-        )
-        .unwrap();
-        rows.as_array()
-            .unwrap()
-            .iter()
-            .map(|r| r["mean"]["low_resolution"]["psnr"].as_f64().unwrap())
-            .collect()
-    };
-    let said = |more: &[&str]| {
-        let folder = project.artifact("refine", &[&["refined"], more].concat());
-        std::fs::read_to_string(folder.join("summary.txt")).unwrap()
-    };
-    let is_trained_so = |more: &[&str]| -> bool {
-        project.json("train-refine", "refiner.json", &[&["refined"], more].concat())["agreeing"]
-            .as_bool()
-            .unwrap()
-    };
-    let given = at_lr(&[]);
-    assert!(given[1] < given[0] + 3.0 && !said(&[]).contains("agree"), "{given:?}");
-    let papers = at_lr(&["-p", "split=paper"]);
+    let given = at_lr(&project, &[]);
+    assert!(
+        given[1] < given[0] + 3.0 && !refine_summary(&project, &[]).contains("agree"),
+        "{given:?}"
+    );
+    let papers = at_lr(&project, &["-p", "split=paper"]);
     assert!(papers[1] > papers[0] + 6.0, "{papers:?}");
-    assert!(said(&["-p", "split=paper"]).contains("agree with their own photographs"));
+    assert!(
+        refine_summary(&project, &["-p", "split=paper"])
+            .contains("agree with their own photographs")
+    );
     // The network has learnt on consistent views, too; what hasn't is said to be another task.
-    assert!(is_trained_so(&["-p", "split=paper"]) && !is_trained_so(&[]));
+    assert!(is_agreeing(&project, &["-p", "split=paper"]) && !is_agreeing(&project, &[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
     let mut command = std::process::Command::new(common::bin("refine"));
@@ -166,6 +178,24 @@ fn views_are_consistent_with_their_own_photographs() {
         "{}",
         alone.stderr
     );
+}
+
+fn refine_enlarged(
+    project: &Project,
+    views: &Path,
+    refiner: &Path,
+    name: &str,
+    enlarged: Option<&Path>,
+) -> (Finished, PathBuf) {
+    let mut inputs = vec![("views", views), ("refiner", refiner)];
+    inputs.extend(enlarged.map(|enlarged| ("enlarged", enlarged)));
+    let output = project.path(name);
+    (stage("refine", "{}", &inputs, &output, &[]), output)
+}
+
+fn green_over_white(folder: &Path, name: &str) -> Vec<f32> {
+    let file = folder.join(format!("images/{name}.exr"));
+    pixels::read_premultiplied(&file).unwrap().over(1.0).channel(1)
 }
 
 /// A view becomes the mean of what is refined and of its own photograph enlarged, where that
@@ -204,18 +234,15 @@ fn views_are_means_with_their_enlarged_photographs() {
     let inputs = [("views", photographs.as_path()), ("cameras", &cameras)];
     assert_eq!(stage("upsample", "{}", &inputs, &enlarged, &[]).code, 0);
 
-    let refine = |name: &str, enlarged: Option<&Path>| {
-        let mut inputs = vec![("views", views.as_path()), ("refiner", &refiner)];
-        inputs.extend(enlarged.map(|enlarged| ("enlarged", enlarged)));
-        let output = project.path(name);
-        (stage("refine", "{}", &inputs, &output, &[]), output)
-    };
-    let (plain, mean) = (refine("plain", None).1, refine("mean", Some(&enlarged)).1);
-    let green = |folder: &Path| {
-        let file = folder.join(format!("images/{name}.exr"));
-        pixels::read_premultiplied(&file).unwrap().over(1.0).channel(1)
-    };
-    let (plain, mean, enlarged) = (green(&plain), green(&mean), green(&enlarged));
+    let (plain, mean) = (
+        refine_enlarged(&project, &views, &refiner, "plain", None).1,
+        refine_enlarged(&project, &views, &refiner, "mean", Some(&enlarged)).1,
+    );
+    let (plain, mean, enlarged) = (
+        green_over_white(&plain, name),
+        green_over_white(&mean, name),
+        green_over_white(&enlarged, name),
+    );
     for (i, ((plain, mean), enlarged)) in plain.iter().zip(&mean).zip(&enlarged).enumerate() {
         let expected = if i % 48 < 24 { 0.5 * (plain + enlarged) } else { *plain };
         assert!(
@@ -225,9 +252,26 @@ fn views_are_means_with_their_enlarged_photographs() {
     }
     assert!(plain.iter().zip(&enlarged).any(|(a, b)| (a - b).abs() > 0.05), "both are the same");
     // Of another size.
-    refine("no", Some(&photographs))
+    refine_enlarged(&project, &views, &refiner, "no", Some(&photographs))
         .0
         .fails(3, &["input enlarged: view", "24×24 pixels where the view to refine has 48×48"]);
+}
+
+fn refine_with(
+    project: &Project,
+    views: &Path,
+    name: &str,
+    refiner: &Path,
+    more: &[(&str, &Path)],
+) -> (Finished, PathBuf) {
+    let inputs = [&[("views", views), ("refiner", refiner)], more].concat();
+    let output = project.path(name);
+    let mut command = std::process::Command::new(common::bin("refine"));
+    command.arg("--output").arg(&output);
+    for (name, folder) in inputs {
+        command.arg("--input").arg(format!("{name}={}", folder.display()));
+    }
+    (Finished::of(command.output().unwrap()), output)
 }
 
 #[test]
@@ -238,27 +282,15 @@ fn references_are_used_by_a_network_that_knows_how() {
     let (views, refiner) = (folder("finetuned-views"), folder("train-reference"));
     let (prep, reference_views, referenced) =
         (folder("prep"), folder("reference-views"), folder("refine-reference"));
-    let refine = |name: &str, refiner: &Path, more: &[(&str, &Path)]| {
-        let inputs = [&[("views", views.as_path()), ("refiner", refiner)], more].concat();
-        let output = project.path(name);
-        let mut command = std::process::Command::new(common::bin("refine"));
-        command.arg("--output").arg(&output);
-        for (name, folder) in inputs {
-            command.arg("--input").arg(format!("{name}={}", folder.display()));
-        }
-        (Finished::of(command.output().unwrap()), output)
-    };
     let references = prep.join("references");
-    let green = |folder: &Path| {
-        pixels::read_exr(&folder.join("images/r_0.exr")).unwrap().channel("G").unwrap().to_vec()
-    };
+    let image = "images/r_0.exr";
     // Without references it still refines, otherwise, and says so.
-    let (alone, output) = refine("alone", &refiner, &[]);
+    let (alone, output) = refine_with(&project, &views, "alone", &refiner, &[]);
     assert!(alone.code == 0 && alone.stderr.contains("there are none"), "{}", alone.stderr);
-    assert_ne!(green(&output), green(&referenced));
+    assert_ne!(green(&output.join(image)), green(&referenced.join(image)));
     // Images without their rendered views can't be placed.
     let both = [("references", references.as_path()), ("reference-views", views.as_path())];
-    refine("no", &refiner, &both)
+    refine_with(&project, &views, "no", &refiner, &both)
         .0
         .fails(3, &["input reference-views: no view r_0 with that pose"]);
     // A network that can't use them says so.
@@ -267,7 +299,7 @@ fn references_are_used_by_a_network_that_knows_how() {
     let plain = project.artifact("train-refine", &plain_target);
     let both =
         [("references", references.as_path()), ("reference-views", reference_views.as_path())];
-    let (left_out, _) = refine("plain", &plain, &both);
+    let (left_out, _) = refine_with(&project, &views, "plain", &plain, &both);
     assert!(
         left_out.code == 0 && left_out.stderr.contains("trained without references"),
         "{}",
@@ -298,7 +330,7 @@ fn changed(
     of: &Path,
     extension: &str,
     change: &dyn Fn(&Path),
-) -> std::path::PathBuf {
+) -> PathBuf {
     let to = project.path(name);
     for file in walkdir::WalkDir::new(of).into_iter().flatten().filter(|f| f.file_type().is_file())
     {
@@ -334,6 +366,31 @@ fn noise(seed: u64, pixel: usize) -> f32 {
     1.0 + 0.03 * (counter_rng::uniform(seed, 2, pixel as u64) - 0.5)
 }
 
+fn with_depths(project: &Project, name: &str, of: &Path, change: fn(usize, f32) -> f32) -> PathBuf {
+    changed(project, name, of, "exr", &|path| change_depth(path, change))
+}
+
+fn with_colours(
+    project: &Project,
+    references: &Path,
+    name: &str,
+    change: fn([f32; 3]) -> [f32; 3],
+) -> PathBuf {
+    changed(project, name, references, "png", &|path| {
+        let image = pixels::read_premultiplied(path).unwrap().over(1.0);
+        let data = image.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
+        pixels::write_png(path, &pixels::Image::new(image.width, image.height, 3, data).to_rgba8())
+            .unwrap();
+    })
+}
+
+fn first_psnr(prep: &Path, found: &Path) -> f64 {
+    let read = |path: &Path| pixels::read_premultiplied(path).unwrap().over(1.0);
+    let truth = prep.join("truth/images").read_dir().unwrap().next().unwrap().unwrap().path();
+    let name = truth.with_extension("exr");
+    eval::psnr(&read(&found.join("images").join(name.file_name().unwrap())), &read(&truth))
+}
+
 /// Depth with noise, depth of surfaces that lie elsewhere, references that see nothing, are of
 /// another exposure or show something else: never worse than what is rendered by more than a hair,
 /// and the log says what is wrong.
@@ -350,27 +407,7 @@ fn bad_references_do_no_harm() {
     );
     println!("{}", project.json("train-reference", "refiner.json", &target));
     let references = prep.join("references");
-    let depths = |name: &str, of: &Path, change: fn(usize, f32) -> f32| {
-        changed(&project, name, of, "exr", &|path| change_depth(path, change))
-    };
-    let images = |name: &str, change: fn([f32; 3]) -> [f32; 3]| {
-        changed(&project, name, &references, "png", &|path| {
-            let image = pixels::read_premultiplied(path).unwrap().over(1.0);
-            let data = image.data.as_chunks::<3>().0.iter().flat_map(|p| change(*p)).collect();
-            pixels::write_png(
-                path,
-                &pixels::Image::new(image.width, image.height, 3, data).to_rgba8(),
-            )
-            .unwrap();
-        })
-    };
-    let psnr = |found: &Path| {
-        let read = |path: &Path| pixels::read_premultiplied(path).unwrap().over(1.0);
-        let truth = prep.join("truth/images").read_dir().unwrap().next().unwrap().unwrap().path();
-        let name = truth.with_extension("exr");
-        eval::psnr(&read(&found.join("images").join(name.file_name().unwrap())), &read(&truth))
-    };
-    let rendered = psnr(&views);
+    let rendered = first_psnr(&prep, &views);
     let refined = |name: &str, views: &Path, references: &Path, reference_views: &Path| {
         let inputs = [
             ("views", views),
@@ -386,14 +423,14 @@ fn bad_references_do_no_harm() {
         let summary = std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap();
         println!(
             "{name}: {:.2} dB, rendered {rendered:.2}; {summary}; {}",
-            psnr(&project.path(name)),
+            first_psnr(&prep, &project.path(name)),
             finished.stderr
         );
         // Three of four seeds lose at most 0.11 dB by the shifted depth, one 0.36.
         assert!(
-            psnr(&project.path(name)) > rendered - 0.15,
+            first_psnr(&prep, &project.path(name)) > rendered - 0.15,
             "{name}: {} of {rendered}",
-            psnr(&project.path(name))
+            first_psnr(&prep, &project.path(name))
         );
         finished.stderr
     };
@@ -401,22 +438,77 @@ fn bad_references_do_no_harm() {
     assert!(!good.contains("reference r_"), "{good}");
 
     let (mine, theirs) = (
-        depths("a", &views, |i, z| z * noise(1, i)),
-        depths("b", &reference_views, |i, z| z * noise(3, i)),
+        with_depths(&project, "a", &views, |i, z| z * noise(1, i)),
+        with_depths(&project, "b", &reference_views, |i, z| z * noise(3, i)),
     );
     refined("noisy", &mine, &references, &theirs);
-    let (mine, theirs) =
-        (depths("c", &views, |_, _| 2.5), depths("d", &reference_views, |_, _| 2.5));
+    let (mine, theirs) = (
+        with_depths(&project, "c", &views, |_, _| 2.5),
+        with_depths(&project, "d", &reference_views, |_, _| 2.5),
+    );
     let said = refined("shifted", &mine, &references, &theirs);
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
-    let said =
-        refined("hidden", &views, &references, &depths("e", &reference_views, |_, z| 0.01 * z));
+    let said = refined(
+        "hidden",
+        &views,
+        &references,
+        &with_depths(&project, "e", &reference_views, |_, z| 0.01 * z),
+    );
     assert!(said.contains("sees nothing of these views"), "{said}");
-    let said = refined("dark", &views, &images("f", |p| p.map(|v| 0.6 * v)), &reference_views);
+    let said = refined(
+        "dark",
+        &views,
+        &with_colours(&project, &references, "f", |p| p.map(|v| 0.6 * v)),
+        &reference_views,
+    );
     assert!(said.contains("has another exposure"), "{said}");
-    let said =
-        refined("other", &views, &images("g", |[r, g, b]| [g, b, 1.0 - r]), &reference_views);
+    let said = refined(
+        "other",
+        &views,
+        &with_colours(&project, &references, "g", |[r, g, b]| [g, b, 1.0 - r]),
+        &reference_views,
+    );
     assert!(said.contains("looks otherwise than what is rendered"), "{said}");
+}
+
+fn mean_psnr(project: &Project, arguments: &[&str], stage: &str) -> f64 {
+    let metrics = project.json(stage, "metrics.json", arguments);
+    metrics["mean"]["psnr"].as_f64().unwrap()
+}
+
+fn member_weights(field: &Path, member: u32) -> Option<Vec<u8>> {
+    std::fs::read(field.join(format!("field-{member}.safetensors"))).ok()
+}
+
+fn gone_on(project: &Project, first: &Path, combine: &str, rays: &str, references: &str) -> f64 {
+    let given = [("rays", rays), ("max_references", references), ("combine", combine)]
+        .map(|(name, value)| format!("finetuned-field.{name}={value}"));
+    let more = [
+        "-p",
+        "prep.hr_references=6",
+        "-p",
+        "train-ss.rays=800000",
+        "-p",
+        &given[0],
+        "-p",
+        &given[1],
+        "-p",
+        &given[2],
+    ];
+    let arguments = [&["eval-finetuned"], &more[..]].concat();
+    project.ok(&[&["run"], &arguments[..]].concat());
+    let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"]
+        .as_f64()
+        .unwrap();
+    println!("{on:.2} dB, {given:?}");
+    let field = project.artifact("finetuned-field", &arguments);
+    assert_eq!(member_weights(&field, 1).is_some(), combine == "ensemble");
+    assert_eq!(
+        member_weights(&field, 0) == member_weights(first, 0),
+        combine == "ensemble",
+        "the initial field is the first member"
+    );
+    on
 }
 
 /// HR references that join the training: what they show is learnt.
@@ -439,64 +531,49 @@ fn references_join_a_training() {
     let arguments =
         ["eval", "eval-joined", "-p", "prep.hr_references=6", "-p", "train-ss.rays=800000"];
     project.ok(&[&["run"], &arguments[..]].concat());
-    let psnr = |stage: &str| {
-        let metrics = project.json(stage, "metrics.json", &arguments);
-        metrics["mean"]["psnr"].as_f64().unwrap()
-    };
     println!(
         "{:.2} dB from LR images, {:.2} dB with six of twelve at HR",
-        psnr("eval"),
-        psnr("eval-joined")
+        mean_psnr(&project, &arguments, "eval"),
+        mean_psnr(&project, &arguments, "eval-joined")
     );
-    assert!(psnr("eval-joined") > psnr("eval") + 0.3);
+    assert!(
+        mean_psnr(&project, &arguments, "eval-joined")
+            > mean_psnr(&project, &arguments, "eval") + 0.3
+    );
     // Half as many rays do, where the training goes on from what LR images gave and both fields, or
     // their weights' mean, are kept. Few rays, or one reference alone, lose nothing of that.
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
-        let on = |rays: &str, references: &str| {
-            let given = [("rays", rays), ("max_references", references), ("combine", combine)]
-                .map(|(name, value)| format!("finetuned-field.{name}={value}"));
-            let more = [
-                "-p",
-                "prep.hr_references=6",
-                "-p",
-                "train-ss.rays=800000",
-                "-p",
-                &given[0],
-                "-p",
-                &given[1],
-                "-p",
-                &given[2],
-            ];
-            let arguments = [&["eval-finetuned"], &more[..]].concat();
-            project.ok(&[&["run"], &arguments[..]].concat());
-            let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"]
-                .as_f64()
-                .unwrap();
-            println!("{on:.2} dB, {given:?}");
-            let field = project.artifact("finetuned-field", &arguments);
-            let weights = |field: &Path, member: u32| {
-                std::fs::read(field.join(format!("field-{member}.safetensors"))).ok()
-            };
-            assert_eq!(weights(&field, 1).is_some(), combine == "ensemble");
-            assert_eq!(
-                weights(&field, 0) == weights(&first, 0),
-                combine == "ensemble",
-                "the initial field is the first member"
-            );
-            on
-        };
-        assert!(on("100000", "6") > psnr("eval") + 0.2);
-        assert!(on("8000", "6") > psnr("eval") - 0.02);
-        assert!(on("100000", "1") > psnr("eval") - 0.02);
+        assert!(
+            gone_on(&project, &first, combine, "100000", "6")
+                > mean_psnr(&project, &arguments, "eval") + 0.2
+        );
+        assert!(
+            gone_on(&project, &first, combine, "8000", "6")
+                > mean_psnr(&project, &arguments, "eval") - 0.02
+        );
+        assert!(
+            gone_on(&project, &first, combine, "100000", "1")
+                > mean_psnr(&project, &arguments, "eval") - 0.02
+        );
     }
     // None of them, and all is as without.
     let none = [&arguments[..], &["-p", "joined-field.max_references=0"]].concat();
     project.ok(&[&["run"], &none[..]].concat());
-    let weights = |stage: &str| {
-        std::fs::read(project.artifact(stage, &none).join("field-0.safetensors")).unwrap()
-    };
+    let weights = |stage: &str| member_weights(&project.artifact(stage, &none), 0).unwrap();
     assert!(weights("joined-field") == weights("train-ss"));
+}
+
+fn cannot_go_on(project: &Project, scene: &Path, parameters: &str, field: &Path, words: &[&str]) {
+    stage("train-ss", parameters, &[("scene", scene), ("init", field)], &project.path("no"), &[])
+        .fails(3, words);
+    assert!(!project.path("no").exists());
+}
+
+fn with_file(project: &Project, field: &Path, name: &str, file: &str) -> PathBuf {
+    let field = changed(project, name, field, "none", &|_| ());
+    std::fs::write(field.join("field.json"), file).unwrap();
+    field
 }
 
 /// Only a field that the same parameters give of the same scene can be gone on from.
@@ -507,37 +584,31 @@ fn other_fields_are_not_gone_on_from() {
     let folder = |stage: &str| project.artifact(stage, &["train-ss"]);
     let (scene, field) = (folder("prep").join("train"), folder("train-ss"));
     let file = std::fs::read_to_string(field.join("field.json")).unwrap();
-    let fails = |parameters: &str, field: &Path, words: &[&str]| {
-        stage(
-            "train-ss",
-            parameters,
-            &[("scene", scene.as_path()), ("init", field)],
-            &project.path("no"),
-            &[],
-        )
-        .fails(3, words);
-        assert!(!project.path("no").exists());
-    };
-    fails("{}", &field, &["input init: it is made of something else than the parameters ask for"]);
-    let with = |name: &str, file: &str| {
-        let field = changed(&project, name, &field, "none", &|_| ());
-        std::fs::write(field.join("field.json"), file).unwrap();
-        field
-    };
+    cannot_go_on(
+        &project,
+        &scene,
+        "{}",
+        &field,
+        &["input init: it is made of something else than the parameters ask for"],
+    );
     let own = r#"{"rays": 8000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 128}"#;
-    fails(
+    cannot_go_on(
+        &project,
+        &scene,
         own,
-        &with("black", &file.replace("\"white\"", "\"black\"")),
+        &with_file(&project, &field, "black", &file.replace("\"white\"", "\"black\"")),
         &["input init: it has another background"],
     );
-    fails(
+    cannot_go_on(
+        &project,
+        &scene,
         own,
-        &with("far", &file.replace("\"far\": ", "\"far\": 1")),
+        &with_file(&project, &field, "far", &file.replace("\"far\": ", "\"far\": 1")),
         &["input init: it lies elsewhere"],
     );
-    let cut = with("cut", &file);
+    let cut = with_file(&project, &field, "cut", &file);
     std::fs::write(cut.join("field-0.safetensors"), b"{").unwrap();
-    fails(own, &cut, &["input init", "field-0.safetensors"]);
+    cannot_go_on(&project, &scene, own, &cut, &["input init", "field-0.safetensors"]);
     // Nor can more than sixteen be kept.
     let many = own.replace('{', r#"{"ensemble": 16, "#);
     stage(
@@ -601,6 +672,21 @@ fn a_training_killed_at_any_moment_ends_in_the_same_bytes_at_any_thread_count() 
     assert_eq!(manifest(&output), manifest(&whole));
 }
 
+fn kept(work: &Path) -> Vec<PathBuf> {
+    let found = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
+    let manifests = found
+        .filter(|f| f.file_name() == "artifact.json")
+        .map(|f| f.path().parent().unwrap().to_owned());
+    manifests.filter(|part| !part.file_name().unwrap().to_string_lossy().starts_with('.')).collect()
+}
+
+fn written(parts: &[PathBuf]) -> Vec<SystemTime> {
+    parts
+        .iter()
+        .map(|part| part.join("artifact.json").metadata().unwrap().modified().unwrap())
+        .collect()
+}
+
 /// Views that were rendered or refined before a kill aren't made again, unless they are damaged or
 /// something else was asked for.
 #[test]
@@ -620,15 +706,6 @@ fn views_that_were_finished_are_kept() {
         ("references", &references),
         ("reference-views", &rendered),
     ];
-    let kept = |work: &Path| -> Vec<std::path::PathBuf> {
-        let found = walkdir::WalkDir::new(work).sort_by_file_name().into_iter().flatten();
-        let manifests = found
-            .filter(|f| f.file_name() == "artifact.json")
-            .map(|f| f.path().parent().unwrap().to_owned());
-        manifests
-            .filter(|part| !part.file_name().unwrap().to_string_lossy().starts_with('.'))
-            .collect()
-    };
     for (name, inputs, params, other) in [
         ("render-depth", &render[..], r#"{"size": 120}"#, r#"{"size": 40}"#),
         ("refine", &refine, r#"{"self_ensemble": 8}"#, r#"{"self_ensemble": 1}"#),
@@ -647,12 +724,6 @@ fn views_that_were_finished_are_kept() {
         wait_until(|| !kept(&work).is_empty() || child.try_wait().unwrap().is_some());
         signal(&child, "-KILL");
         child.wait().unwrap();
-        let written = |parts: &[std::path::PathBuf]| -> Vec<SystemTime> {
-            parts
-                .iter()
-                .map(|part| part.join("artifact.json").metadata().unwrap().modified().unwrap())
-                .collect()
-        };
         let again = |output: &str, params: &str| {
             let output = project.path(output);
             let finished = stage(name, params, inputs, &output, &more);
@@ -696,24 +767,34 @@ fn views_that_were_finished_are_kept() {
     }
 }
 
+fn train(project: &Project, params: &str, views: &Path, truth: &Path) -> Finished {
+    stage("train-refine", params, &[("views", views), ("truth", truth)], &project.path("no"), &[])
+}
+
 #[test]
 fn wrong_views_are_refused_in_a_line() {
     let project = project();
     let (views, truth, _) = training(&project);
-    let train = |params: &str, views: &Path, truth: &Path| {
-        stage(
-            "train-refine",
-            params,
-            &[("views", views), ("truth", truth)],
-            &project.path("no"),
-            &[],
-        )
-    };
-    train(r#"{"patch_size": 15}"#, &views, &truth).fails(2, &["parameter patch_size: 15 is odd"]);
-    train("{}", &views, &truth.with_file_name("downscaled"))
+    train(&project, r#"{"patch_size": 15}"#, &views, &truth)
+        .fails(2, &["parameter patch_size: 15 is odd"]);
+    train(&project, "{}", &views, &truth.with_file_name("downscaled"))
         .fails(3, &["24×24 pixels where its image has 12×12"]);
-    train("{}", &views, &truth.with_file_name("truth"))
+    train(&project, "{}", &views, &truth.with_file_name("truth"))
         .fails(3, &["none of them has an image, by name and pose, in input truth"]);
+}
+
+fn fails_to_train(
+    project: &Project,
+    inputs: &[(&str, &Path)],
+    params: &str,
+    weights: Option<&Path>,
+    code: i32,
+    words: &[&str],
+) {
+    let output = project.path("failed");
+    let mut inputs = inputs.to_vec();
+    inputs.extend(weights.map(|folder| ("weights", folder)));
+    stage("train-refine", params, &inputs, &output, &[]).fails(code, words);
 }
 
 /// The published network goes through the same stages; what it can't do is said.
@@ -737,18 +818,29 @@ fn the_paper_s_network_refines_by_references() {
     assert_eq!(done.code, 0, "{}", done.stderr);
     // Weights of no network, and patches that fit nowhere.
     let (scene, own) = (folder("prep").join("references"), folder("reference-views"));
-    let fails = |params: &str, weights: Option<&Path>, code: i32, words: &[&str]| {
-        let output = project.path("failed");
-        let mut inputs = vec![("views", own.as_path()), ("truth", scene.as_path())];
-        inputs.extend(weights.map(|folder| ("weights", folder)));
-        stage("train-refine", params, &inputs, &output, &[]).fails(code, words);
-    };
-    fails(
+    let inputs = [("views", own.as_path()), ("truth", scene.as_path())];
+    fails_to_train(
+        &project,
+        &inputs,
         r#"{"net": "paper", "steps": 1}"#,
         Some(&scene),
         3,
         &["input weights", "vgg19.safetensors"],
     );
-    fails(r#"{"net": "paper", "patch_size": 96}"#, None, 3, &["smaller than a patch of 96×96"]);
-    fails(r#"{"net": "paper", "patch_size": 20}"#, None, 3, &["multiple of 8"]);
+    fails_to_train(
+        &project,
+        &inputs,
+        r#"{"net": "paper", "patch_size": 96}"#,
+        None,
+        3,
+        &["smaller than a patch of 96×96"],
+    );
+    fails_to_train(
+        &project,
+        &inputs,
+        r#"{"net": "paper", "patch_size": 20}"#,
+        None,
+        3,
+        &["multiple of 8"],
+    );
 }

@@ -73,27 +73,32 @@ fn cells(line: &str) -> Vec<String> {
     cells.map(|cell| if cell == "–" { String::new() } else { cell }).collect()
 }
 
+fn is_first(lines: &[&str], place: usize) -> bool {
+    lines[place].starts_with('|') && (place == 0 || !lines[place - 1].starts_with('|'))
+}
+
+fn table_at<'a>(lines: &[&'a str], place: usize) -> Vec<&'a str> {
+    lines[place..].iter().take_while(|line| line.starts_with('|')).copied().collect()
+}
+
 /// The tables of a text: the line before, and their lines.
 fn tables(text: &str) -> Vec<(&str, Vec<&str>)> {
     let lines: Vec<&str> = text.lines().collect();
-    let is_first = |&place: &usize| {
-        lines[place].starts_with('|') && (place == 0 || !lines[place - 1].starts_with('|'))
-    };
-    let firsts = (0..lines.len()).filter(is_first);
-    let table = |place: usize| {
-        lines[place..].iter().take_while(|line| line.starts_with('|')).copied().collect()
-    };
-    firsts.map(|place| (if place == 0 { "" } else { lines[place - 1] }, table(place))).collect()
+    let firsts = (0..lines.len()).filter(|&place| is_first(&lines, place));
+    firsts
+        .map(|place| (if place == 0 { "" } else { lines[place - 1] }, table_at(&lines, place)))
+        .collect()
+}
+
+fn command_of(comment: &str) -> Option<String> {
+    Some(comment.strip_prefix("<!-- nerf-sr ")?.strip_suffix(" -->")?.to_owned())
 }
 
 /// The marked tables of a document.
 fn marked(text: &str) -> Vec<Marked> {
-    let command = |comment: &str| {
-        Some(comment.strip_prefix("<!-- nerf-sr ")?.strip_suffix(" -->")?.to_owned())
-    };
     let found = tables(text).into_iter().filter_map(|(before, lines)| {
         Some(Marked {
-            command: command(before)?.split_whitespace().map(str::to_owned).collect(),
+            command: command_of(before)?.split_whitespace().map(str::to_owned).collect(),
             head: cells(lines[0]),
             rows: lines[2..].iter().map(|line| cells(line)).collect(),
         })
@@ -169,6 +174,10 @@ fn experiments_make_these_tables() {
     }
 }
 
+fn is_meant((before, lines): &(&str, Vec<&str>), comment: &str, head: &[String]) -> bool {
+    *before == comment.trim_end() && cells(lines[0]) == head
+}
+
 /// Puts the tables that the commands made at full budgets into the documents; those whose command
 /// hasn't run stay.
 #[test]
@@ -186,10 +195,12 @@ fn what_was_measured_is_put_into_the_documents() {
                 continue;
             };
             let comment = format!("<!-- nerf-sr {} -->\n", table.command.join(" "));
-            let is_meant = |(before, lines): &(&str, Vec<&str>)| {
-                *before == comment.trim_end() && cells(lines[0]) == table.head
-            };
-            let old = tables(&text).into_iter().find(is_meant).unwrap().1.join("\n");
+            let old = tables(&text)
+                .into_iter()
+                .find(|one| is_meant(one, &comment, &table.head))
+                .unwrap()
+                .1
+                .join("\n");
             text = text.replacen(
                 &format!("{comment}{old}"),
                 &format!("{comment}{}", lines.join("\n")),

@@ -107,7 +107,28 @@ struct Cluster {
     dir: tempfile::TempDir,
 }
 
+fn word_after(text: &str, key: &str) -> String {
+    text.split_whitespace().find_map(|word| word.strip_prefix(key)).unwrap_or_default().to_owned()
+}
+
 impl Cluster {
+    /// One try: somebody else may take a port between the look and the start.
+    fn try_start() -> Option<Self> {
+        // Socket paths are short: not in a test's own deep folder.
+        let cluster =
+            Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
+        let mut script = cluster.script("start");
+        script.env("MINI_SLURM_PORT", free_ports().to_string()).env("MINI_SLURM_FAKE_GPUS", "2");
+        // The daemons would hold a pipe open, and write into the lines of tests.
+        script
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .status()
+            .unwrap()
+            .success()
+            .then_some(cluster)
+    }
+
     /// A new one; without Slurm's programs it says so and is none.
     fn start() -> Option<Self> {
         let path = std::env::var("PATH").unwrap_or_default() + ":/usr/sbin";
@@ -117,25 +138,7 @@ impl Cluster {
             eprintln!("skipped: no {missing}");
             return None;
         }
-        // Socket paths are short: not in a test's own deep folder.
-        // Somebody else may take a port between the look and the start.
-        let start = || {
-            let cluster =
-                Self { dir: tempfile::Builder::new().prefix("ms").tempdir_in("/tmp").unwrap() };
-            let mut script = cluster.script("start");
-            script
-                .env("MINI_SLURM_PORT", free_ports().to_string())
-                .env("MINI_SLURM_FAKE_GPUS", "2");
-            // The daemons would hold a pipe open, and write into the lines of tests.
-            script
-                .stdout(Stdio::null())
-                .stderr(Stdio::null())
-                .status()
-                .unwrap()
-                .success()
-                .then_some(cluster)
-        };
-        let cluster = (0..3).find_map(|_| start());
+        let cluster = (0..3).find_map(|_| Self::try_start());
         assert!(cluster.is_some(), "the cluster doesn't start");
         cluster
     }
@@ -192,14 +195,7 @@ impl Cluster {
     /// Slurm's word on a job: `COMPLETED 0:0`.
     fn state(&self, job: &str) -> String {
         let shown = self.slurm("scontrol", &["-o", "show", "job", job]);
-        let of = |key: &str| {
-            shown
-                .split_whitespace()
-                .find_map(|word| word.strip_prefix(key))
-                .unwrap_or_default()
-                .to_owned()
-        };
-        format!("{} {}", of("JobState="), of("ExitCode="))
+        format!("{} {}", word_after(&shown, "JobState="), word_after(&shown, "ExitCode="))
     }
 }
 
@@ -437,16 +433,19 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     assert!(cluster.ok(&shared, &["verify"]).contains("0 damaged"));
 }
 
+fn names_folder(entry: &std::fs::DirEntry, folder: &[u8]) -> bool {
+    let words = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
+    words.windows(folder.len()).any(|window| window == folder)
+}
+
 /// Processes whose command line names a project: its jobs' runners and stages.
 fn processes(project: &Project) -> Vec<String> {
     let folder = project.path("").into_os_string().into_encoded_bytes();
     let entries = std::fs::read_dir("/proc").unwrap().map(|entry| entry.unwrap());
-    let names_it = |entry: &std::fs::DirEntry| {
-        let words = std::fs::read(entry.path().join("cmdline")).unwrap_or_default();
-        words.windows(folder.len()).any(|window| window == folder)
-    };
-    let mut found: Vec<String> =
-        entries.filter(names_it).map(|entry| entry.file_name().into_string().unwrap()).collect();
+    let mut found: Vec<String> = entries
+        .filter(|entry| names_folder(entry, &folder))
+        .map(|entry| entry.file_name().into_string().unwrap())
+        .collect();
     found.sort();
     found
 }
@@ -556,6 +555,12 @@ fn fake(project: &Project, name: &str, more: &str) {
     );
 }
 
+fn run_on_path(project: &Project, path: &str, arguments: &[&str]) -> Finished {
+    let command = with_environment(command(project, arguments), "PATH", Path::new(path));
+    let mut command = with_environment(command, "NERF_SR_SITE", Path::new("site.yaml"));
+    Finished::of(command.output().unwrap())
+}
+
 #[test]
 fn what_slurm_is_told() {
     let project = project(
@@ -568,13 +573,8 @@ fn what_slurm_is_told() {
     fake(&project, "squeue", "cat queue 2>/dev/null || true");
     fake(&project, "scancel", "");
     let path = format!("{}:{}", project.path("bin").display(), std::env::var("PATH").unwrap());
-    let run = |arguments: &[&str]| {
-        let command = with_environment(command(&project, arguments), "PATH", Path::new(&path));
-        let mut command = with_environment(command, "NERF_SR_SITE", Path::new("site.yaml"));
-        Finished::of(command.output().unwrap())
-    };
     project.write("site.yaml", "partition: gpu\nmax_submit: 2\nsetup: [module load cuda]\n");
-    let said = run(&["run"]);
+    let said = run_on_path(&project, &path, &["run"]);
     assert_eq!(
         (said.code, said.stdout.as_str()),
         (0, "first: job 41\nlast: job 42\n2 jobs submitted, 0 queued before\n"),
@@ -609,32 +609,40 @@ fn what_slurm_is_told() {
     let script = lines[0].split_whitespace().find(|word| word.ends_with("job.sh")).unwrap();
     project
         .write("queue", &format!("41|RUNNING|None|{script} 0\n42|PENDING|Dependency|{script} 1\n"));
-    assert!(run(&["run"]).stdout.contains("0 jobs submitted, 2 queued before"));
+    assert!(
+        run_on_path(&project, &path, &["run"]).stdout.contains("0 jobs submitted, 2 queued before")
+    );
     project.write("site.yaml", "max_submit: 3\n");
-    let said = run(&["run"]);
+    let said = run_on_path(&project, &path, &["run"]);
     assert_eq!(said.stdout, "page: job 43\n1 job submitted, 2 queued before\n");
     assert!(
         std::fs::read_to_string(project.path("sbatch.called"))
             .unwrap()
             .contains("--dependency=afterok:42 ")
     );
-    let status = run(&["status"]).stdout;
+    let status = run_on_path(&project, &path, &["status"]).stdout;
     assert!(
         status.contains("job 41 running") && status.contains("job 42 pending: Dependency"),
         "{status}"
     );
-    let json: serde_json::Value = serde_json::from_str(&run(&["status", "--json"]).stdout).unwrap();
+    let json: serde_json::Value =
+        serde_json::from_str(&run_on_path(&project, &path, &["status", "--json"]).stdout).unwrap();
     assert_eq!(json["nodes"][0]["job"]["state"], "RUNNING", "{json}");
-    assert!(run(&["cancel", "last"]).stdout.contains("cancelled 1 job of last"));
+    assert!(
+        run_on_path(&project, &path, &["cancel", "last"])
+            .stdout
+            .contains("cancelled 1 job of last")
+    );
     assert_eq!(std::fs::read_to_string(project.path("scancel.called")).unwrap(), "42\n");
     // Refusals are one line, and nothing is lost.
     fake(&project, "sbatch", "echo 'sbatch: error: invalid partition' >&2; exit 1");
     project.write("queue", "");
-    run(&["run"]).fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
-    run(&["run", "-j", "2"])
+    run_on_path(&project, &path, &["run"])
+        .fails(1, &["3 jobs left: sbatch: error: invalid partition; run this again"]);
+    run_on_path(&project, &path, &["run", "-j", "2"])
         .fails(2, &["--jobs, --threads, --memory and --keep-going are for --executor local"]);
     project.write("site.yaml", "partitions: gpu\n");
-    run(&["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
+    run_on_path(&project, &path, &["run"]).fails(2, &["site.yaml", "unknown field `partitions`"]);
     std::fs::remove_file(project.path("bin/squeue")).unwrap();
     let mut alone = with_environment(
         command(&project, &["gc", "--keep-days", "0"]),

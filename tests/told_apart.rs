@@ -27,6 +27,29 @@ fn prepared(project: &Project, dataset: &Path, params: &Value) -> (String, Strin
     (summary["background"].as_str().unwrap().to_owned(), space, summary["notes"].to_string())
 }
 
+fn chosen(folder: &Path, file: &str) -> Vec<String> {
+    let transforms: Value =
+        serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
+    let frames = transforms["frames"].as_array().unwrap();
+    frames
+        .iter()
+        .map(|frame| {
+            Path::new(frame["file_path"].as_str().unwrap())
+                .file_name()
+                .unwrap()
+                .to_str()
+                .unwrap()
+                .to_owned()
+        })
+        .collect()
+}
+
+fn over_white(p: &[u8]) -> [u8; 4] {
+    let alpha = u32::from(p[3]);
+    let level = |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
+    [level(0), level(1), level(2), 255]
+}
+
 /// Some views of a Blender scene, as RGB on white.
 fn on_white(source: &Path, folder: &Path) {
     for split in ["train", "test"] {
@@ -39,23 +62,8 @@ fn on_white(source: &Path, folder: &Path) {
         std::fs::write(folder.join(format!("transforms_{split}.json")), transforms.to_string())
             .unwrap();
     }
-    let chosen = |file: &str| -> Vec<String> {
-        let transforms: Value =
-            serde_json::from_str(&std::fs::read_to_string(folder.join(file)).unwrap()).unwrap();
-        let frames = transforms["frames"].as_array().unwrap();
-        frames
-            .iter()
-            .map(|frame| {
-                Path::new(frame["file_path"].as_str().unwrap())
-                    .file_name()
-                    .unwrap()
-                    .to_str()
-                    .unwrap()
-                    .to_owned()
-            })
-            .collect()
-    };
-    let (train, test) = (chosen("transforms_train.json"), chosen("transforms_test.json"));
+    let (train, test) =
+        (chosen(folder, "transforms_train.json"), chosen(folder, "transforms_test.json"));
     let set = Dataset::read(source).unwrap();
     let given = set.split.clone().unwrap();
     for (split, numbers, names) in [("train", given.train, train), ("test", given.test, test)] {
@@ -66,13 +74,7 @@ fn on_white(source: &Path, folder: &Path) {
                 continue;
             }
             let image = frame.photograph().unwrap();
-            let over = |p: &[u8]| {
-                let alpha = u32::from(p[3]);
-                let level =
-                    |c: usize| ((u32::from(p[c]) * alpha + 255 * (255 - alpha)) / 255) as u8;
-                [level(0), level(1), level(2), 255]
-            };
-            let data = image.data.chunks_exact(4).flat_map(over).collect();
+            let data = image.data.chunks_exact(4).flat_map(over_white).collect();
             write_png(
                 &folder.join(split).join(format!("{name}.png")),
                 &Rgba8::new(image.width, image.height, data),
@@ -99,24 +101,30 @@ fn objects_on_white_stay_in_a_box_on_white() {
     }
 }
 
+fn demo(
+    project: &Project,
+    folder: &Path,
+    layout: &str,
+    backdrop: bool,
+) -> (String, String, String) {
+    std::fs::remove_dir_all(folder).ok();
+    let params = json!({"form": "transforms", "backdrop": backdrop, "layout": layout,
+        "size": 64, "aspect": 1.5, "train": 12, "test": 3,
+        "samples_per_axis": 1});
+    assert_eq!(stage("demo-scene", &params.to_string(), &[], folder, &[]).code, 0);
+    prepared(project, folder, &json!({}))
+}
+
 #[test]
 fn photographs_of_a_scene_that_goes_on_are_opaque_and_unbounded() {
     let project = Project::tiny();
     let folder = project.path("photographs");
-    let demo = |layout: &str, backdrop: bool| {
-        std::fs::remove_dir_all(&folder).ok();
-        let params = json!({"form": "transforms", "backdrop": backdrop, "layout": layout,
-            "size": 64, "aspect": 1.5, "train": 12, "test": 3,
-            "samples_per_axis": 1});
-        assert_eq!(stage("demo-scene", &params.to_string(), &[], &folder, &[]).code, 0);
-        prepared(&project, &folder, &json!({}))
-    };
-    let (background, space, notes) = demo("around", true);
+    let (background, space, notes) = demo(&project, &folder, "around", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "contraction"), "{notes}");
     assert!(notes.contains("of 12 views looked at: the scene goes on behind"), "{notes}");
-    let (background, space, notes) = demo("forward", true);
+    let (background, space, notes) = demo(&project, &folder, "forward", true);
     assert_eq!((background.as_str(), space.as_str()), ("opaque", "ndc"), "{notes}");
-    let (background, space, notes) = demo("around", false);
+    let (background, space, notes) = demo(&project, &folder, "around", false);
     assert_eq!((background.as_str(), space.as_str()), ("white", "box"), "{notes}");
     // What is said by hand holds.
     let (background, space, _) = prepared(&project, &folder, &json!({"background": "opaque"}));

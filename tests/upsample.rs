@@ -32,6 +32,21 @@ fn goldens() -> std::path::PathBuf {
     common::root().join("stages/upsample/tests/goldens")
 }
 
+fn fails_to_upsample(
+    project: &Project,
+    inputs: &[(&str, &Path)],
+    params: &str,
+    weights: Option<&Path>,
+    code: i32,
+    words: &[&str],
+) {
+    let output = project.path("none");
+    let mut inputs = inputs.to_vec();
+    inputs.extend(weights.map(|weights| ("weights", weights)));
+    stage("upsample", params, &inputs, &output, &[]).fails(code, words);
+    assert!(!output.exists());
+}
+
 #[test]
 fn views_are_enlarged_and_scored() {
     let project = project();
@@ -90,29 +105,43 @@ fn views_are_enlarged_and_scored() {
         assert_eq!(manifest(&output), manifest(&project.object(&outputs[0])), "{threads} threads");
     }
 
-    let fails = |params: &str, weights: Option<&Path>, code: i32, words: &[&str]| {
-        let output = project.path("none");
-        let mut inputs = vec![("views", views.as_path()), ("cameras", cameras.as_path())];
-        inputs.extend(weights.map(|weights| ("weights", weights)));
-        stage("upsample", params, &inputs, &output, &[]).fails(code, words);
-        assert!(!output.exists());
-    };
-    fails(r#"{"method": "imdn"}"#, None, 2, &["weights is missing", "imdn", "convert-weights.py"]);
-    fails(r#"{"method": "imdn"}"#, Some(&weights), 3, &["no file imdn_x2.safetensors"]);
-    fails(
+    let inputs = [("views", views.as_path()), ("cameras", cameras.as_path())];
+    fails_to_upsample(
+        &project,
+        &inputs,
+        r#"{"method": "imdn"}"#,
+        None,
+        2,
+        &["weights is missing", "imdn", "convert-weights.py"],
+    );
+    fails_to_upsample(
+        &project,
+        &inputs,
+        r#"{"method": "imdn"}"#,
+        Some(&weights),
+        3,
+        &["no file imdn_x2.safetensors"],
+    );
+    fails_to_upsample(
+        &project,
+        &inputs,
         r#"{"method": "imdn", "file": "liif.safetensors"}"#,
         Some(&weights),
         3,
         &["fea_conv", "the right network"],
     );
-    fails(
+    fails_to_upsample(
+        &project,
+        &inputs,
         r#"{"method": "liif", "file": "../weights/liif.safetensors"}"#,
         Some(&weights),
         2,
         &["no name of a file"],
     );
     std::fs::copy(goldens().join("imdn.safetensors"), weights.join("imdn_x2.safetensors")).unwrap();
-    fails(
+    fails_to_upsample(
+        &project,
+        &inputs,
         r#"{"method": "imdn"}"#,
         Some(&weights),
         3,

@@ -109,13 +109,14 @@ fn write_split(folder: &Path, split: &str, centres: &[DVec3]) {
     std::fs::write(folder.join(format!("transforms_{split}.json")), list.to_string()).unwrap();
 }
 
+fn around(turn: f64, height: f64) -> DVec3 {
+    let level = (1.0 - height * height).sqrt();
+    3.5 * DVec3::new(level * turn.sin(), -level * turn.cos(), height)
+}
+
 /// A data set of the boards; test views are one from the front, one from the side, and one that
 /// looks straight down.
 fn text_scene(folder: &Path) {
-    let around = |turn: f64, height: f64| {
-        let level = (1.0 - height * height).sqrt();
-        3.5 * DVec3::new(level * turn.sin(), -level * turn.cos(), height)
-    };
     let train: Vec<DVec3> =
         (0..40).map(|i| around(2.4 * f64::from(i), 0.02 + 0.97 * f64::from(i) / 40.0)).collect();
     write_split(folder, "train", &train);
@@ -173,6 +174,11 @@ fn other_spaces_are_refused() {
     assert!(!project.path("out/viewer/index.html").exists());
 }
 
+fn far(state: &Value) -> f64 {
+    let centre = state["centre"].as_array().unwrap().iter();
+    centre.map(|c| c.as_f64().unwrap().powi(2)).sum::<f64>().sqrt()
+}
+
 /// What people do with mouse, keys and fingers changes the view as they expect.
 #[test]
 fn people_can_look_around() {
@@ -195,10 +201,6 @@ fn people_can_look_around() {
     }
     assert!(desktop("arrow")["camera"] == -1 && desktop("arrow")["frusta"] == false);
     assert_eq!(desktop("frusta")["frusta"], true);
-    let far = |state: &Value| {
-        let centre = state["centre"].as_array().unwrap().iter();
-        centre.map(|c| c.as_f64().unwrap().powi(2)).sum::<f64>().sqrt()
-    };
     assert!(far(&desktop("wheel")) > 1.1 * far(&desktop("arrow")), "the wheel moves away");
     for state in ["hash", "camera", "centre", "frusta"] {
         assert_eq!(desktop("reset")[state], first[state], "{state}");

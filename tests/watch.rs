@@ -4,11 +4,24 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::process::Command;
+
 use common::{Finished, Project, demo_train, manifest, stage, stage_command};
 use serde_json::json;
 
 const PARAMETERS: &str = r#"{"rays": 60000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12,
     "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+
+/// A training with checkpoints.
+fn train(project: &Project, output: &str, more: &[&str]) -> Command {
+    let (work, scene) = (project.path("work"), project.path("scene/train"));
+    let words = [&["--work", work.to_str().unwrap()], more].concat();
+    stage_command("train-ss", PARAMETERS, &[("scene", &scene)], &project.path(output), &words)
+}
+
+fn trained(project: &Project, output: &str, more: &[&str]) -> Finished {
+    Finished::of(train(project, output, more).output().unwrap())
+}
 
 /// The latest checkpoint of a training that was stopped becomes a field that is rendered; the
 /// training goes on to the bytes that it would have had.
@@ -18,18 +31,14 @@ fn a_checkpoint_becomes_a_field() {
     let scene = demo_train(&project, 8);
     let (work, whole) = (project.path("work"), project.path("whole"));
     let work_folder = work.to_str().unwrap().to_owned();
-    let train = |output: &str, more: &[&str]| {
-        let words = [&["--work", &work_folder], more].concat();
-        let output = project.path(output);
-        stage_command("train-ss", PARAMETERS, &[("scene", &scene)], &output, &words)
-    };
-    let run = |output: &str, more: &[&str]| Finished::of(train(output, more).output().unwrap());
-    run("early", &["--from-checkpoint"]).fails(3, &["--work", "no complete checkpoint"]);
+    trained(&project, "early", &["--from-checkpoint"])
+        .fails(3, &["--work", "no complete checkpoint"]);
     assert!(!project.path("early").exists());
 
-    let stopped = train("stopped", &[]).env("NERF_SR_STOP_AFTER", "30000").output().unwrap();
+    let stopped =
+        train(&project, "stopped", &[]).env("NERF_SR_STOP_AFTER", "30000").output().unwrap();
     assert_eq!(Finished::of(stopped).code, 130);
-    let made = run("field", &["--from-checkpoint"]);
+    let made = trained(&project, "field", &["--from-checkpoint"]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     let log = std::fs::read(project.path("field/training.json")).unwrap();
     let log: serde_json::Value = serde_json::from_slice(&log).unwrap();
@@ -41,7 +50,7 @@ fn a_checkpoint_becomes_a_field() {
     let rendered = stage("render-depth", r#"{"size": 8}"#, &inputs, &project.path("views"), &[]);
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
 
-    assert_eq!(run("resumed", &[]).code, 0);
+    assert_eq!(trained(&project, "resumed", &[]).code, 0);
     let plain = stage("train-ss", PARAMETERS, &[("scene", &scene)], &whole, &[]);
     assert_eq!(plain.code, 0, "{}", plain.stderr);
     assert_eq!(manifest(&whole), manifest(&project.path("resumed")));
@@ -55,26 +64,24 @@ fn a_checkpoint_becomes_a_field() {
 /// Long enough for a look or two on any machine: a look may take a fiftieth of the time.
 const LONG: [&str; 2] = ["-p", "train-ss.rays=1500000"];
 
+fn psnr(look: &str) -> f64 {
+    let (_, after) = look.split_once("PSNR ").unwrap();
+    after.split_whitespace().next().unwrap().parse::<f64>().unwrap()
+}
+
 #[test]
 fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let project = Project::tiny();
     let arguments = [&["run", "eval"], LONG.as_slice()].concat();
     project.ok(&["run", "prep"]);
-    let name_of = |index: usize| {
-        let views = project.json("prep", "truth/views.json", &[]);
-        views["views"][index]["camera"]["name"].as_str().unwrap().to_owned()
-    };
-    let second = name_of(1);
+    let views = project.json("prep", "truth/views.json", &[]);
+    let second = views["views"][1]["camera"]["name"].as_str().unwrap().to_owned();
     let watch = format!("--watch={second}");
     let watched = project.run(&[arguments.as_slice(), &[watch.as_str()]].concat());
     assert_eq!(watched.code, 0, "{}", watched.stderr);
     let start = format!("train-ss: view {second}: ");
     let looks: Vec<&str> = watched.stderr.lines().filter(|l| l.starts_with(&start)).collect();
     assert!(!looks.is_empty(), "no look in:\n{}", watched.stderr);
-    let psnr = |look: &str| {
-        let (_, after) = look.split_once("PSNR ").unwrap();
-        after.split_whitespace().next().unwrap().parse::<f64>().unwrap()
-    };
     let last = psnr(looks[looks.len() - 1]);
     assert!(last > 12.0, "{looks:?}");
     let picture = project.path("out/watch/train-ss.png");

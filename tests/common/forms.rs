@@ -42,6 +42,12 @@ pub const FORMS: &[Form] = &[
     },
 ];
 
+fn column(frame: &Value, column: usize) -> DVec3 {
+    DVec3::from(
+        [0, 1, 2].map(|row: usize| frame["transform_matrix"][row][column].as_f64().unwrap()),
+    )
+}
+
 /// Names, poses (right, up, back and centre as columns) and opaque images of a demo scene's
 /// training views, in `folder/images`.
 pub fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3)> {
@@ -69,11 +75,11 @@ pub fn photographs(project: &Project, folder: &str) -> Vec<(String, DMat3, DVec3
                 .unwrap()
                 .over(1.0);
             pixels::write_png(&images.join(format!("{name}.png")), &image.to_rgba8()).unwrap();
-            let number = |row: usize, column: usize| {
-                frame["transform_matrix"][row][column].as_f64().unwrap()
-            };
-            let column = |c: usize| DVec3::new(number(0, c), number(1, c), number(2, c));
-            (name, DMat3::from_cols(column(0), column(1), column(2)), column(3))
+            (
+                name,
+                DMat3::from_cols(column(frame, 0), column(frame, 1), column(frame, 2)),
+                column(frame, 3),
+            )
         })
         .collect();
     // By name, as LLFF has them and as COLMAP's are put.

@@ -50,18 +50,19 @@ pub struct Splat {
     opacity: f64,
 }
 
+fn rotation(columns: &BTreeMap<String, Vec<f64>>, i: usize) -> DMat3 {
+    let [w, x, y, z] = ["rot_0", "rot_1", "rot_2", "rot_3"].map(|name| columns[name][i]);
+    DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+}
+
 /// Reads a splat file by its layout alone.
 pub fn read_splats(path: &Path) -> Vec<Splat> {
     let columns = read_ply(path);
     let positions = vectors(&columns, ["x", "y", "z"]);
     let colours = vectors(&columns, ["f_dc_0", "f_dc_1", "f_dc_2"]);
     let scales = vectors(&columns, ["scale_0", "scale_1", "scale_2"]);
-    let rotation = |i: usize| {
-        let [w, x, y, z] = ["rot_0", "rot_1", "rot_2", "rot_3"].map(|name| columns[name][i]);
-        DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
-    };
     let splat = |i: usize| {
-        let axes = rotation(i) * DMat3::from_diagonal(scales[i].exp());
+        let axes = rotation(&columns, i) * DMat3::from_diagonal(scales[i].exp());
         Splat {
             position: positions[i],
             covariance: axes * axes.transpose(),
@@ -81,6 +82,11 @@ struct Drawn<'a> {
     radius: f64,
 }
 
+fn covered(radius: f64, middle: f64, size: usize) -> std::ops::Range<usize> {
+    let end = |x: f64| x.clamp(0.0, size as f64) as usize;
+    end(middle - radius)..end(middle + radius + 1.0)
+}
+
 /// Renders splats over a grey background as Kerbl et al. 2023 do: linearised projection, a blur of
 /// 0.3 square pixels, front to back.
 pub fn render_splats(splats: &[Splat], camera: &Camera, background: f64) -> Image {
@@ -90,12 +96,8 @@ pub fn render_splats(splats: &[Splat], camera: &Camera, background: f64) -> Imag
     let (width, height) = (k.width as usize, k.height as usize);
     let (mut colours, mut left) = (vec![DVec3::ZERO; width * height], vec![1.0f64; width * height]);
     for item in &drawn {
-        let range = |middle: f64, size: usize| {
-            let end = |x: f64| x.clamp(0.0, size as f64) as usize;
-            end(middle - item.radius)..end(middle + item.radius + 1.0)
-        };
-        for y in range(item.middle.y, height) {
-            for x in range(item.middle.x, width) {
+        for y in covered(item.radius, item.middle.y, height) {
+            for x in covered(item.radius, item.middle.x, width) {
                 let off = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - item.middle;
                 let density = (-0.5 * off.dot(item.inverse * off)).exp();
                 let alpha = (item.splat.opacity * density).min(0.99);

@@ -22,6 +22,21 @@ pub struct Glb {
     pub triangles: Vec<[usize; 3]>,
 }
 
+fn words(description: &Value, binary: &[u8], accessor: &Value) -> Vec<[u8; 4]> {
+    let accessor = &description["accessors"][accessor.as_u64().unwrap() as usize];
+    let view = &description["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+    let [offset, length] =
+        ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
+    let part = &binary[offset..offset + length];
+    part.as_chunks::<4>().0.to_vec()
+}
+
+fn vectors(description: &Value, binary: &[u8], accessor: &Value) -> Vec<DVec3> {
+    let words = words(description, binary, accessor);
+    let number = |word: [u8; 4]| f64::from(f32::from_le_bytes(word));
+    words.as_chunks::<3>().0.iter().map(|v| DVec3::from(v.map(number))).collect()
+}
+
 impl Glb {
     /// Reads a file.
     pub fn read(path: &Path) -> Self {
@@ -33,27 +48,14 @@ impl Glb {
         let description: Value = serde_json::from_slice(&bytes[20..20 + text]).unwrap();
         let first = 28 + text;
         assert!(&bytes[first - 4..first] == b"BIN\0" && word(first - 8) == bytes.len() - first);
-        let words = |accessor: &Value| -> Vec<[u8; 4]> {
-            let accessor = &description["accessors"][accessor.as_u64().unwrap() as usize];
-            let view =
-                &description["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
-            let [offset, length] =
-                ["byteOffset", "byteLength"].map(|name| view[name].as_u64().unwrap() as usize);
-            let part = &bytes[first + offset..first + offset + length];
-            part.as_chunks::<4>().0.to_vec()
-        };
         let primitive = &description["meshes"][0]["primitives"][0];
-        let vectors = |name: &str| -> Vec<DVec3> {
-            let words = words(&primitive["attributes"][name]);
-            let number = |word: [u8; 4]| f64::from(f32::from_le_bytes(word));
-            words.as_chunks::<3>().0.iter().map(|v| DVec3::from(v.map(number))).collect()
-        };
-        let indices = words(&primitive["indices"]);
+        let (attributes, binary) = (&primitive["attributes"], &bytes[first..]);
+        let indices = words(&description, binary, &primitive["indices"]);
         let index = |word: [u8; 4]| u32::from_le_bytes(word) as usize;
         Self {
-            positions: vectors("POSITION"),
-            normals: vectors("NORMAL"),
-            colours: vectors("COLOR_0"),
+            positions: vectors(&description, binary, &attributes["POSITION"]),
+            normals: vectors(&description, binary, &attributes["NORMAL"]),
+            colours: vectors(&description, binary, &attributes["COLOR_0"]),
             triangles: indices.as_chunks::<3>().0.iter().map(|t| t.map(index)).collect(),
             description,
         }

@@ -229,13 +229,14 @@ mod tests {
     use super::*;
     use scene::Intrinsics;
 
+    fn camera(name: &str, camera_to_world: Pose) -> Camera {
+        let intrinsics = Intrinsics::from_angle_x(40, 30, 0.7);
+        Camera { name: name.to_owned(), intrinsics, camera_to_world }
+    }
+
     fn cameras(places: &[DVec3], at: impl Fn(DVec3) -> DVec3) -> Vec<Camera> {
-        let one = |(i, &place): (usize, &DVec3)| Camera {
-            name: i.to_string(),
-            intrinsics: Intrinsics::from_angle_x(40, 30, 0.7),
-            camera_to_world: looking_at(place, at(place), DVec3::Z),
-        };
-        places.iter().enumerate().map(one).collect()
+        let poses = places.iter().map(|&place| looking_at(place, at(place), DVec3::Z));
+        poses.enumerate().map(|(i, pose)| camera(&i.to_string(), pose)).collect()
     }
 
     fn ring() -> Vec<Camera> {
@@ -262,12 +263,7 @@ mod tests {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, space: Space::Box };
 
     fn whole(poses: &[Pose]) -> Vec<Camera> {
-        let one = |pose: &Pose| Camera {
-            name: "c".into(),
-            intrinsics: Intrinsics::from_angle_x(40, 30, 0.7),
-            camera_to_world: *pose,
-        };
-        let cameras: Vec<Camera> = poses.iter().map(one).collect();
+        let cameras: Vec<Camera> = poses.iter().map(|&pose| camera("c", pose)).collect();
         cameras.iter().for_each(|c| c.check().unwrap());
         cameras
     }

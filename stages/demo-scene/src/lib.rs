@@ -278,18 +278,19 @@ mod tests {
         }
     }
 
+    fn view(seed: u32) -> pixels::Rgba8 {
+        render::render(
+            &World::new(seed),
+            &pose(Layout::Around, "test", 0, 10),
+            CAMERA_ANGLE,
+            [32, 32],
+            1,
+        )
+        .colour
+    }
+
     #[test]
     fn seeds_differ() {
-        let view = |seed| {
-            render::render(
-                &World::new(seed),
-                &pose(Layout::Around, "test", 0, 10),
-                CAMERA_ANGLE,
-                [32, 32],
-                1,
-            )
-            .colour
-        };
         assert_eq!(view(0), view(0));
         assert_ne!(view(0), view(1));
     }

@@ -132,8 +132,8 @@ impl World {
         self
     }
 
-    /// Distance from a point to the nearest surface, below 0 inside of things: what geometry made of
-    /// the scene's images is measured by.
+    /// Distance from a point to the nearest surface, below 0 inside of things. Geometry made of the
+    /// scene's images is measured by it.
     pub fn distance(&self, point: DVec3) -> f64 {
         let things = self.groups.iter().flat_map(|group| &group.things);
         let to = |thing: &Thing| thing.shape.distance(thing.to_local * (point - thing.centre));

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use crate::surfel::Surfel;
 
 /// Points of a COLMAP model, at most: what a structure from motion finds, about.
-const POINTS: usize = 100_000;
+const MOST_POINTS: usize = 100_000;
 
 /// `transforms.json` as instant-ngp and nerfstudio read it. Images aren't exported: each is named
 /// `images/NAME.png`.
@@ -54,8 +54,8 @@ fn lens(k: &Intrinsics) -> Map<String, Value> {
     if let Value::Object(entry) = entry { entry } else { Map::new() }
 }
 
-/// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to camera
-/// with axes right, down, forward. Points have no track.
+/// A COLMAP model as text: `cameras.txt`, `images.txt` and `points3D.txt`. Poses are world to
+/// camera with axes right, down, forward. Points have no track.
 pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, String); 3] {
     let mut lenses: Vec<&Intrinsics> = Vec::new();
     let mut images =
@@ -77,7 +77,7 @@ pub(crate) fn colmap(cameras: &[Camera], surfels: &[Surfel]) -> [(&'static str, 
         let _ = writeln!(cameras, "{id} {model} {} {} {numbers}", k.width, k.height);
     }
     let mut points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]\n".to_owned();
-    let step = surfels.len().div_ceil(POINTS).max(1);
+    let step = surfels.len().div_ceil(MOST_POINTS).max(1);
     for (id, surfel) in (1..).zip(surfels.iter().step_by(step)) {
         let [x, y, z] = surfel.position.as_vec3().to_array();
         let [r, g, b] = crate::points::level(surfel.colour);

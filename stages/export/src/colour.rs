@@ -8,8 +8,9 @@ use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 use crate::seen::{SeenView, Sight};
 
-/// Colours of a mesh's vertices, display-encoded sRGB: the mean over the views that see a vertex,
-/// more from those that see it not aslant. Where none does, the field's own colour along the normal.
+/// Colours of a mesh's vertices, display-encoded sRGB. Each is the mean over the views that see a
+/// vertex, more from those that see it not aslant. Where none does, the field's own colour along
+/// the normal.
 pub(crate) fn colours(
     field: &Members,
     views: &[SeenView],

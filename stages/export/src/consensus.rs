@@ -3,9 +3,9 @@ use rayon::prelude::*;
 use crate::seen::{SeenView, Sight};
 
 /// Views see one surface where they agree to so many pixel widths,
-const REACH: f64 = 2.0;
+const AGREEMENT_PIXELS: f64 = 2.0;
 /// and their normals to 45°: thin things have another side.
-const SAME_SIDE: f64 = 0.7;
+const SAME_SIDE_COSINE: f64 = 0.7;
 
 /// Moves what each view sees to the mean of what all views see of the same surface, and drops what
 /// more than a third of them look through: floaters, and fringes of edges.
@@ -27,12 +27,12 @@ pub(crate) fn agree(views: &mut [SeenView]) {
 /// How far a pixel's point is moved along its normal; `None` where it is dropped.
 fn shift(views: &[SeenView], view: &SeenView, at: usize) -> Option<f32> {
     let (point, normal) = (view.world_point(at), view.world_normal(at));
-    let reach = (REACH * view.footprint(at)) as f32;
+    let reach = (AGREEMENT_PIXELS * view.footprint(at)) as f32;
     let (mut sum, mut weights, mut seen, mut looked_through) = (0.0, 0.0, 0, 0);
     for other in views {
         match other.look(point, reach) {
             Sight::Surface { distance, cosine, index }
-                if other.world_normal(index).dot(normal) > SAME_SIDE =>
+                if other.world_normal(index).dot(normal) > SAME_SIDE_COSINE =>
             {
                 let weight = cosine.max(0.05);
                 sum += weight * distance;

@@ -5,11 +5,11 @@ use crate::lattice::Lattice;
 use crate::seen::{SeenView, Sight};
 
 /// A surface counts up to so many spacings from it: more than noise, less than what is thin.
-const REACH: f64 = 2.5;
+const REACH_SPACINGS: f64 = 2.5;
 
 /// Signed distances from the surface at a lattice's places, in shares of the reach: below 0 inside,
-/// 1 where nothing is near, the mean of what the views say (Curless and Levoy 1996); NaN where no view
-/// sees anything.
+/// 1 where nothing is near. Each is the mean of what the views say (Curless and Levoy 1996), NaN
+/// where no view sees anything.
 pub(crate) fn fuse(views: &[SeenView], lattice: &Lattice) -> Vec<f32> {
     let [nx, ny, _] = lattice.counts;
     let occupied = occupied_box(views);
@@ -24,7 +24,7 @@ pub(crate) fn fuse(views: &[SeenView], lattice: &Lattice) -> Vec<f32> {
 
 /// Distance from a surface up to which it counts, near a place of a lattice, in scene units.
 pub(crate) fn reach(lattice: &Lattice, place: [f64; 3]) -> f32 {
-    (REACH * lattice.spacing_at(place)) as f32
+    (REACH_SPACINGS * lattice.spacing_at(place)) as f32
 }
 
 /// The box around all surfaces that the views see.

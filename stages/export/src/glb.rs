@@ -46,13 +46,11 @@ pub(crate) fn buffer_length(mesh: &Mesh) -> usize {
 
 fn description(mesh: &Mesh) -> Value {
     let (vertices, triangles) = (mesh.positions.len(), mesh.triangles.len());
-    let list = |view: u32| json!({"bufferView": view, "componentType": FLOAT, "count": vertices, "type": "VEC3"});
-    let mut positions = list(0);
+    let mut positions = vectors(0, vertices);
     positions["min"] = json!(bound(mesh, Vec3::min));
     positions["max"] = json!(bound(mesh, Vec3::max));
     let indices = json!({"bufferView": 3, "componentType": UNSIGNED, "count": 3 * triangles,
         "type": "SCALAR"});
-    let view = |first: usize, length: usize, target: u32| json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target});
     let length = 12 * vertices;
     json!({
         "asset": {"version": "2.0", "generator": "nerf-sr export",
@@ -71,15 +69,25 @@ fn description(mesh: &Mesh) -> Value {
             "extensions": {"KHR_materials_unlit": {}},
             "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
         }],
-        "accessors": [positions, list(1), list(2), indices],
+        "accessors": [positions, vectors(1, vertices), vectors(2, vertices), indices],
         "bufferViews": [
-            view(0, length, VERTICES),
-            view(length, length, VERTICES),
-            view(2 * length, length, VERTICES),
-            view(3 * length, 12 * triangles, INDICES),
+            buffer_view(0, length, VERTICES),
+            buffer_view(length, length, VERTICES),
+            buffer_view(2 * length, length, VERTICES),
+            buffer_view(3 * length, 12 * triangles, INDICES),
         ],
         "buffers": [{"byteLength": buffer_length(mesh)}],
     })
+}
+
+/// A list of vectors, one of each vertex.
+fn vectors(buffer_view: u32, count: usize) -> Value {
+    json!({"bufferView": buffer_view, "componentType": FLOAT, "count": count, "type": "VEC3"})
+}
+
+/// A part of the buffer.
+fn buffer_view(first: usize, length: usize, target: u32) -> Value {
+    json!({"buffer": 0, "byteOffset": first, "byteLength": length, "target": target})
 }
 
 fn bound(mesh: &Mesh, of: fn(Vec3, Vec3) -> Vec3) -> [f32; 3] {

@@ -1,8 +1,8 @@
 use glam::DVec3;
 use scene::{Bounds, Frustum, Space};
 
-/// Evenly spaced places: in the world, or in NDC in a frustum's cube, where they lie the wider apart
-/// the farther away they are.
+/// Evenly spaced places: in the world, or in NDC in a frustum's cube. There they lie the wider
+/// apart the farther away they are.
 pub(crate) struct Lattice {
     frustum: Option<Frustum>,
     origin: DVec3,
@@ -67,8 +67,8 @@ impl Lattice {
         steps.fold(0.0, f64::max)
     }
 
-    /// Whether the lattice's axes are left-handed in the world: a frustum's third goes away from the
-    /// camera.
+    /// Whether the lattice's axes are left-handed in the world: a frustum's third goes away from
+    /// the camera.
     pub(crate) fn is_mirrored(&self) -> bool {
         self.frustum.is_some()
     }

@@ -53,7 +53,7 @@ pub(crate) const COORDINATES: &str =
 pub const EXPORT_FILE: &str = "export.json";
 
 /// Pixels of all rendered views together, unless `size` is given.
-const PIXELS: f64 = 16e6;
+const MOST_PIXELS: f64 = 16e6;
 /// Size of the rendered views over the cameras': a supersampled field has more than these show.
 const MOST_SCALE: f64 = 2.0;
 
@@ -76,7 +76,8 @@ pub struct Params {
     /// Maximum number of points and of splats.
     #[schemars(range(min = 1, max = 20_000_000))]
     pub max_points: u32,
-    /// Cells of the mesh's grid along the longest side of the field's box, or in NDC of its frustum.
+    /// Cells of the mesh's grid along the longest side of the field's box, or in NDC of its
+    /// frustum.
     #[schemars(range(min = 8, max = 1024))]
     pub resolution: u32,
 }
@@ -183,7 +184,7 @@ fn render(
 ) -> anyhow::Result<Vec<SeenView>> {
     let progress = context.progress("rendering", cameras.len() as u64);
     let pixels = |c: &Camera| f64::from(c.intrinsics.width) * f64::from(c.intrinsics.height);
-    let most = (PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(MOST_SCALE);
+    let most = (MOST_PIXELS / cameras.iter().map(pixels).sum::<f64>()).sqrt().min(MOST_SCALE);
     cameras
         .iter()
         .map(|camera| {

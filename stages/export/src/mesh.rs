@@ -12,7 +12,7 @@ pub(crate) struct Mesh {
 }
 
 /// Pieces with fewer triangles than this share of all are dropped: floaters.
-const LEAST_PIECE: f64 = 1e-3;
+const LEAST_PIECE_SHARE: f64 = 1e-3;
 
 impl Mesh {
     /// Makes each vertex's normal the mean of its triangles', weighted by area.
@@ -44,7 +44,7 @@ impl Mesh {
         let pieces = self.pieces();
         let mut sizes = vec![0usize; self.positions.len()];
         self.triangles.iter().for_each(|t| sizes[pieces[t[0] as usize] as usize] += 1);
-        let least = LEAST_PIECE * self.triangles.len() as f64;
+        let least = LEAST_PIECE_SHARE * self.triangles.len() as f64;
         self.triangles.retain(|t| sizes[pieces[t[0] as usize] as usize] as f64 >= least);
         let mut is_used = vec![false; self.positions.len()];
         self.triangles.iter().flatten().for_each(|&v| is_used[v as usize] = true);

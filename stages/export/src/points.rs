@@ -4,12 +4,12 @@ use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
 /// Normals so many pixels from a silhouette may be wrong.
-const UNSURE: u8 = 2;
+const UNSURE_PIXELS: u8 = 2;
 
-/// The surfels that become points: all but those near silhouettes, or all where there are no others.
+/// The surfels that become points: all but those near silhouettes. Where there are no others, all.
 pub(crate) fn chosen(surfels: &[Surfel]) -> Vec<Surfel> {
     let sure: Vec<Surfel> =
-        surfels.iter().filter(|surfel| surfel.margin > UNSURE).copied().collect();
+        surfels.iter().filter(|surfel| surfel.margin > UNSURE_PIXELS).copied().collect();
     if sure.is_empty() { surfels.to_vec() } else { sure }
 }
 

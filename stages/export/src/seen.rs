@@ -5,14 +5,14 @@ use radiance::{Pixel, Ray, RayField};
 use scene::{Background, Camera, Intrinsics};
 
 /// Rays that are cast at once.
-const RAYS: usize = 1 << 16;
+const RAYS_AT_ONCE: usize = 1 << 16;
 /// A pixel shows a surface where so much of its ray is stopped.
-const OPAQUE: f32 = 0.5;
+const LEAST_OPACITY: f32 = 0.5;
 /// Neighbouring pixels show one surface where their depths differ by at most so many pixel widths:
 /// slants of up to 80°.
-const SLANT: f32 = 6.0;
+const MOST_DEPTH_STEP: f32 = 6.0;
 /// A normal is known by so many pixels to each side: more than noise, less than what is thin.
-const BASELINE: usize = 4;
+const BASELINE_PIXELS: usize = 4;
 
 /// A view's surface, seen by a pinhole camera.
 pub(crate) struct SeenView {
@@ -40,7 +40,7 @@ pub(crate) struct SeenPixel {
     /// Whether something nearer ends beside it: up to where isn't known to a pixel's width.
     pub(crate) is_edge: bool,
     /// For how many pixels its surface goes on to each side in its row and its column, up to
-    /// [`BASELINE`].
+    /// [`BASELINE_PIXELS`].
     pub(crate) margin: u8,
 }
 
@@ -80,8 +80,8 @@ impl SeenView {
             pixels: Vec::with_capacity((intrinsics.width * intrinsics.height) as usize),
         };
         let count = intrinsics.width as usize * intrinsics.height as usize;
-        for first in (0..count).step_by(RAYS) {
-            seen.cast(field, &camera, background, first..(first + RAYS).min(count))?;
+        for first in (0..count).step_by(RAYS_AT_ONCE) {
+            seen.cast(field, &camera, background, first..(first + RAYS_AT_ONCE).min(count))?;
         }
         seen.find_normals();
         Ok(seen)
@@ -130,9 +130,10 @@ impl SeenView {
         }
     }
 
-    /// The way along the surface from before a pixel to behind it, in a row or a column, and for how
-    /// many pixels the surface goes on to both sides; `None` where it ends on both. `place` is the
-    /// pixel's place in its line and the line's length, `stride` the distance of the line's pixels.
+    /// The way along the surface from before a pixel to behind it, in a row or a column. Beside it,
+    /// for how many pixels the surface goes on to both sides. `None` where it ends on both. `place`
+    /// is the pixel's place in its line and the line's length, `stride` the distance of the line's
+    /// pixels.
     fn tangent(
         &self,
         at: usize,
@@ -147,11 +148,11 @@ impl SeenView {
         (before != after).then_some((way, margin as u8))
     }
 
-    /// The farthest pixel within [`BASELINE`] that still shows a pixel's surface, `room` pixels
-    /// before the image ends.
+    /// The farthest pixel within [`BASELINE_PIXELS`] that still shows a pixel's surface, `room`
+    /// pixels before the image ends.
     fn last_of_surface(&self, at: usize, room: usize, stride: isize) -> usize {
         let mut last = at;
-        for _ in 0..room.min(BASELINE) {
+        for _ in 0..room.min(BASELINE_PIXELS) {
             let next = last.wrapping_add_signed(stride);
             if !self.goes_on(last, next) {
                 break;
@@ -175,7 +176,7 @@ impl SeenView {
 
     /// Difference of two neighbours' depths up to which they show one surface.
     fn jump(&self, depth: f32) -> f32 {
-        SLANT * depth / self.intrinsics.fx.min(self.intrinsics.fy) as f32
+        MOST_DEPTH_STEP * depth / self.intrinsics.fx.min(self.intrinsics.fy) as f32
     }
 
     /// A pixel's surface point in camera space.
@@ -271,12 +272,12 @@ impl SeenView {
 }
 
 fn seen(pixel: &Pixel, to_z: f32) -> SeenPixel {
-    let shows = pixel.opacity >= OPAQUE;
+    let shows = pixel.opacity >= LEAST_OPACITY;
     let level = |v: f32| (255.0 * v.clamp(0.0, 1.0) + 0.5) as u8;
     SeenPixel {
         depth: if shows { pixel.median_depth * to_z } else { 0.0 },
         normal: Vec3::ZERO,
-        colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(OPAQUE))),
+        colour: pixel.premultiplied.map(|v| level(v / pixel.opacity.max(LEAST_OPACITY))),
         opacity: level(pixel.opacity),
         is_edge: false,
         margin: 0,

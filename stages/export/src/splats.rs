@@ -13,11 +13,11 @@ const HARMONIC: f32 = 0.282_094_79;
 const RADIUS: f64 = 0.5;
 /// Standard deviation along the normal, over that.
 const FLATNESS: f64 = 0.1;
-/// Opacity of a disc on an opaque surface. There are several in each square of the distance; more of
-/// it widens edges, since viewers blur splats.
-const OPACITY: f64 = 0.6;
+/// Opacity of a disc on an opaque surface. There are several in each square of the distance; more
+/// of it widens edges, since viewers blur splats.
+const DISC_OPACITY: f64 = 0.6;
 /// Opacities written: a logit of 1 is infinite.
-const OPACITIES: [f64; 2] = [0.02, 0.99];
+const OPACITY_BOUNDS: [f64; 2] = [0.02, 0.99];
 
 /// Writes surfels as 3D Gaussians, in the PLY layout of Kerbl et al. 2023: position, normal, colour
 /// as coefficient of the constant spherical harmonic, opacity as logit, standard deviations as
@@ -36,7 +36,8 @@ fn splat(surfel: &Surfel) -> [f32; 17] {
     let [x, y, z] = surfel.position.as_vec3().to_array();
     let [nx, ny, nz] = surfel.normal.as_vec3().to_array();
     let [r, g, b] = surfel.colour.map(|v| (v - 0.5) / HARMONIC);
-    let opacity = (OPACITY * f64::from(surfel.opacity)).clamp(OPACITIES[0], OPACITIES[1]);
+    let opacity =
+        (DISC_OPACITY * f64::from(surfel.opacity)).clamp(OPACITY_BOUNDS[0], OPACITY_BOUNDS[1]);
     let along = RADIUS * surfel.spacing;
     let [along, across] = [along, FLATNESS * along].map(|deviation| deviation.ln() as f32);
     let turn = DQuat::from_rotation_arc(DVec3::Z, surfel.normal).as_quat();

@@ -4,9 +4,9 @@ use crate::lattice::Lattice;
 use crate::mesh::Mesh;
 
 /// Extracts the surface between places with values below 0, inside, and above (naive surface nets,
-/// Gibson 1998): a vertex in each cell that the surface passes, at the mean of its crossings with the
-/// cell's edges, and a quad around each crossed edge of the lattice. NaN is unknown: no surface
-/// ends there.
+/// Gibson 1998). Each cell that the surface passes gets a vertex, at the mean of its crossings with
+/// the cell's edges. Each crossed edge of the lattice gets a quad around it. NaN is unknown: no
+/// surface ends there.
 pub(crate) fn extract(lattice: &Lattice, values: &[f32]) -> Mesh {
     let cells = Cells { lattice, values, strides: lattice.strides() };
     let mut mesh = Mesh::default();

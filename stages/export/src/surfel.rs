@@ -24,9 +24,9 @@ pub(crate) struct Surfel {
 /// A pixel that shows a surface: the cell of its point, then view and pixel, which order them.
 type Sample = ([u32; 3], u32, u32);
 
-/// Merges what all views see: one surfel for each cell of a grid over the field's unit cube, whose
-/// cells are as large as half of the views' pixels, or larger where there would be more than `most`.
-/// They are in the order of their cells.
+/// Merges what all views see: one surfel for each cell of a grid over the field's unit cube. The
+/// cells are as large as half of the views' pixels, or larger where there would be more than
+/// `most`. The surfels are in the order of their cells.
 pub(crate) fn merge(views: &[SeenView], bounds: &Bounds, most: usize) -> Vec<Surfel> {
     let mut edge = finest_edge(views, bounds);
     loop {

@@ -39,22 +39,23 @@ fn ball_pixel(ray: &Ray) -> Pixel {
 const BOX: Bounds =
     Bounds { min: [-1.0; 3], max: [1.0; 3], near: 1.0, far: 9.0, space: Space::Box };
 
+fn camera_around(i: u32, count: u32, lowest: f64) -> Camera {
+    let share = (f64::from(i) + 0.5) / f64::from(count);
+    let (height, angle) = (lowest + (0.98 - lowest) * share, 2.4 * f64::from(i));
+    let level = (1.0 - height * height).sqrt();
+    let back = DVec3::new(level * angle.cos(), level * angle.sin(), height);
+    let right = DVec3::Z.cross(back).normalize();
+    let up = back.cross(right);
+    Camera {
+        name: format!("v {i}"),
+        intrinsics: Intrinsics::from_angle_x(96, 80, 0.6),
+        camera_to_world: [0, 1, 2].map(|k| [right[k], up[k], back[k], 3.0 * back[k]]),
+    }
+}
+
 /// Cameras around the origin at distance 3; `up` is the lowest height that they have.
 fn around(count: u32, lowest: f64) -> Vec<Camera> {
-    let camera = |i: u32| {
-        let share = (f64::from(i) + 0.5) / f64::from(count);
-        let (height, angle) = (lowest + (0.98 - lowest) * share, 2.4 * f64::from(i));
-        let level = (1.0 - height * height).sqrt();
-        let back = DVec3::new(level * angle.cos(), level * angle.sin(), height);
-        let right = DVec3::Z.cross(back).normalize();
-        let up = back.cross(right);
-        Camera {
-            name: format!("v {i}"),
-            intrinsics: Intrinsics::from_angle_x(96, 80, 0.6),
-            camera_to_world: [0, 1, 2].map(|k| [right[k], up[k], back[k], 3.0 * back[k]]),
-        }
-    };
-    (0..count).map(camera).collect()
+    (0..count).map(|i| camera_around(i, count, lowest)).collect()
 }
 
 fn views(cameras: &[Camera]) -> Vec<SeenView> {
@@ -69,16 +70,24 @@ fn fused(views: &[SeenView], cells: u32) -> Mesh {
     mesh
 }
 
+/// Signed volume between a triangle and the origin.
+fn tetrahedron(mesh: &Mesh, t: &[u32; 3]) -> f64 {
+    let [a, b, c] = t.map(|v| mesh.positions[v as usize].as_dvec3());
+    a.dot(b.cross(c)) / 6.0
+}
+
 /// The volume inside, above 0 where triangles are counter-clockwise seen from outside.
 fn volume(mesh: &Mesh) -> f64 {
-    let volume = |t: &[u32; 3]| {
-        let [a, b, c] = t.map(|v| mesh.positions[v as usize].as_dvec3());
-        a.dot(b.cross(c)) / 6.0
-    };
-    mesh.triangles.iter().map(volume).sum()
+    mesh.triangles.iter().map(|t| tetrahedron(mesh, t)).sum()
 }
 
 const BALL_VOLUME: f64 = 4.0 / 3.0 * std::f64::consts::PI * RADIUS * RADIUS * RADIUS;
+
+fn beyond_the_ball(lattice: &Lattice, i: usize) -> f32 {
+    let [nx, ny, _] = lattice.counts;
+    let place = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
+    (lattice.point(place).length() - RADIUS) as f32
+}
 
 #[test]
 fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
@@ -87,12 +96,7 @@ fn surface_nets_close_a_ball_in_a_box_and_in_a_frustum() {
     let frustum = Frustum { camera_to_world: pose, min: [-0.4; 2], max: [0.4; 2], near, far };
     for space in [Space::Box, Space::Ndc(frustum)] {
         let lattice = Lattice::new(&Bounds { space, ..BOX }, 48);
-        let [nx, ny, _] = lattice.counts;
-        let value = |i: usize| {
-            let place = [i % nx, i / nx % ny, i / (nx * ny)].map(|n| n as f64);
-            (lattice.point(place).length() - RADIUS) as f32
-        };
-        let values: Vec<f32> = (0..lattice.len()).map(value).collect();
+        let values: Vec<f32> = (0..lattice.len()).map(|i| beyond_the_ball(&lattice, i)).collect();
         let mut mesh = surface_nets::extract(&lattice, &values);
         mesh.find_normals();
         assert_eq!(mesh.open_edges().len(), 0, "{space:?}");
@@ -138,6 +142,13 @@ fn the_unseen_side_stays_open() {
     }
 }
 
+/// A camera at distance 3 sees the points whose direction has a cosine above RADIUS / 3 with its
+/// own.
+fn is_seen(cameras: &[Camera], p: &glam::Vec3) -> bool {
+    let outwards = p.as_dvec3().normalize();
+    cameras.iter().any(|c| outwards.dot(c.centre().normalize()) > RADIUS / 3.0)
+}
+
 /// Fused surfaces extend a little beyond what is seen. That part is dropped, with only a few rows
 /// before it.
 #[test]
@@ -148,13 +159,10 @@ fn what_no_view_shows_is_dropped() {
     let mut mesh = whole.clone();
     unseen::drop_unseen(&views, &lattice, &mut mesh);
     mesh.drop_small_pieces();
-    // A camera at distance 3 sees the points whose direction has a cosine above RADIUS / 3 with its
-    // own.
-    let is_seen = |p: &glam::Vec3| {
-        let outwards = p.as_dvec3().normalize();
-        cameras.iter().any(|c| outwards.dot(c.centre().normalize()) > RADIUS / 3.0)
-    };
-    assert!(!whole.positions.iter().all(is_seen) && mesh.positions.iter().all(is_seen));
+    assert!(
+        !whole.positions.iter().all(|p| is_seen(&cameras, p))
+            && mesh.positions.iter().all(|p| is_seen(&cameras, p))
+    );
     let share = mesh.triangles.len() as f64 / whole.triangles.len() as f64;
     assert!((0.7..1.0).contains(&share), "{share}");
 }
@@ -175,16 +183,17 @@ fn surfels_lie_on_the_ball_and_face_outwards() {
     }
 }
 
+fn made_with(threads: usize) -> (Mesh, Vec<Surfel>) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+    pool.install(|| {
+        let views = views(&around(9, -0.5));
+        (fused(&views, 40), surfel::merge(&views, &BOX, 5_000))
+    })
+}
+
 #[test]
 fn any_number_of_threads_gives_the_same() {
-    let with = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let views = views(&around(9, -0.5));
-            (fused(&views, 40), surfel::merge(&views, &BOX, 5_000))
-        })
-    };
-    assert!(with(1) == with(3));
+    assert!(made_with(1) == made_with(3));
 }
 
 #[test]

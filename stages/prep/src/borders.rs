@@ -11,10 +11,10 @@ use scene::Background;
 use crate::frame_name;
 
 /// Views that are looked at, spread evenly: enough to tell nine of ten.
-pub(crate) const LOOKED_AT: usize = 20;
+pub(crate) const MOST_VIEWS: usize = 20;
 /// Levels by which a flat colour may vary: JPEG's noise beside nothing else. A clear sky varies by
 /// more from corner to corner.
-const NOISE: u8 = 8;
+const MOST_NOISE_LEVELS: u8 = 8;
 
 /// What lies behind a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -123,7 +123,7 @@ fn colour(image: &Rgba8, pixel: usize) -> [u8; 3] {
 }
 
 fn is_like(colour: [u8; 3], other: [u8; 3]) -> bool {
-    colour.iter().zip(other).all(|(a, b)| a.abs_diff(b) <= NOISE)
+    colour.iter().zip(other).all(|(a, b)| a.abs_diff(b) <= MOST_NOISE_LEVELS)
 }
 
 /// The median of each channel; black where there is none.
@@ -138,7 +138,7 @@ fn median(colours: &[[u8; 3]]) -> [u8; 3] {
 /// Looks at the borders of training views, spread evenly; where the first has alpha, at no other.
 /// No more images than threads are held at once.
 pub(crate) fn borders(frames: &[&Frame]) -> anyhow::Result<Borders> {
-    let count = frames.len().min(LOOKED_AT);
+    let count = frames.len().min(MOST_VIEWS);
     if count > 0 && look(frames[0])? == Border::Transparent {
         return Ok(Borders::new(&[Border::Transparent]));
     }
@@ -154,20 +154,25 @@ fn look(frame: &Frame) -> anyhow::Result<Border> {
 mod tests {
     use super::*;
 
+    fn picture_pixel(border: [u8; 3], noise: u8, touching: usize, at: usize) -> [u8; 4] {
+        let (x, y) = (at % 20, at / 20);
+        let inside = (5..15).contains(&x) && (3..7).contains(&y) || y == 0 && x < touching;
+        let [r, g, b] = if inside {
+            [90, 40, 200]
+        } else {
+            border.map(|v| v.saturating_sub(at as u8 % (noise + 1)))
+        };
+        [r, g, b, u8::MAX]
+    }
+
     /// A picture of 20×10 pixels: a border of a colour with some noise, and something in the
     /// middle, which may touch the border.
     fn picture(border: [u8; 3], noise: u8, touching: usize) -> Rgba8 {
-        let pixel = |at: usize| -> [u8; 4] {
-            let (x, y) = (at % 20, at / 20);
-            let inside = (5..15).contains(&x) && (3..7).contains(&y) || y == 0 && x < touching;
-            let [r, g, b] = if inside {
-                [90, 40, 200]
-            } else {
-                border.map(|v| v.saturating_sub(at as u8 % (noise + 1)))
-            };
-            [r, g, b, u8::MAX]
-        };
-        Rgba8::new(20, 10, (0..200).flat_map(pixel).collect())
+        Rgba8::new(
+            20,
+            10,
+            (0..200).flat_map(|at| picture_pixel(border, noise, touching, at)).collect(),
+        )
     }
 
     fn of(images: &[Rgba8]) -> Borders {

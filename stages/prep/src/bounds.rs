@@ -30,7 +30,7 @@ pub enum SpaceError {
 }
 
 /// What lies so many box halves from the box's middle needs more than a box.
-const BEYOND: f64 = 2.5;
+const MOST_BOX_HALVES: f64 = 2.5;
 
 /// A posed view, and between which depths it sees anything, where that is known.
 pub type SeenDepths = (Camera, Option<[f64; 2]>);
@@ -77,7 +77,7 @@ fn in_ndc(
 
 /// Share of the distance to what cameras look at before which nothing is taken to lie, and how many
 /// times as far they see.
-const GUESSED: [f64; 2] = [0.25, 50.0];
+const GUESSED_DEPTH_FACTORS: [f64; 2] = [0.25, 50.0];
 
 /// Depths that cameras which look one way may see, by the cameras alone: around the point that they
 /// look at, or where their axes are parallel, around a place four times as far away as they stand
@@ -88,11 +88,11 @@ fn guessed_depths(sights: &[SeenDepths]) -> Option<[f64; 2]> {
     let forward = common_direction(cameras.iter().copied())?;
     let mean = cameras.iter().map(|c| c.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
     let apart = 2.0 * cameras.iter().map(|c| (c.centre() - mean).length()).fold(0.0, f64::max);
-    let focus = crossing(&cameras, PARALLEL)
+    let focus = crossing(&cameras, LEAST_DETERMINANT)
         .map(|point| (point - mean).dot(forward))
         .filter(|distance| *distance > apart);
     let distance = focus.unwrap_or(4.0 * apart);
-    (distance > 0.0).then(|| GUESSED.map(|factor| factor * distance))
+    (distance > 0.0).then(|| GUESSED_DEPTH_FACTORS.map(|factor| factor * distance))
 }
 
 /// What all cameras see, from the middle of them: the frustum of NDC.
@@ -133,7 +133,7 @@ fn mean(sights: &[SeenDepths], of: fn(&Camera) -> DVec3) -> DVec3 {
 /// Whether more lies outside the box than a box can hold.
 fn reaches_beyond(bounds: &Bounds, sights: &[SeenDepths]) -> bool {
     let centre = 0.5 * (DVec3::from(bounds.min) + DVec3::from(bounds.max));
-    let reach = BEYOND * 0.5 * bounds.longest_side();
+    let reach = MOST_BOX_HALVES * 0.5 * bounds.longest_side();
     let far = sights.iter().filter(|(camera, depths)| {
         depths.is_some_and(|[_, farthest]| farthest > (camera.centre() - centre).length() + reach)
     });
@@ -211,7 +211,7 @@ fn half_width(camera: &Camera, place: DVec3) -> f64 {
 }
 
 /// The determinant of axes that say nothing of where they cross.
-const PARALLEL: f64 = 1e-9;
+const LEAST_DETERMINANT: f64 = 1e-9;
 
 /// The point nearest to all optical axes, where they cross well enough: the determinant is 0 for
 /// parallel axes and 8/27 for axes from all sides.
@@ -391,6 +391,20 @@ mod tests {
         assert_eq!(place(&sights(&one, None), &[], false, None).map(|b| b.space), Ok(Space::Box));
     }
 
+    fn parallel(scale: f64, i: u32) -> Camera {
+        looking_at(
+            scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.0),
+            scale * DVec3::new(0.2 * f64::from(i), 9.0, 0.0),
+        )
+    }
+
+    fn meeting(scale: f64, i: u32) -> Camera {
+        looking_at(
+            scale * DVec3::new(0.2 * f64::from(i) - 0.4, 0.0, 0.0),
+            scale * DVec3::new(0.0, 6.0, 0.0),
+        )
+    }
+
     /// Without any depth: where images say that the scene goes on, cameras say how.
     #[test]
     fn a_scene_that_goes_on_is_in_no_box() {
@@ -416,20 +430,10 @@ mod tests {
             assert_eq!(room.space, Space::Contraction);
             assert!((7.9..8.5).contains(&(0.5 * room.longest_side() / scale)), "{room:?}");
             // Forward: parallel axes, and axes that meet at a distance of 6.
-            let parallel = |i: u32| {
-                looking_at(
-                    scale * DVec3::new(0.2 * f64::from(i), 0.0, 0.0),
-                    scale * DVec3::new(0.2 * f64::from(i), 9.0, 0.0),
-                )
-            };
-            let meeting = |i: u32| {
-                looking_at(
-                    scale * DVec3::new(0.2 * f64::from(i) - 0.4, 0.0, 0.0),
-                    scale * DVec3::new(0.0, 6.0, 0.0),
-                )
-            };
-            let forward: [(Vec<Camera>, f64); 2] =
-                [((0..5).map(parallel).collect(), 3.2), ((0..5).map(meeting).collect(), 6.0)];
+            let forward: [(Vec<Camera>, f64); 2] = [
+                ((0..5).map(|i| parallel(scale, i)).collect(), 3.2),
+                ((0..5).map(|i| meeting(scale, i)).collect(), 6.0),
+            ];
             for (cameras, distance) in forward {
                 let seen =
                     place(&sights(&cameras, None), &sights(&cameras[1..2], None), true, None)

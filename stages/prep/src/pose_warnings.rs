@@ -4,15 +4,15 @@ use scene::{Camera, Intrinsics};
 
 /// Cameras that are so many times as far from the middle of all as half of them are, at least, are
 /// far off. One that is doubles the box as often as that; walks through a room have 2 to 5.
-const FAR_OFF: f64 = 20.0;
+const FAR_OFF_RATIO: f64 = 20.0;
 /// Fewer cameras say too little of where the others stand.
-const FEWEST: usize = 4;
+const LEAST_CAMERAS: usize = 4;
 /// A principal point farther from the middle of the image, as a share of its length, is far from
 /// it. Real lenses have a hundredth.
-const OFF_CENTRE: f64 = 0.2;
+const OFF_CENTRE_SHARE: f64 = 0.2;
 /// Centres nearer to each other than this share of their distance from the origin are one place:
 /// they were the same before they were rounded.
-const ONE_PLACE: f64 = 1e-7;
+const ONE_PLACE_SHARE: f64 = 1e-7;
 
 /// Refuses training views that were all taken by the same camera at the same place: whatever they
 /// show, it isn't one scene seen from several sides.
@@ -70,7 +70,7 @@ impl std::fmt::Display for Named<'_> {
 
 fn stand_in_one_place(cameras: &[Camera]) -> bool {
     let Some(first) = cameras.first().map(Camera::centre) else { return false };
-    cameras.iter().all(|camera| camera.centre().distance(first) <= ONE_PLACE * first.length())
+    cameras.iter().all(|camera| camera.centre().distance(first) <= ONE_PLACE_SHARE * first.length())
 }
 
 /// Cameras far away from the others, by the medians: those hold whatever a few cameras do.
@@ -79,10 +79,10 @@ fn far_off(all: &[Named]) -> Option<String> {
     let middle = DVec3::from([0, 1, 2].map(|i| median(centres.iter().map(|centre| centre[i]))));
     let away: Vec<f64> = centres.iter().map(|centre| centre.distance(middle)).collect();
     let usual = median(away.iter().copied());
-    if all.len() < FEWEST || usual <= 0.0 {
+    if all.len() < LEAST_CAMERAS || usual <= 0.0 {
         return None;
     }
-    let far: Vec<usize> = (0..all.len()).filter(|&i| away[i] > FAR_OFF * usual).collect();
+    let far: Vec<usize> = (0..all.len()).filter(|&i| away[i] > FAR_OFF_RATIO * usual).collect();
     let more = if far.len() > 1 { format!(" (and {} more)", far.len() - 1) } else { String::new() };
     far.first().map(|&first| {
         format!(
@@ -119,7 +119,7 @@ fn off_centre(all: &[Named]) -> Option<String> {
 }
 
 fn is_off_centre(k: &Intrinsics) -> bool {
-    let off = |at: f64, length: u32| (at / f64::from(length) - 0.5).abs() > OFF_CENTRE;
+    let off = |at: f64, length: u32| (at / f64::from(length) - 0.5).abs() > OFF_CENTRE_SHARE;
     off(k.cx, k.width) || off(k.cy, k.height)
 }
 
@@ -136,17 +136,18 @@ mod tests {
         Camera { name: name.into(), intrinsics, camera_to_world: pose_of(r, centre.into()) }
     }
 
+    fn on_ring(i: u32, scale: f64, middle: f64) -> Camera {
+        let angle = f64::from(i);
+        camera(
+            &format!("r_{i}"),
+            angle,
+            [middle + 4.0 * scale * angle.cos(), 4.0 * scale * angle.sin(), scale],
+        )
+    }
+
     /// Around something, at any scale and anywhere.
     fn ring(count: u32, scale: f64, middle: f64) -> Vec<Camera> {
-        let at = |i: u32| {
-            let angle = f64::from(i);
-            camera(
-                &format!("r_{i}"),
-                angle,
-                [middle + 4.0 * scale * angle.cos(), 4.0 * scale * angle.sin(), scale],
-            )
-        };
-        (0..count).map(at).collect()
+        (0..count).map(|i| on_ring(i, scale, middle)).collect()
     }
 
     #[test]
@@ -195,32 +196,37 @@ mod tests {
         assert_eq!((check(&same[..1]), check(&[])), (Ok(()), Ok(())));
     }
 
+    fn assert_one_warning(training: &[Camera], test: &[Camera], words: &str) {
+        let found = warnings(training, test);
+        assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");
+    }
+
     #[test]
     fn what_looks_wrong_is_said_once() {
-        let one = |training: &[Camera], test: &[Camera], words: &str| {
-            let found = warnings(training, test);
-            assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");
-        };
-        one(
+        assert_one_warning(
             &ring(1, 1.0, 0.0),
             &ring(3, 1.0, 0.0),
             "there is 1 training view: nothing tells how far",
         );
         let turning: Vec<Camera> =
             (0..5).map(|i| camera("t", f64::from(i), [3.0, 1.0, 4.0])).collect();
-        one(&turning, &[], "all 5 training cameras stand in one place");
+        assert_one_warning(&turning, &[], "all 5 training cameras stand in one place");
         let mut far = ring(8, 1.0, 0.0);
         far[5].camera_to_world[0][3] = 1e6;
-        one(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");
+        assert_one_warning(&far, &ring(3, 1.0, 0.0), "training view r_5 is 3");
         far[6].camera_to_world[0][3] = -1e6;
-        one(&far, &ring(3, 1.0, 0.0), "as half of them (and 1 more); is its pose right?");
+        assert_one_warning(
+            &far,
+            &ring(3, 1.0, 0.0),
+            "as half of them (and 1 more); is its pose right?",
+        );
         let mut far = ring(3, 1.0, 0.0);
         far[0].camera_to_world[1][3] = 500.0;
-        one(&ring(8, 1.0, 0.0), &far, "test view r_0 is ");
+        assert_one_warning(&ring(8, 1.0, 0.0), &far, "test view r_0 is ");
         // Numbers for 32×24 pixels, taken for ones for 64×48.
         let mut shrunk = ring(6, 1.0, 0.0);
         shrunk[2..].iter_mut().for_each(|c| (c.intrinsics.cx, c.intrinsics.cy) = (8.0, 6.0));
-        one(
+        assert_one_warning(
             &shrunk,
             &ring(2, 1.0, 0.0),
             "4 of 8 views have a principal point far from the middle, first training view r_2: \

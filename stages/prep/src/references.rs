@@ -25,11 +25,12 @@ pub(crate) fn choose(centres: impl Iterator<Item = DVec3>, count: usize) -> Vec<
 mod tests {
     use super::*;
 
+    fn along(places: &[f64]) -> std::vec::IntoIter<DVec3> {
+        places.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter()
+    }
+
     #[test]
     fn references_are_spread() {
-        let along = |places: &[f64]| {
-            places.iter().map(|&x| DVec3::new(x, 0.0, 0.0)).collect::<Vec<_>>().into_iter()
-        };
         let cameras = || along(&[0.0, 1.0, 2.0, 3.0, 9.0, 10.0]);
         assert_eq!(choose(cameras(), 4), [0, 5, 3, 1]);
         assert_eq!(choose(cameras(), 2), [0, 5]);

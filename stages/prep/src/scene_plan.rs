@@ -133,25 +133,31 @@ mod tests {
     use crate::params::SplitKind;
     use crate::split::split;
 
+    fn frame(i: usize, count: usize) -> Frame {
+        let (sin, cos) = (i as f64 / count as f64 * std::f64::consts::TAU).sin_cos();
+        let camera_to_world =
+            [[-sin, 0.0, cos, 4.0 * cos], [cos, 0.0, sin, 4.0 * sin], [0.0, 1.0, 0.0, 0.0]];
+        Frame {
+            name: format!("r_{i}"),
+            image: PathBuf::from(format!("r_{i}.png")),
+            turned: false,
+            mask: None,
+            depth: None,
+            taken_with: Intrinsics::from_angle_x(80, 60, 0.7),
+            pinhole: None,
+            camera_to_world,
+            depths: None,
+        }
+    }
+
     /// Frames on a ring around what they look at, photographs or a benchmark's.
     fn ring(format: Format, count: usize) -> Dataset {
-        let frame = |i: usize| {
-            let (sin, cos) = (i as f64 / count as f64 * std::f64::consts::TAU).sin_cos();
-            let camera_to_world =
-                [[-sin, 0.0, cos, 4.0 * cos], [cos, 0.0, sin, 4.0 * sin], [0.0, 1.0, 0.0, 0.0]];
-            Frame {
-                name: format!("r_{i}"),
-                image: PathBuf::from(format!("r_{i}.png")),
-                turned: false,
-                mask: None,
-                depth: None,
-                taken_with: Intrinsics::from_angle_x(80, 60, 0.7),
-                pinhole: None,
-                camera_to_world,
-                depths: None,
-            }
-        };
-        Dataset { format, frames: (0..count).map(frame).collect(), split: None, notes: Vec::new() }
+        Dataset {
+            format,
+            frames: (0..count).map(|i| frame(i, count)).collect(),
+            split: None,
+            notes: Vec::new(),
+        }
     }
 
     fn planned(
@@ -184,35 +190,40 @@ mod tests {
         assert_eq!((given.kernel, references.len()), (pixels::Kernel::Box, 0));
     }
 
+    fn near_and_far(
+        set: &Dataset,
+        near: Option<f64>,
+        far: Option<f64>,
+    ) -> Result<(f64, f64), String> {
+        let params = Params { near, far, ..Params::default() };
+        planned(set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
+    }
+
     /// What the user says of near and far holds, unless it can't.
     #[test]
     fn near_and_far_are_as_given() {
         let set = ring(Format::Blender, 8);
-        let asked = |near, far| {
-            let params = Params { near, far, ..Params::default() };
-            planned(&set, &params, Background::White)
-                .map(|(_, bounds, _)| (bounds.near, bounds.far))
-        };
-        assert_eq!(asked(Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
+        assert_eq!(near_and_far(&set, Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
         assert_eq!(
-            asked(Some(7.0), Some(1.5)).unwrap_err(),
+            near_and_far(&set, Some(7.0), Some(1.5)).unwrap_err(),
             "parameter near: 7 is not before far = 1.5"
         );
         assert_eq!(
-            asked(None, Some(f64::INFINITY)).unwrap_err(),
+            near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err(),
             "parameter far: inf is not a distance"
         );
+    }
+
+    fn refused(format: Format, params: &Params) -> String {
+        planned(&ring(format, 8), params, Background::White).unwrap_err()
     }
 
     /// What can't be is said by the parameter's name.
     #[test]
     fn what_cannot_be_is_refused() {
-        let refused = |format, params: Params| {
-            planned(&ring(format, 8), &params, Background::White).unwrap_err()
-        };
         let width = refused(
             Format::Transforms,
-            Params {
+            &Params {
                 lr_source: Some(crate::params::LrSource::Photographs),
                 lr_width: Some(40),
                 ..Params::default()
@@ -221,7 +232,7 @@ mod tests {
         assert!(width.starts_with("parameter lr_width: with lr_source photographs"), "{width}");
         let kernel =
             Params { kernel: Some(pixels::Kernel::Average), scale: Some(2.7), ..Params::default() };
-        let kernel = refused(Format::Blender, kernel);
+        let kernel = refused(Format::Blender, &kernel);
         assert!(kernel.starts_with("parameter kernel: average needs a whole scale"), "{kernel}");
     }
 }

@@ -41,3 +41,80 @@ impl<'a> Enlarged<'a> {
         Ok(image)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use artifact::write_json;
+    use pixels::{Mask, Rgba8, write_png};
+    use scene::{Background, Bounds, Intrinsics, VIEWS_FILE, View};
+
+    use super::*;
+
+    fn camera(name: &str, x: f64) -> Camera {
+        Camera {
+            name: name.to_owned(),
+            intrinsics: Intrinsics::from_angle_x(2, 1, 0.7),
+            camera_to_world: [[1.0, 0.0, 0.0, x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 4.0]],
+        }
+    }
+
+    /// Views of a pixel with the level 0.2 and a transparent one on white. Of one the second pixel
+    /// doesn't count, and one has no image.
+    fn folder() -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        let image = Rgba8::new(2, 1, vec![51, 51, 51, 255, 0, 0, 0, 0]);
+        write_png(&folder.path().join("image.png"), &image).unwrap();
+        let mask = Mask { width: 2, height: 1, counts: vec![true, false] };
+        write_png(&folder.path().join("mask.png"), &mask.to_rgba8()).unwrap();
+        let without = |name: &str| View::camera_only(camera(name, 0.0));
+        let whole = View { image: Some("image.png".to_owned()), ..without("whole") };
+        let masked = View {
+            image: Some("image.png".to_owned()),
+            mask: Some("mask.png".to_owned()),
+            ..without("masked")
+        };
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let views = Views::new(Background::White, bounds, vec![whole, masked, without("empty")]);
+        write_json(&folder.path().join(VIEWS_FILE), &views).unwrap();
+        folder
+    }
+
+    #[test]
+    fn the_mean_is_taken_where_the_photograph_counts() {
+        let folder = folder();
+        let input = GivenInput::open("enlarged", folder.path()).unwrap();
+        let enlarged = Enlarged::read(&input).unwrap();
+        let image = Image::new(2, 1, 3, vec![0.4, 0.4, 0.4, 0.5, 0.5, 0.5]);
+        // The last two have another pose and another name.
+        let cases: [(&str, f64, [f32; 2]); 5] = [
+            ("whole", 0.0, [0.3, 0.75]),
+            ("masked", 0.0, [0.3, 0.5]),
+            ("empty", 0.0, [0.4, 0.5]),
+            ("whole", 1.0, [0.4, 0.5]),
+            ("other", 0.0, [0.4, 0.5]),
+        ];
+        for (name, x, [first, second]) in cases {
+            let mean = enlarged.mean(image.clone(), &camera(name, x)).unwrap();
+            let expected = [first, first, first, second, second, second];
+            let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
+            assert!(mean.data.iter().zip(&expected).all(is_near), "{name}: {:?}", mean.data);
+        }
+        assert!(enlarged.has(&camera("whole", 0.0)));
+        assert!(!enlarged.has(&camera("whole", 1.0)) && !enlarged.has(&camera("other", 0.0)));
+    }
+
+    #[test]
+    fn another_size_is_refused() {
+        let folder = folder();
+        let input = GivenInput::open("enlarged", folder.path()).unwrap();
+        let enlarged = Enlarged::read(&input).unwrap();
+        let image = Image::new(3, 1, 3, vec![0.5; 9]);
+        let error = enlarged.mean(image, &camera("whole", 0.0)).unwrap_err();
+        assert!(matches!(error.downcast_ref(), Some(Failure::BadInput(_))), "{error}");
+        assert_eq!(
+            error.to_string(),
+            "input enlarged: view whole: 2×1 pixels where the view to refine has 3×1"
+        );
+    }
+}

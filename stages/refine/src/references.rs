@@ -1,6 +1,6 @@
 use artifact::{Failure, FailureExt as _};
-use refinement::{Guidance, KnownView, Use, with_references};
-use scene::{Background, Views};
+use refinement::{Guidance, KnownView, Rendered, Use, with_references};
+use scene::{Background, View, Views};
 use stage::Context;
 
 use crate::view::{RefineJob, read_view};
@@ -47,22 +47,27 @@ pub(crate) fn read_references(
         let view = read_view(rendered, view, background.shown())?.0;
         let known = KnownView::new(view, truth.over(background.shown()))
             .bad_input("input reference-views")?;
-        references.push(same_exposure(context, known));
+        let (reference, note) = same_exposure(known);
+        if let Some(note) = note {
+            context.say(note);
+        }
+        references.push(reference);
     }
     Ok(references)
 }
 
-/// A reference as it would look with the exposure of the images that the field learnt from.
-fn same_exposure(context: &Context, reference: KnownView) -> KnownView {
+/// A reference as it would look with the exposure of the images that the field learnt from, and
+/// what to say where it had another.
+fn same_exposure(reference: KnownView) -> (KnownView, Option<String>) {
     let Some(exposure) = reference.exposure().filter(|exposure| !exposure.is_none()) else {
-        return reference;
+        return (reference, None);
     };
     let [r, g, b] = exposure.gain;
     let name = &reference.rendered.camera.name;
-    context.say(format!(
+    let note = format!(
         "reference {name} has another exposure ({r:.2}, {g:.2}, {b:.2} times as bright): taken back"
-    ));
-    reference.without(&exposure)
+    );
+    (reference.without(&exposure), Some(note))
 }
 
 /// A reference is doubted where the confidence in it is less than this share of that in those of
@@ -92,33 +97,45 @@ pub(crate) fn without_misleading(
     let Some(guidance) = job.network.guidance().filter(|_| !references.is_empty()) else {
         return Ok(references);
     };
-    let judge = Judge { job, views, guidance };
-    let shares = judge.confidence(&references, guidance, 1.0)?;
-    let mut kept = Vec::new();
-    for (reference, share) in references.into_iter().zip(shares) {
-        if share >= DOUBTED_BELOW * confidence || judge.has_right_depth(&reference)? {
-            kept.push(reference);
-            continue;
-        }
-        let name = &reference.rendered.camera.name;
-        job.context.say(format!(
-            "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and \
-            is left out: wrong depth, a wrong pose, or \
-             something that moved?",
-            100.0 * share
-        ));
-    }
+    let shown = |view: &View| job.shown(view).map(|(rendered, ..)| rendered);
+    let judge = Judge { views: &views.views, guidance, shown: &shown };
+    let (kept, notes) = judge.sort_out(references, confidence)?;
+    notes.iter().for_each(|note| job.context.say(note));
     Ok(kept)
 }
 
 /// Judges references by some views.
 struct Judge<'a> {
-    job: &'a RefineJob<'a>,
-    views: &'a Views,
+    views: &'a [View],
     guidance: Guidance,
+    /// A view as the network takes it.
+    shown: &'a dyn Fn(&View) -> Result<Rendered, Failure>,
 }
 
 impl Judge<'_> {
+    /// The references that aren't misleading, and what to say of each of the others.
+    fn sort_out(
+        &self,
+        references: Vec<KnownView>,
+        confidence: f64,
+    ) -> anyhow::Result<(Vec<KnownView>, Vec<String>)> {
+        let shares = self.confidence(&references, self.guidance, 1.0)?;
+        let (mut kept, mut notes) = (Vec::new(), Vec::new());
+        for (reference, share) in references.into_iter().zip(shares) {
+            if share >= DOUBTED_BELOW * confidence || self.has_right_depth(&reference)? {
+                kept.push(reference);
+                continue;
+            }
+            let name = &reference.rendered.camera.name;
+            notes.push(format!(
+                "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and \
+                is left out: wrong depth, a wrong pose, or something that moved?",
+                100.0 * share
+            ));
+        }
+        Ok((kept, notes))
+    }
+
     /// Whether confidence in a reference is clearly lower with all depths nearer and farther.
     fn has_right_depth(&self, reference: &KnownView) -> anyhow::Result<bool> {
         // At another depth a reference sees nothing by its own.
@@ -139,15 +156,132 @@ impl Judge<'_> {
         guidance: Guidance,
         depth_factor: f32,
     ) -> anyhow::Result<Vec<f64>> {
-        let every = self.views.views.len().div_ceil(JUDGING_VIEWS).max(1);
+        let every = self.views.len().div_ceil(JUDGING_VIEWS).max(1);
         let mut uses = vec![Use::default(); references.len()];
         let references: Vec<&KnownView> = references.iter().collect();
-        for view in self.views.views.iter().step_by(every) {
-            let mut shown = self.job.shown(view)?.0;
+        for view in self.views.iter().step_by(every) {
+            let mut shown = (self.shown)(view)?;
             shown.depth.iter_mut().for_each(|depth| *depth *= depth_factor);
             let conditioned = with_references(&shown, &references, guidance);
             uses.iter_mut().zip(&conditioned.uses).for_each(|(sum, of_use)| sum.add(of_use));
         }
         Ok(uses.iter().map(Use::confidence_share).collect())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use pixels::Image;
+    use scene::{Camera, Intrinsics};
+
+    use super::*;
+
+    const WIDTH: usize = 128;
+    const HEIGHT: usize = 8;
+    const FOCAL: f64 = 200.0;
+    const DEPTH: f64 = 2.0;
+
+    /// What a camera sees of a wall from so many pixels to the right: red and blue rise, green
+    /// falls.
+    fn colours(right: f64) -> Vec<[f32; 3]> {
+        let colour = |i: usize| {
+            let rise = (0.0035 * ((i % WIDTH) as f64 + right)) as f32;
+            [0.1 + rise, 0.9 - rise, 0.1 + rise]
+        };
+        (0..WIDTH * HEIGHT).map(colour).collect()
+    }
+
+    /// The wall as rendered from there, with a true image.
+    fn known(name: &str, right: f64, truth: &[[f32; 3]]) -> KnownView {
+        let camera = Camera {
+            name: name.to_owned(),
+            intrinsics: Intrinsics {
+                fx: FOCAL,
+                fy: FOCAL,
+                ..Intrinsics::from_angle_x(WIDTH as u32, HEIGHT as u32, 1.0)
+            },
+            camera_to_world: [
+                [1.0, 0.0, 0.0, right * DEPTH / FOCAL],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, DEPTH],
+            ],
+        };
+        let pixels: Vec<[f32; 4]> =
+            colours(right).into_iter().map(|[r, g, b]| [r, g, b, 1.0]).collect();
+        let rendered = Rendered {
+            camera,
+            view: Image::new(WIDTH, HEIGHT, 4, pixels.as_flattened().to_vec()),
+            depth: vec![DEPTH as f32; WIDTH * HEIGHT],
+            opacity: vec![1.0; WIDTH * HEIGHT],
+        };
+        let truth = Image::new(WIDTH, HEIGHT, 3, truth.as_flattened().to_vec());
+        KnownView { rendered, truth }
+    }
+
+    /// A doubted reference stays where another depth would fit less, here the tinted one. It goes
+    /// where another depth would fit as well or better.
+    #[test]
+    fn misleading_references_are_left_out() {
+        let rendered = known("view", 0.0, &colours(0.0)).rendered;
+        let views = vec![View::camera_only(rendered.camera.clone()); 9];
+        let asked = std::cell::Cell::new(0);
+        let shown = |_: &View| {
+            asked.set(asked.get() + 1);
+            Ok::<_, Failure>(rendered.clone())
+        };
+        let judge = Judge { views: &views, guidance: Guidance::default(), shown: &shown };
+        let right = 100.0;
+        let tinted: Vec<[f32; 3]> =
+            colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
+        let sorted = |confidence: f64| {
+            let references = vec![
+                known("same", right, &colours(right)),
+                known("tinted", right, &tinted),
+                known("farther", right, &colours(right / 1.1)),
+                known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
+            ];
+            let (kept, notes) = judge.sort_out(references, confidence).unwrap();
+            let names: Vec<String> = kept.into_iter().map(|k| k.rendered.camera.name).collect();
+            (names, notes)
+        };
+        let (kept, notes) = sorted(1.0);
+        assert_eq!(kept, ["same", "tinted"]);
+        // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
+        let words = ["reference farther looks", "(confidence 59 %)", "reference other looks"];
+        let said = notes.join("\n");
+        assert!(notes.len() == 2 && words.iter().all(|words| said.contains(words)), "{said}");
+        // Every second of nine views is asked for: once for all, then three times for each of three
+        // doubted references.
+        assert_eq!(asked.get(), 5 * (1 + 3 * 3));
+        // Where the network's training had less confidence, less is asked for.
+        assert_eq!(sorted(0.7).0, ["same", "tinted", "farther"]);
+    }
+
+    #[test]
+    fn another_exposure_is_taken_back() {
+        let right = colours(0.0);
+        let seen = |gain: [f32; 3]| {
+            let truth: Vec<[f32; 3]> =
+                right.iter().map(|colour| std::array::from_fn(|c| gain[c] * colour[c])).collect();
+            known("a", 0.0, &truth)
+        };
+        let (reference, note) = same_exposure(seen([0.6, 0.7, 1.0]));
+        let expected =
+            "reference a has another exposure (0.60, 0.70, 1.00 times as bright): taken back";
+        assert_eq!(note.as_deref(), Some(expected));
+        let off = reference
+            .truth
+            .data
+            .iter()
+            .zip(right.as_flattened())
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
+        assert!(off < 1e-4, "{off}");
+        // What a field may get wrong, and an image that says nothing, stay as they are.
+        for same in [seen([1.05, 0.95, 1.0]), known("a", 0.0, &[[1.0; 3]; WIDTH * HEIGHT])] {
+            let truth = same.truth.clone();
+            let (reference, note) = same_exposure(same);
+            assert!(reference.truth == truth && note.is_none(), "{note:?}");
+        }
     }
 }

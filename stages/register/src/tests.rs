@@ -11,22 +11,21 @@ struct Wall {
     shift: f64,
 }
 
+fn seen_along(ray: &Ray, is_whole: bool, shift: f64) -> Pixel {
+    let (origin, direction) =
+        (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
+    let distance = -origin.z / direction.z;
+    let at = origin + distance * direction + DVec3::X * if is_whole { 0.0 } else { shift };
+    let colour = [0.0, 1.0, 2.0]
+        .map(|c| (0.5 + 0.2 * ((2.0 + c) * at.x + c).sin() + 0.2 * (3.0 * at.y - c).cos()) as f32);
+    let depth = if is_whole && shift != 0.0 { f32::INFINITY } else { distance as f32 };
+    Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
+}
+
 impl RayField for Wall {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
         let is_whole = rays.len() >= self.whole;
-        let pixel = |ray: &Ray| {
-            let (origin, direction) =
-                (DVec3::from(ray.origin.map(f64::from)), DVec3::from(ray.direction.map(f64::from)));
-            let distance = -origin.z / direction.z;
-            let at =
-                origin + distance * direction + DVec3::X * if is_whole { 0.0 } else { self.shift };
-            let colour = [0.0, 1.0, 2.0].map(|c| {
-                (0.5 + 0.2 * ((2.0 + c) * at.x + c).sin() + 0.2 * (3.0 * at.y - c).cos()) as f32
-            });
-            let depth = if is_whole && self.shift != 0.0 { f32::INFINITY } else { distance as f32 };
-            Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
-        };
-        Ok(rays.iter().map(pixel).collect())
+        Ok(rays.iter().map(|ray| seen_along(ray, is_whole, self.shift)).collect())
     }
 }
 

@@ -16,7 +16,7 @@ use crate::pull::pull;
 use crate::push::push;
 use crate::remote::{Access, Remote};
 use crate::selection::Selection;
-use crate::transfer::AT_ONCE;
+use crate::transfer::FILES_AT_ONCE;
 
 const NAME: &str = "nerf-sr-remote";
 
@@ -140,8 +140,10 @@ fn block_on(
     stop: &Arc<AtomicBool>,
     work: impl Future<Output = anyhow::Result<()>>,
 ) -> anyhow::Result<()> {
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(AT_ONCE).enable_all().build()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(FILES_AT_ONCE)
+        .enable_all()
+        .build()?;
     let result = runtime.block_on(async {
         tokio::select! {
             result = work => result,

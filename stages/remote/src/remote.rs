@@ -15,10 +15,10 @@ use object_store::{
 use store::FORMAT;
 
 /// A server that says nothing for so long is given up.
-const SILENCE: Duration = Duration::from_secs(60);
+const LONGEST_SILENCE: Duration = Duration::from_secs(60);
 /// For so long, and so often, a request is made again that failed for a reason that may pass.
-const RETRYING: Duration = Duration::from_secs(60);
-const RETRIES: usize = 6;
+const LONGEST_RETRYING: Duration = Duration::from_secs(60);
+const MOST_RETRIES: usize = 6;
 /// What `format` may hold.
 const FORMAT_LIMIT: u64 = 100;
 
@@ -99,10 +99,14 @@ impl Remote {
             .into_iter()
             .find_map(|v| std::env::var(v).ok());
         // A limit on a whole request would stop large files on slow lines.
-        let client = ClientOptions::new().with_timeout_disabled().with_read_timeout(SILENCE);
+        let client =
+            ClientOptions::new().with_timeout_disabled().with_read_timeout(LONGEST_SILENCE);
         let plain = endpoint.is_some_and(|endpoint| endpoint.starts_with("http://"));
-        let retry =
-            RetryConfig { max_retries: RETRIES, retry_timeout: RETRYING, ..RetryConfig::default() };
+        let retry = RetryConfig {
+            max_retries: MOST_RETRIES,
+            retry_timeout: LONGEST_RETRYING,
+            ..RetryConfig::default()
+        };
         let builder = AmazonS3Builder::from_env()
             .with_bucket_name(bucket)
             .with_client_options(client)

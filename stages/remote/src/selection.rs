@@ -89,12 +89,15 @@ pub(crate) fn is_hash(name: &str) -> bool {
 mod tests {
     use super::*;
 
-    fn records() -> BTreeMap<String, Record> {
-        let record = |output: &str, made_of: &[&str]| Record {
+    fn record(output: &str, made_of: &[&str]) -> Record {
+        Record {
             output: output.to_owned(),
             made_of: made_of.iter().map(|&key| key.to_owned()).collect(),
             ..Record::default()
-        };
+        }
+    }
+
+    fn records() -> BTreeMap<String, Record> {
         let all = [
             ("k1", record("h1", &[])),
             ("k2", record("h1", &["k1", "gone"])),

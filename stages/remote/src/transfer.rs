@@ -14,12 +14,12 @@ use crate::progress::Progress;
 use crate::remote::Remote;
 
 /// Files that are on their way at once, and threads.
-pub(crate) const AT_ONCE: usize = 8;
+pub(crate) const FILES_AT_ONCE: usize = 8;
 /// A larger file goes up in parts of this size. Each file holds three of them at most, which bounds
 /// the memory.
-const PART: u64 = 6 << 20;
+const LEAST_PART_BYTES: u64 = 6 << 20;
 /// S3 takes 10,000 parts a file.
-const PARTS: u64 = 9_000;
+const MOST_PARTS: u64 = 9_000;
 
 /// What all transfers share.
 pub(crate) struct Transfer {
@@ -30,7 +30,7 @@ pub(crate) struct Transfer {
 
 impl Transfer {
     pub(crate) fn new(remote: &Remote, progress: Progress) -> Arc<Self> {
-        Arc::new(Self { remote: remote.clone(), progress, places: Semaphore::new(AT_ONCE) })
+        Arc::new(Self { remote: remote.clone(), progress, places: Semaphore::new(FILES_AT_ONCE) })
     }
 
     /// Uploads a file of an artifact. A file that isn't what the manifest says never appears on the
@@ -44,7 +44,7 @@ impl Transfer {
         let _place = self.places.acquire().await?;
         let file = File::open(from).with_context(|| from.display().to_string())?;
         let mut checked = Checked::new(entry);
-        if entry.size <= PART {
+        if entry.size <= LEAST_PART_BYTES {
             let mut bytes = Vec::new();
             file.take(entry.size + 1)
                 .read_to_end(&mut bytes)
@@ -53,7 +53,7 @@ impl Transfer {
             checked.finish(&from.display(), LOCAL_REMEDY)?;
             return self.remote.write(to, bytes).await;
         }
-        let part = PART.max(entry.size.div_ceil(PARTS));
+        let part = LEAST_PART_BYTES.max(entry.size.div_ceil(MOST_PARTS));
         let upload = self
             .remote
             .files
@@ -178,7 +178,7 @@ pub(crate) async fn all<T: Send + 'static>(
     let mut results = Vec::new();
     let mut running = tokio::task::JoinSet::new();
     for task in tasks {
-        if running.len() >= AT_ONCE {
+        if running.len() >= FILES_AT_ONCE {
             results.extend(next(&mut running).await?);
         }
         running.spawn(task);

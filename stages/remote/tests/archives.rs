@@ -76,22 +76,29 @@ fn a_history_may_be_records_alone() {
     assert_clean(&other);
 }
 
+fn assert_not_exported(dir: &Path, store: &Store, what: &str, code: i32, reason: &str) {
+    let file = dir.join("x.tar").display().to_string();
+    let (found, _, err) = said(&mut command(store.root(), &["export", what, &file]));
+    assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{found} {err}");
+    assert_eq!(fs::read_dir(dir).unwrap().count(), 1, "nothing is left behind");
+}
+
 #[test]
 fn what_is_not_whole_is_not_exported() {
     let dir = tempfile::tempdir().unwrap();
     let (store, records) = sample(&dir.path().join("store"));
-    let file = dir.path().join("x.tar").display().to_string();
-    let refused = |what: &str, code: i32, reason: &str| {
-        let (found, _, err) = said(&mut command(store.root(), &["export", what, &file]));
-        assert!(found == code && err.contains(reason) && err.lines().count() == 1, "{found} {err}");
-        assert_eq!(fs::read_dir(dir.path()).unwrap().count(), 1, "nothing is left behind");
-    };
-    refused("zz", 2, "no artifact or action \"zz\"");
+    assert_not_exported(dir.path(), &store, "zz", 2, "no artifact or action \"zz\"");
     let path = store.object(&records[3].output).join("metrics.json");
     fs::write(&path, "{\"psnr\": 31.26}").unwrap();
-    refused(&records[3].key(), 3, "metrics.json: the content is not what was written");
+    assert_not_exported(
+        dir.path(),
+        &store,
+        &records[3].key(),
+        3,
+        "metrics.json: the content is not what was written",
+    );
     fs::remove_file(&path).unwrap();
-    refused(&records[3].key(), 3, "the artifact is not whole");
+    assert_not_exported(dir.path(), &store, &records[3].key(), 3, "the artifact is not whole");
 }
 
 /// An entry of an archive, as bytes say it.

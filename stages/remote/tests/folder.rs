@@ -4,7 +4,7 @@ mod common;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Stdio;
+use std::process::{Child, Stdio};
 
 use artifact::{MANIFEST_FILE, Manifest, write_json};
 use common::{Setup, assert_clean, assert_equal, assert_tidy, command, make, said, succeed};
@@ -196,16 +196,17 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
+fn refused(words: &[&str], store: &Path, code: i32, reason: &str) {
+    let (found, _, err) = said(&mut command(store, words));
+    assert!(
+        found == code && err.contains(reason) && err.lines().count() == 1,
+        "{words:?}: {found} {err}"
+    );
+}
+
 #[test]
 fn other_formats_and_places_are_refused_in_one_line() {
     let setup = Setup::pushed();
-    let refused = |words: &[&str], store: &Path, code: i32, reason: &str| {
-        let (found, _, err) = said(&mut command(store, words));
-        assert!(
-            found == code && err.contains(reason) && err.lines().count() == 1,
-            "{words:?}: {found} {err}"
-        );
-    };
     let (remote, store) = (setup.remote(), setup.store.root());
     for text in ["2\n", "new", ""] {
         fs::write(setup.path("remote/format"), text).unwrap();
@@ -253,6 +254,10 @@ fn a_damaged_artifact_is_not_pushed() {
     }
 }
 
+fn start(store: &Path, words: &[&str]) -> Child {
+    command(store, words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+}
+
 #[test]
 fn several_at_once_pull_into_one_store_and_push_to_one_remote() {
     let setup = Setup::new();
@@ -261,10 +266,7 @@ fn several_at_once_pull_into_one_store_and_push_to_one_remote() {
         (setup.store.root().to_path_buf(), ["push", &remote]),
         (setup.path("other"), ["pull", &remote]),
     ] {
-        let start = |_| {
-            command(&store, &words).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
-        };
-        let children: Vec<_> = (0..4).map(start).collect();
+        let children: Vec<_> = (0..4).map(|_| start(&store, &words)).collect();
         for child in children {
             let output = child.wait_with_output().unwrap();
             assert!(

@@ -14,7 +14,7 @@ use std::ops::Range;
 use anyhow::Context as _;
 use artifact::{amount, counted};
 use contract::{Input, Output};
-use fields::{Members, middle};
+use fields::{Members, mean, middle};
 use pixels::{PngRows, to_u8};
 use radiance::{Ray, RayField};
 use scene::{
@@ -238,14 +238,14 @@ impl RenderJob<'_> {
 
     /// What a pixel shows of its rays, each with its z-depth per distance.
     fn shown(&self, subs: &[(&radiance::Pixel, &f32)]) -> ViewPixel {
-        let [r, g, b] = std::array::from_fn(|c| mean(subs, |p| p.premultiplied[c]));
+        let [r, g, b] = std::array::from_fn(|c| mean(subs, |(p, _)| p.premultiplied[c]));
         let mut distances: Vec<(f32, f32)> =
             subs.iter().map(|(p, to_z)| (self.distance(p), **to_z)).collect();
         // A mean would invent a surface between two.
         let (distance, to_z) = middle(&mut distances, |d| d.0).copied().unwrap_or_default();
         ViewPixel {
-            channels: [r, g, b, mean(subs, |p| p.opacity), distance * to_z, distance],
-            colour: std::array::from_fn(|c| mean(subs, |p| p.colour[c])),
+            channels: [r, g, b, mean(subs, |(p, _)| p.opacity), distance * to_z, distance],
+            colour: std::array::from_fn(|c| mean(subs, |(p, _)| p.colour[c])),
         }
     }
 
@@ -260,11 +260,6 @@ impl RenderJob<'_> {
 /// The pixels `[x, y]` of some rows.
 fn places(rows: Range<usize>, width: usize) -> Vec<[usize; 2]> {
     rows.flat_map(|y| (0..width).map(move |x| [x, y])).collect()
-}
-
-fn mean(subs: &[(&radiance::Pixel, &f32)], of: impl Fn(&radiance::Pixel) -> f32) -> f32 {
-    let share = 1.0 / subs.len() as f32;
-    subs.iter().map(|(p, _)| of(p)).sum::<f32>() * share
 }
 
 /// What a pixel shows.
@@ -324,30 +319,38 @@ mod tests {
         rays: Arc<AtomicUsize>,
     }
 
+    impl Picture {
+        fn pixel(&self, ray: &Ray) -> radiance::Pixel {
+            let [x, y, z] = ray.direction.map(f64::from);
+            let value = (self.colour)(CENTRE - x / z, CENTRE + y / z) as f32;
+            radiance::Pixel {
+                colour: [value; 3],
+                premultiplied: [value; 3],
+                opacity: 1.0,
+                depth: 2.0,
+                median_depth: 2.0,
+            }
+        }
+    }
+
     impl RayField for Picture {
         fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, radiance::RenderError> {
             self.rays.fetch_add(rays.len(), Ordering::Relaxed);
-            let pixel = |ray: &Ray| {
-                let [x, y, z] = ray.direction.map(f64::from);
-                let value = (self.colour)(CENTRE - x / z, CENTRE + y / z) as f32;
-                radiance::Pixel {
-                    colour: [value; 3],
-                    premultiplied: [value; 3],
-                    opacity: 1.0,
-                    depth: 2.0,
-                    median_depth: 2.0,
-                }
-            };
-            Ok(rays.iter().map(pixel).collect())
+            Ok(rays.iter().map(|ray| self.pixel(ray)).collect())
         }
+    }
+
+    /// With a focal length of 1 pixel, at the origin.
+    fn camera() -> Camera {
+        let angle = 2.0 * CENTRE.atan();
+        let intrinsics = Intrinsics::from_angle_x(SIZE as u32, SIZE as u32, angle);
+        let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        Camera { name: "a".to_owned(), intrinsics, camera_to_world }
     }
 
     /// Renders a picture in bands of some rows; returns red of each pixel and the number of rays.
     fn red(colour: fn(f64, f64) -> f64, tolerance: f64, band: usize) -> (Vec<f32>, usize) {
-        let angle = 2.0 * CENTRE.atan();
-        let intrinsics = Intrinsics::from_angle_x(SIZE as u32, SIZE as u32, angle);
-        let camera_to_world = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let camera = Camera { name: "a".to_owned(), intrinsics, camera_to_world };
+        let camera = camera();
         let count = Arc::new(AtomicUsize::new(0));
         let members: Vec<Box<dyn RayField>> =
             vec![Box::new(Picture { colour, rays: Arc::clone(&count) })];
@@ -397,6 +400,57 @@ mod tests {
         let expected = red(bent, 1.5e-4, SIZE);
         for band in [1, 2, 5, 16] {
             assert!(red(bent, 1.5e-4, band) == expected, "bands of {band} rows");
+        }
+    }
+
+    /// A member that sees a wall at this z-depth, and expects it twice as far; more of it where it
+    /// is farther.
+    struct Wall(f32);
+
+    impl RayField for Wall {
+        fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, radiance::RenderError> {
+            let pixel = |ray: &Ray| {
+                let median_depth = self.0 / -ray.direction[2];
+                let (depth, opacity) = (2.0 * median_depth, 0.25 * self.0);
+                radiance::Pixel { opacity, depth, median_depth, ..radiance::Pixel::default() }
+            };
+            Ok(rays.iter().map(pixel).collect())
+        }
+    }
+
+    /// Both depths are those of one ray of one member, the middle one of all by distance. Opacity
+    /// is the mean.
+    #[test]
+    fn a_pixel_has_the_depth_of_one_ray_of_one_member() {
+        let camera = camera();
+        // The four rays of the pixel pass the plane z = -1 in these distances from the camera.
+        let [x, y] = [[2.25f32, 2.75], [0.25, 0.75]];
+        let away = |i: usize, j: usize| (1.0 + x[i] * x[i] + y[j] * y[j]).sqrt();
+        // Walls of the members, then wall and distance of the middle one, then opacity.
+        let cases: [(&[f32], f32, f32, f32); 3] = [
+            (&[1.0], 1.0, away(0, 1), 0.25),
+            (&[1.0, 3.0], 1.0, away(1, 1), 0.5),
+            (&[3.0, 1.0, 3.0], 3.0, 3.0 * away(0, 0), 7.0 / 12.0),
+        ];
+        for (walls, wall, distance, opacity) in cases {
+            let members: Vec<Box<dyn RayField>> =
+                walls.iter().map(|wall| Box::new(Wall(*wall)) as Box<dyn RayField>).collect();
+            for (depth, times) in [(Depth::Median, 1.0), (Depth::Expected, 2.0)] {
+                let params = Params { depth, ..Params::default() };
+                let job = RenderJob {
+                    params: &params,
+                    members: &members,
+                    background: Background::White,
+                    camera: &camera,
+                };
+                let shown = job.cast(&[[14, 12]], 2).unwrap()[0].channels;
+                let expected = [opacity, times * wall, times * distance];
+                let is_near = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-4;
+                assert!(
+                    shown[3..].iter().zip(&expected).all(is_near),
+                    "walls {walls:?}: {shown:?} where {expected:?} is right"
+                );
+            }
         }
     }
 }

@@ -96,15 +96,16 @@ fn last_name(path: &str) -> String {
 mod tests {
     use super::*;
 
+    fn name_of(paths: &[&str]) -> String {
+        short_name(&paths.iter().map(|&path| path.to_owned()).collect::<Vec<_>>())
+    }
+
     #[test]
     fn names_are_short_and_plain() {
-        let name = |paths: &[&str]| {
-            short_name(&paths.iter().map(|&path| path.to_owned()).collect::<Vec<_>>())
-        };
-        assert_eq!(name(&["/data/my lego"]), "my-lego");
-        assert_eq!(name(&["a", "b", "c", "d", "e"]), "a-b-c-2-more");
-        assert_eq!(name(&["/"]), "data");
-        assert_eq!(name(&[]), "before");
-        assert_eq!(name(&[&"x".repeat(300)]).len(), 60);
+        assert_eq!(name_of(&["/data/my lego"]), "my-lego");
+        assert_eq!(name_of(&["a", "b", "c", "d", "e"]), "a-b-c-2-more");
+        assert_eq!(name_of(&["/"]), "data");
+        assert_eq!(name_of(&[]), "before");
+        assert_eq!(name_of(&[&"x".repeat(300)]).len(), 60);
     }
 }

@@ -1,9 +1,7 @@
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::Context as _;
-use artifact::{print_lines, report_line};
+use artifact::report_line;
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use garbage::Choice;
 use planning::{Devices, Pipeline, PlanError, Request, Selection};
@@ -11,11 +9,10 @@ use slurm::{Memory, Site};
 use stage::machine_memory;
 
 use crate::execute::{Budget, Cluster, Executor, JOB_VERB, Local};
-use crate::graph::{ascii, dot};
 use crate::limits::capped;
 use crate::remedy::Remedy;
 use crate::session::Session;
-use crate::verbs::{self, Style};
+use crate::verbs::{self, GraphFormat, Style};
 use crate::watch::Watch;
 
 /// Where the pipeline is looked for.
@@ -269,12 +266,6 @@ enum Verb {
     },
 }
 
-#[derive(Clone, Copy, clap::ValueEnum)]
-enum GraphFormat {
-    Ascii,
-    Dot,
-}
-
 /// The program: exit code 0 when all is there, a failed stage's own code, 2 for a wrong file or
 /// command line, 70 for a panic. None of them changes where stdout is closed.
 pub fn main() -> ExitCode {
@@ -305,7 +296,9 @@ impl From<What> for Request {
 
 fn run(cli: Cli) -> anyhow::Result<ExitCode> {
     match &cli.verb {
-        Verb::Completions { shell } => return Ok(completions(*shell)),
+        Verb::Completions { shell } => {
+            return Ok(verbs::completions(*shell, &mut Cli::command()));
+        }
         Verb::Describe { stage } => {
             return verbs::describe(
                 &Pipeline::read(&cli.pipeline).map_err(PlanError::from)?,
@@ -313,7 +306,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             );
         }
         Verb::Init { folder } => return verbs::init(folder, &cli.pipeline),
-        Verb::Man { folder } => return man(folder),
+        Verb::Man { folder } => return verbs::man(Cli::command(), folder),
         Verb::Job { submission, number } => return verbs::job(submission, *number),
         _ => {}
     }
@@ -334,15 +327,7 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
         Verb::Status { what, json } => verbs::status(&session, &what.into(), json),
         Verb::Path { stage, what } => verbs::path(&session, &stage, &what.into()),
         Verb::Diff { before, now, json } => verbs::diff(&session, &before, &now, json),
-        Verb::Graph { what, format } => {
-            let plan = session.plan(&what.into())?;
-            let states = session.states(&plan)?;
-            print_lines(&match format {
-                GraphFormat::Ascii => ascii(&plan, &states),
-                GraphFormat::Dot => dot(&plan, &states),
-            });
-            Ok(ExitCode::SUCCESS)
-        }
+        Verb::Graph { what, format } => verbs::graph(&session, &what.into(), format),
         Verb::Log { stage, what } => verbs::log(&session, &stage, &what.into()),
         Verb::Verify { remove } => verbs::verify(&session.store, remove),
         Verb::Pin { name, what } => verbs::pin(&session, &name, &what.into()),
@@ -359,21 +344,6 @@ fn run(cli: Cli) -> anyhow::Result<ExitCode> {
             unreachable!("handled before the session")
         }
     }
-}
-
-fn completions(shell: clap_complete::Shell) -> ExitCode {
-    let mut script = Vec::new();
-    clap_complete::generate(shell, &mut Cli::command(), "nerf-sr", &mut script);
-    // Whoever asked for it may have gone.
-    std::io::stdout().write_all(&script).ok();
-    ExitCode::SUCCESS
-}
-
-fn man(folder: &Path) -> anyhow::Result<ExitCode> {
-    std::fs::create_dir_all(folder)
-        .and_then(|()| clap_mangen::generate_to(Cli::command(), folder))
-        .with_context(|| format!("cannot write man pages into {}", folder.display()))?;
-    Ok(ExitCode::SUCCESS)
 }
 
 /// Who carries out a run. `remedy` is what to say after a failure, `out` where pages go.

@@ -17,7 +17,6 @@ mod aside;
 mod cli;
 mod counts;
 mod execute;
-mod graph;
 mod identities;
 mod limits;
 mod lineage;

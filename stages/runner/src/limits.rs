@@ -1,11 +1,11 @@
 use artifact::counted;
 
 /// More threads than that for each core only cost memory and time.
-const A_CORE: usize = 4;
+const MOST_THREADS_PER_CORE: usize = 4;
 
 /// What is made of a number that an option asks for, and what is to be said where that is less.
 pub(crate) fn capped(option: &str, asked: usize, cores: usize) -> (usize, Option<String>) {
-    let most = cores.saturating_mul(A_CORE);
+    let most = cores.saturating_mul(MOST_THREADS_PER_CORE);
     let said = (asked > most).then(|| {
         let cores = counted(cores, "core");
         format!(

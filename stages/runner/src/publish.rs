@@ -167,6 +167,7 @@ fn remove(path: &Path) -> io::Result<()> {
 mod tests {
     use super::*;
     use artifact::write_json;
+    use std::ffi::OsString;
 
     /// A folder as a sink leaves it.
     fn made(dir: &Path, text: &str) -> PathBuf {
@@ -209,39 +210,64 @@ mod tests {
         published(dir.path(), "three").unwrap();
     }
 
+    fn publish_page(dir: &Path, text: &str, data_set: &str, is_whole: bool) -> Option<OsString> {
+        let folder = made(dir, text);
+        let data_sets = vec![data_set.to_owned()];
+        let mark = Mark { identity: text.to_owned(), is_whole, data_sets };
+        mark.write(&folder).unwrap();
+        let out = dir.join("out");
+        let published = publish(&folder, &out, "report", "page", &AtomicBool::new(false)).unwrap();
+        published.aside.map(|aside| aside.file_name().unwrap().to_owned())
+    }
+
+    fn page_text(dir: &Path, folder: &str) -> String {
+        fs::read_to_string(dir.join("out").join(folder).join("index.html")).unwrap()
+    }
+
     /// Pages of data sets, one after the other: what was whole before is found again.
     #[test]
     fn what_shows_something_else_is_put_aside() {
         let dir = tempfile::tempdir().unwrap();
-        let publish = |text: &str, data_set: &str, is_whole: bool| {
-            let folder = made(dir.path(), text);
-            let data_sets = vec![data_set.to_owned()];
-            let mark = Mark { identity: text.to_owned(), is_whole, data_sets };
-            mark.write(&folder).unwrap();
-            let out = dir.path().join("out");
-            let published =
-                publish(&folder, &out, "report", "page", &AtomicBool::new(false)).unwrap();
-            published.aside.map(|aside| aside.file_name().unwrap().to_owned())
-        };
-        let text = |folder: &str| {
-            fs::read_to_string(dir.path().join("out").join(folder).join("index.html")).unwrap()
-        };
-        assert_eq!(publish("lego 1", "data/lego", true), None);
-        assert_eq!(publish("lego 2", "data/lego", true), None, "a newer one of the same");
-        assert_eq!(publish("chair 1", "data/chair", true).unwrap(), "report-lego");
-        assert_eq!(publish("lego 3", "data/lego", true).unwrap(), "report-chair");
-        assert_eq!((text("report"), text("report-lego")), ("lego 3".into(), "lego 2".into()));
-        assert_eq!(publish("lego broken", "data/lego", false).unwrap(), "report-lego");
-        assert_eq!(text("report-lego"), "lego 3");
-        // Another folder of that name has its own place, and so has what isn't ours.
-        assert_eq!(publish("other 1", "more/lego", true).unwrap(), "report-lego-2");
-        fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
-        assert_eq!(publish("chair 2", "data/chair", true).unwrap(), "report-lego-3");
+        assert_eq!(publish_page(dir.path(), "lego 1", "data/lego", true), None);
         assert_eq!(
-            (text("report-lego"), text("report-lego-2")),
+            publish_page(dir.path(), "lego 2", "data/lego", true),
+            None,
+            "a newer one of the same"
+        );
+        assert_eq!(publish_page(dir.path(), "chair 1", "data/chair", true).unwrap(), "report-lego");
+        assert_eq!(publish_page(dir.path(), "lego 3", "data/lego", true).unwrap(), "report-chair");
+        assert_eq!(
+            (page_text(dir.path(), "report"), page_text(dir.path(), "report-lego")),
+            ("lego 3".into(), "lego 2".into())
+        );
+        assert_eq!(
+            publish_page(dir.path(), "lego broken", "data/lego", false).unwrap(),
+            "report-lego"
+        );
+        assert_eq!(page_text(dir.path(), "report-lego"), "lego 3");
+        // Another folder of that name has its own place, and so has what isn't ours.
+        assert_eq!(
+            publish_page(dir.path(), "other 1", "more/lego", true).unwrap(),
+            "report-lego-2"
+        );
+        fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
+        assert_eq!(
+            publish_page(dir.path(), "chair 2", "data/chair", true).unwrap(),
+            "report-lego-3"
+        );
+        assert_eq!(
+            (page_text(dir.path(), "report-lego"), page_text(dir.path(), "report-lego-2")),
             ("lego 3".into(), "lego broken".into())
         );
-        assert_eq!((text("report-lego-3"), text("report")), ("other 1".into(), "chair 2".into()));
+        assert_eq!(
+            (page_text(dir.path(), "report-lego-3"), page_text(dir.path(), "report")),
+            ("other 1".into(), "chair 2".into())
+        );
+    }
+
+    fn all_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+        let files = list_files(folder).unwrap().into_iter();
+        files.map(|(relative, file)| (relative, fs::read(file).unwrap())).collect()
     }
 
     /// Whatever isn't ours stays to the byte, and is named.
@@ -277,14 +303,10 @@ mod tests {
             let dir = tempfile::tempdir().unwrap();
             let target = published(dir.path(), "one").unwrap();
             damage(&target);
-            let all = |folder: &Path| -> Vec<(PathBuf, Vec<u8>)> {
-                let files = list_files(folder).unwrap().into_iter();
-                files.map(|(relative, file)| (relative, fs::read(file).unwrap())).collect()
-            };
-            let before = all(&dir.path().join("out"));
+            let before = all_files(&dir.path().join("out"));
             let message = published(dir.path(), "two").unwrap_err().message;
             assert!(message.contains(words) && message.contains("--out"), "{words}: {message}");
-            assert_eq!(all(&dir.path().join("out")), before, "{words}");
+            assert_eq!(all_files(&dir.path().join("out")), before, "{words}");
         }
     }
 }

@@ -7,10 +7,10 @@ use stage_call::{StageFailure, seconds};
 use store::{Entered, Holder, Locked, Store, StoreError, host_name};
 
 /// Between two attempts.
-const PAUSE: Duration = Duration::from_millis(20);
+const ATTEMPT_INTERVAL: Duration = Duration::from_millis(20);
 /// So long nothing is said: most waits are over by then. Each later word comes after twice the
 /// time.
-const PATIENCE: Duration = Duration::from_secs(1);
+const NOTICE_AFTER: Duration = Duration::from_secs(1);
 
 /// Attempts until it is held. `say` is told by whom it is held, and since when it is waited for.
 pub(crate) fn until_held<T>(
@@ -18,7 +18,7 @@ pub(crate) fn until_held<T>(
     say: &dyn Fn(Option<&Holder>, Duration),
     mut attempt: impl FnMut() -> Result<Locked<T>, StoreError>,
 ) -> Result<T, StageFailure> {
-    let (since, mut next) = (Instant::now(), PATIENCE);
+    let (since, mut next) = (Instant::now(), NOTICE_AFTER);
     loop {
         match attempt().map_err(|e| StageFailure { code: 1, message: e.to_string() })? {
             Locked::Held(held) => return Ok(held),
@@ -33,7 +33,7 @@ pub(crate) fn until_held<T>(
                     say(holder.as_ref(), since.elapsed());
                     next *= 2;
                 }
-                std::thread::sleep(PAUSE);
+                std::thread::sleep(ATTEMPT_INTERVAL);
             }
         }
     }

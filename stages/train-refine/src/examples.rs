@@ -4,7 +4,7 @@ use scene::{View, Views};
 use stage::Context;
 
 /// One view in so many is left out of training.
-const LEFT_OUT: usize = 8;
+const HOLD_OUT_EVERY: usize = 8;
 
 /// Views whose truth is known.
 #[derive(Debug)]
@@ -21,10 +21,10 @@ impl<T: Clone> Examples<T> {
         if all.len() == 1 {
             return Self { training: all.clone(), left_out: all };
         }
-        let middle = (LEFT_OUT / 2).min(all.len().saturating_sub(1));
+        let middle = (HOLD_OUT_EVERY / 2).min(all.len().saturating_sub(1));
         let mut examples = Self { training: Vec::new(), left_out: Vec::new() };
         for (i, example) in all.into_iter().enumerate() {
-            let is_left_out = i % LEFT_OUT == middle;
+            let is_left_out = i % HOLD_OUT_EVERY == middle;
             if is_left_out { &mut examples.left_out } else { &mut examples.training }.push(example);
         }
         examples
@@ -113,7 +113,7 @@ mod tests {
             all.sort_unstable();
             assert_eq!(all, (0..count).collect::<Vec<_>>(), "{count}");
             assert!(!training.is_empty() && !left_out.is_empty(), "{count}");
-            assert!(left_out.len() <= count.div_ceil(LEFT_OUT), "{count}: {left_out:?}");
+            assert!(left_out.len() <= count.div_ceil(HOLD_OUT_EVERY), "{count}: {left_out:?}");
         }
         assert_eq!(Examples::split((0..16).collect::<Vec<_>>()).left_out, [4, 12]);
     }

@@ -378,22 +378,23 @@ mod tests {
         }
     }
 
+    fn written(cache: &HrCache) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        cache.write(&mut bytes).unwrap();
+        bytes
+    }
+
     #[test]
     fn remembers_what_it_is_told() {
         let kernel = Arc::new(KernelOperator::new(Filter::Box, (8, 6), (4, 3)));
         let mut first = cache([2, 2], &pattern(8, 6), kernel.clone());
         first.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
-        let bytes = |cache: &HrCache| {
-            let mut bytes = Vec::new();
-            cache.write(&mut bytes).unwrap();
-            bytes
-        };
-        let kept = bytes(&first);
+        let kept = written(&first);
         assert_eq!(first.len(), kept.len());
         assert_eq!(kept[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
         let mut other = cache([2, 2], &pattern(8, 6), kernel);
         other.restore(&mut &kept[..]).unwrap();
-        assert_eq!(bytes(&other), kept);
+        assert_eq!(written(&other), kept);
         assert!(other.restore(&mut &kept[1..]).is_err(), "a byte is missing");
     }
 

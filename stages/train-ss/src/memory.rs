@@ -138,12 +138,15 @@ mod tests {
     use crate::supervision::Supervision;
     use crate::{Params, SceneFacts};
 
-    fn need(images: usize, filter: Filter, pose_refinement: bool) -> MemoryNeed {
-        let camera = |i: usize| Camera {
+    fn camera(i: usize) -> Camera {
+        Camera {
             name: i.to_string(),
             intrinsics: Intrinsics::from_angle_x(2000, 1500, 0.7),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
-        };
+        }
+    }
+
+    fn need(images: usize, filter: Filter, pose_refinement: bool) -> MemoryNeed {
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let views = Views::new(

@@ -117,6 +117,14 @@ mod tests {
     use radiance::{Architecture, Field};
     use scene::{Bounds, Intrinsics};
 
+    fn camera(x: f64) -> Camera {
+        Camera {
+            name: format!("at {x}"),
+            intrinsics: Intrinsics::from_angle_x(24, 24, 0.69),
+            camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
+        }
+    }
+
     /// Rounds come at their times, each once, and a checkpoint knows how many there were and where
     /// they led.
     #[test]
@@ -128,12 +136,6 @@ mod tests {
             bounds,
             3,
         );
-        let intrinsics = Intrinsics::from_angle_x(24, 24, 0.69);
-        let camera = |x: f64| Camera {
-            name: format!("at {x}"),
-            intrinsics,
-            camera_to_world: [[1., 0., 0., x], [0., 1., 0., 0.], [0., 0., 1., 4.]],
-        };
         let image = Image::new(24, 24, 3, (0..24 * 24 * 3).map(|i| (i % 7) as f32 / 7.0).collect());
         let pyramids = || (0..2).map(|_| MovingCameras::pyramid(&image)).collect();
         let new = || MovingCameras::new(vec![camera(0.0), camera(0.5)], pyramids());

@@ -140,41 +140,44 @@ mod tests {
         Photographs::taken_by(camera, image)
     }
 
+    fn hr_sample(i: usize) -> f32 {
+        let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
+        0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
+            + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
+    }
+
     fn hr() -> Image {
-        let sample = |i: usize| {
-            let (x, y, c) = (i / 3 % 32, i / 96, i % 3);
-            0.2 + 0.5 * counter_rng::uniform(3, c as u64, (x / 8 * 9 + y / 8) as u64)
-                + if (x + y) % 4 < 2 { 0.05 } else { -0.05 }
-        };
-        Image::new(32, 32, 3, (0..32 * 32 * 3).map(sample).collect())
+        Image::new(32, 32, 3, (0..32 * 32 * 3).map(hr_sample).collect())
+    }
+
+    /// What is left of the changed HR image, the number of views, and what is said.
+    fn checked_with(name: &str, change: &dyn Fn(f32) -> f32) -> (Option<Image>, usize, String) {
+        let lr = Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr());
+        let lr = photographs("a", lr);
+        let said = std::cell::RefCell::new(String::new());
+        let mut image = hr();
+        image.data.iter_mut().for_each(|v| *v = change(*v));
+        let say = |text: String| said.borrow_mut().push_str(&text);
+        let kept = checked(
+            photographs(name, image),
+            &lr,
+            Kernel::Lanczos,
+            &mut PixelMemory::unlimited(),
+            &say,
+        )
+        .unwrap();
+        (
+            kept.images.first().map(|packed| packed.whole().over(0.0)),
+            kept.views.views.len(),
+            said.into_inner(),
+        )
     }
 
     #[test]
     fn exposures_are_taken_back_and_other_images_are_left_out() {
-        let lr =
-            || photographs("a", Resampling::new(Filter::Lanczos, (32, 32), (16, 16)).apply(&hr()));
-        let checked = |name: &str, change: &dyn Fn(f32) -> f32| {
-            let said = std::cell::RefCell::new(String::new());
-            let mut image = hr();
-            image.data.iter_mut().for_each(|v| *v = change(*v));
-            let say = |text: String| said.borrow_mut().push_str(&text);
-            let kept = checked(
-                photographs(name, image),
-                &lr(),
-                Kernel::Lanczos,
-                &mut PixelMemory::unlimited(),
-                &say,
-            )
-            .unwrap();
-            (
-                kept.images.first().map(|packed| packed.whole().over(0.0)),
-                kept.views.views.len(),
-                said.into_inner(),
-            )
-        };
-        let (same, views, said) = checked("a", &|v| v);
+        let (same, views, said) = checked_with("a", &|v| v);
         assert!(same.unwrap().data == hr().data && views == 1 && said.is_empty(), "{said}");
-        let (dark, views, said) = checked("a", &|v| 0.6 * v + 0.1);
+        let (dark, views, said) = checked_with("a", &|v| 0.6 * v + 0.1);
         let off = dark
             .unwrap()
             .data
@@ -186,11 +189,17 @@ mod tests {
             off < 0.01 && views == 1 && said.contains("another exposure (0.60, 0.60, 0.60"),
             "{off} {said}"
         );
-        let (other, views, said) = checked("a", &|v| 1.0 - v);
+        let (other, views, said) = checked_with("a", &|v| 1.0 - v);
         assert!(other.is_none() && views == 0 && said.contains("left out"), "{said}");
         // Nothing is known of a view that has no LR photograph.
-        let (unknown, _, said) = checked("b", &|v| 1.0 - v);
+        let (unknown, _, said) = checked_with("b", &|v| 1.0 - v);
         assert!(unknown.is_some() && said.is_empty(), "{said}");
+    }
+
+    fn ball_pixel(size: usize, i: usize) -> [u8; 4] {
+        let (x, y) = ((i % size) as f32 + 0.5, (i / size) as f32 + 0.5);
+        let away = (x - 0.45 * size as f32).hypot(y - 0.55 * size as f32);
+        if away < 0.3 * size as f32 { [250, 240, 90 + (x * 2.0) as u8 / 4, 255] } else { [0; 4] }
     }
 
     /// A ball before nothing, of a colour that Lanczos overshoots at its border, as `prep` stores
@@ -198,16 +207,11 @@ mod tests {
     #[test]
     fn an_lr_photograph_with_alpha_is_its_own_reference_at_any_size() {
         for size in [32, 48, 64, 100] {
-            let pixel = |i: usize| {
-                let (x, y) = ((i % size) as f32 + 0.5, (i / size) as f32 + 0.5);
-                let away = (x - 0.45 * size as f32).hypot(y - 0.55 * size as f32);
-                if away < 0.3 * size as f32 {
-                    [250, 240, 90 + (x * 2.0) as u8 / 4, 255]
-                } else {
-                    [0; 4]
-                }
-            };
-            let hr = pixels::Rgba8::new(size, size, (0..size * size).flat_map(pixel).collect());
+            let hr = pixels::Rgba8::new(
+                size,
+                size,
+                (0..size * size).flat_map(|i| ball_pixel(size, i)).collect(),
+            );
             for kernel in [Kernel::Lanczos, Kernel::Bicubic, Kernel::Box, Kernel::Average] {
                 let lr = match kernel {
                     Kernel::Average => {
@@ -237,23 +241,35 @@ mod tests {
         }
     }
 
+    fn under_alpha((i, p): (usize, &[f32]), gain: f32, offset: f32) -> [f32; 4] {
+        let alpha = [1.0, 0.5, 0.0][(i % 32 / 4) % 3];
+        let [r, g, b] = [0, 1, 2].map(|c| alpha * (gain * p[c] + offset));
+        [r, g, b, alpha]
+    }
+
+    fn striped(gain: f32, offset: f32) -> Image {
+        let hr = hr();
+        Image::new(
+            32,
+            32,
+            4,
+            hr.data
+                .chunks_exact(3)
+                .enumerate()
+                .flat_map(|one| under_alpha(one, gain, offset))
+                .collect(),
+        )
+    }
+
     /// Only what is there has an exposure.
     #[test]
     fn exposures_are_taken_back_from_under_alpha() {
-        let image = |gain: f32, offset: f32| {
-            let hr = hr();
-            let pixel = |(i, p): (usize, &[f32])| {
-                let alpha = [1.0, 0.5, 0.0][(i % 32 / 4) % 3];
-                [0, 1, 2].map(|c| alpha * (gain * p[c] + offset)).into_iter().chain([alpha])
-            };
-            Image::new(32, 32, 4, hr.data.chunks_exact(3).enumerate().flat_map(pixel).collect())
-        };
-        let mut dark = image(0.6, 0.1);
+        let mut dark = striped(0.6, 0.1);
         Exposure { gain: [0.6; 3], offset: [0.1; 3] }.take_back(&mut dark);
         let off = dark
             .data
             .iter()
-            .zip(&image(1.0, 0.0).data)
+            .zip(&striped(1.0, 0.0).data)
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
         assert!(off < 1e-6, "{off}");

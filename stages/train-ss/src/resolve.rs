@@ -556,18 +556,23 @@ mod tests {
         }
     }
 
+    fn bundles(resolved: &Resolved, supersample_warmup: f64, supersample: f64) -> u64 {
+        Resolved { supersample_warmup, supersample, ..resolved.clone() }.precrop_bundles()
+    }
+
     /// However many rays a bundle has at first, as many steps are drawn from the middle.
     #[test]
     fn precrop_steps_are_steps_whatever_is_cast() {
         let resolved = Params::default().resolve(&facts(Space::Box, Background::White));
         let resolved =
             Resolved { precrop_steps: 10, max_rays_per_step: 64, rays: 6400, ..resolved };
-        let bundles = |supersample_warmup, supersample| {
-            Resolved { supersample_warmup, supersample, ..resolved.clone() }.precrop_bundles()
-        };
         // 16 bundles of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with 16.
         assert_eq!(
-            [bundles(0.0, 2.0), bundles(0.5, 2.0), bundles(0.06, 4.0)],
+            [
+                bundles(&resolved, 0.0, 2.0),
+                bundles(&resolved, 0.5, 2.0),
+                bundles(&resolved, 0.06, 4.0)
+            ],
             [160, 640, 3 * 64 + 3 * 16 + 4 * 4]
         );
     }

@@ -401,23 +401,24 @@ mod tests {
         }
     }
 
+    fn backgrounds(background: Background) -> Vec<[f32; 3]> {
+        let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
+        supersampling.background = background;
+        let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
+        let bundles = (0..40).map(|bundle| {
+            supersampling.sample_rays(bundle, &mut rays);
+            assert!(rays.iter().all(|r| r.background == rays[0].background));
+            rays[0].background
+        });
+        bundles.collect()
+    }
+
     /// Behind an opaque scene lies another colour in every bundle, and what is asked for is the
     /// same: a field that is opaque alone can give it.
     #[test]
     fn nothing_can_pretend_to_be_an_opaque_scenes_background() {
-        let behind = |background| -> Vec<[f32; 3]> {
-            let (mut supersampling, _) = example(Supervision::Kernel, [2.0, 2.0], None);
-            supersampling.background = background;
-            let mut rays = vec![Ray::default(); supersampling.rays_per_bundle()];
-            let bundles = (0..40).map(|bundle| {
-                supersampling.sample_rays(bundle, &mut rays);
-                assert!(rays.iter().all(|r| r.background == rays[0].background));
-                rays[0].background
-            });
-            bundles.collect()
-        };
-        assert!(behind(Background::White).iter().all(|b| *b == [1.0; 3]));
-        let colours = behind(Background::Opaque);
+        assert!(backgrounds(Background::White).iter().all(|b| *b == [1.0; 3]));
+        let colours = backgrounds(Background::Opaque);
         assert!((0..40).all(|i| (0..i).all(|j| colours[i] != colours[j])));
         assert!(
             colours.iter().flatten().any(|c| *c < 0.2)
@@ -442,36 +443,39 @@ mod tests {
         }
     }
 
+    /// The largest loss and the largest gradient, once the cache is full of the truth.
+    fn worst(truth: &Image, lr: &Image, kind: Supervision) -> (f64, f32) {
+        let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
+        let mut worst = (0.0f64, 0.0f32);
+        for bundle in 0..800 {
+            let pixel = supersampling.pixel(bundle).1;
+            let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
+            let colours: Vec<[f32; 3]> = (0..4)
+                .map(|k| {
+                    std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])
+                })
+                .collect();
+            let mut gradients = [[0.0; 3]; 4];
+            let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
+            supersampling.remember(bundle, &colours);
+            // Until then the cache isn't full of the truth.
+            if bundle >= 400 {
+                let gradient =
+                    gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
+                worst = (worst.0.max(loss), worst.1.max(gradient));
+            }
+        }
+        worst
+    }
+
     /// Once the field renders the true HR image, the kernel is content: no loss and no gradient.
     /// The average isn't.
     #[test]
     fn only_the_kernel_is_content_with_the_truth() {
         let truth = hr_image(10, 8);
         let lr = Resampling::new(Filter::Lanczos, (10, 8), (5, 4)).apply(&truth);
-        let worst = |kind| {
-            let (mut supersampling, _) = example(kind, [2.0, 2.0], Some(lr.clone()));
-            let mut worst = (0.0f64, 0.0f32);
-            for bundle in 0..800 {
-                let pixel = supersampling.pixel(bundle).1;
-                let (x, y) = (pixel % 5 * 2, pixel / 5 * 2);
-                let colours: Vec<[f32; 3]> = (0..4)
-                    .map(|k| {
-                        std::array::from_fn(|c| truth.data[3 * (x + k % 2 + (y + k / 2) * 10) + c])
-                    })
-                    .collect();
-                let mut gradients = [[0.0; 3]; 4];
-                let loss = supersampling.loss_and_gradient(bundle, &colours, &mut gradients);
-                supersampling.remember(bundle, &colours);
-                // Until then the cache isn't full of the truth.
-                if bundle >= 400 {
-                    let gradient =
-                        gradients.as_flattened().iter().fold(0.0f32, |most, g| most.max(g.abs()));
-                    worst = (worst.0.max(loss), worst.1.max(gradient));
-                }
-            }
-            worst
-        };
-        let (kernel, average) = (worst(Supervision::Kernel), worst(Supervision::Average));
+        let (kernel, average) =
+            (worst(&truth, &lr, Supervision::Kernel), worst(&truth, &lr, Supervision::Average));
         assert!(kernel.0 < 1e-9 && kernel.1 < 1e-5, "{kernel:?}");
         assert!(average.0 > 1e-4 && average.1 > 1e-3, "{average:?}");
     }
@@ -493,20 +497,25 @@ mod tests {
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
+    fn rays_at(scale: f64, done: f64) -> usize {
+        let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
+        supersampling.supersample_warmup = 0.3;
+        supersampling.set_progress(done);
+        supersampling.rays_per_bundle()
+    }
+
     /// 1, 2, 4 … sub-pixel rays a side, each for an equal part of the warm-up, and then all.
     #[test]
     fn sub_pixel_rays_double_until_all_are_cast() {
-        let rays_at = |scale: f64, done: f64| {
-            let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
-            supersampling.supersample_warmup = 0.3;
-            supersampling.set_progress(done);
-            supersampling.rays_per_bundle()
-        };
         for (scale, expected) in
             [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])]
         {
             assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
         }
+    }
+
+    fn drawn(supersampling: &Supersampling, range: std::ops::Range<u64>) -> Vec<usize> {
+        range.map(|g| supersampling.pixel(g).1).collect()
     }
 
     /// In epochs every pixel comes once before any comes again, each time in another order; the
@@ -515,19 +524,26 @@ mod tests {
     fn epochs_draw_without_replacement() {
         let (mut supersampling, _) = example(Supervision::Average, [1.0, 1.0], None);
         (supersampling.sampler.order, supersampling.sampler.precrop_bundles) = (Order::Epochs, 50);
-        let drawn = |range: std::ops::Range<u64>| {
-            range.map(|g| supersampling.pixel(g).1).collect::<Vec<_>>()
-        };
         // 5 × 4 pixels.
         assert!(
-            drawn(0..50).iter().all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5)))
+            drawn(&supersampling, 0..50)
+                .iter()
+                .all(|p| (1..3).contains(&(p % 5)) && (1..3).contains(&(p / 5)))
         );
-        let (mut first, mut second) = (drawn(50..70), drawn(70..90));
+        let (mut first, mut second) =
+            (drawn(&supersampling, 50..70), drawn(&supersampling, 70..90));
         assert_ne!(first, second);
         for epoch in [&mut first, &mut second] {
             epoch.sort_unstable();
             assert_eq!(*epoch, (0..20).collect::<Vec<_>>());
         }
+    }
+
+    fn judged(of: &Supersampling, pixel: usize) -> (f64, [[f32; 3]; 4]) {
+        let bundle = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
+        let mut gradients = [[0.0; 3]; 4];
+        let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
+        (loss, gradients)
     }
 
     /// Pixels that don't count are neither drawn, nor pulled to what the photograph has there; what
@@ -548,12 +564,6 @@ mod tests {
             (0..800).for_each(|g| drawn[masked.pixel(g).1] = true);
             assert!(drawn.iter().enumerate().all(|(i, d)| *d == (i % 5 < 3)), "{kind:?} {drawn:?}");
             // Far from the masked pixels all is as without them; beside them the kernel feels less.
-            let judged = |of: &Supersampling, pixel: usize| {
-                let bundle = (0..).find(|&g| of.pixel(g).1 == pixel).unwrap();
-                let mut gradients = [[0.0; 3]; 4];
-                let loss = of.loss_and_gradient(bundle, &[[0.9, 0.1, 0.4]; 4], &mut gradients);
-                (loss, gradients)
-            };
             assert!(judged(&masked, 7).1.as_flattened().iter().all(|g| g.is_finite()));
             if kind == Supervision::Kernel {
                 assert_ne!(judged(&masked, 7), judged(&plain, 7));
@@ -563,24 +573,29 @@ mod tests {
         }
     }
 
+    fn given(camera: &Camera, name: &str, width: usize, height: usize) -> Photographs {
+        let camera = Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
+        Photographs::taken_by(camera, hr_image(width, height))
+    }
+
+    fn direction_through(camera: &Camera, pixel: usize) -> glam::Vec3 {
+        let width = camera.intrinsics.width as usize;
+        camera.ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5).direction.as_vec3()
+    }
+
     /// References join LR images as they are: whatever made those, each sub-pixel ray is a
     /// reference's pixel, and all are met by some.
     #[test]
     fn references_are_compared_with_themselves() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);
-        let given = |name: &str, width: usize, height: usize| {
-            let camera =
-                Camera { name: name.into(), ..camera.resized(width as u32, height as u32) };
-            Photographs::taken_by(camera, hr_image(width, height))
-        };
         // The last column of blocks overlaps the one before it.
         let (width, height) = (9, 8);
         let truth = hr_image(width, height);
-        let camera = camera.resized(9, 8);
+        let large = camera.resized(9, 8);
         for kind in [Supervision::Average, Supervision::Kernel] {
             let mut joined = supersampling(
-                given("a", 5, 4),
-                Some(given("a", width, height)),
+                given(&camera, "a", 5, 4),
+                Some(given(&camera, "a", width, height)),
                 &options(kind, [2.0, 2.0]),
             );
             assert_eq!(joined.sampler.numbers(), 20 + 20 * REFERENCE_DRAWS, "{kind:?}");
@@ -592,14 +607,10 @@ mod tests {
                 }
                 joined.sample_rays(bundle, &mut rays);
                 let pixels = rays.map(|ray| {
-                    let of = |pixel: usize| {
-                        camera
-                            .ray((pixel % width) as f64 + 0.5, (pixel / width) as f64 + 0.5)
-                            .direction
-                            .as_vec3()
-                    };
                     (0..72)
-                        .find(|&pixel| of(pixel).distance(ray.direction.into()) < 1e-6)
+                        .find(|&pixel| {
+                            direction_through(&large, pixel).distance(ray.direction.into()) < 1e-6
+                        })
                         .expect("a pixel's ray")
                 });
                 pixels.iter().for_each(|&pixel| seen[pixel] = true);
@@ -623,7 +634,7 @@ mod tests {
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);
             assert!(
-                camera.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6,
+                large.ray(8.0, 1.0).direction.as_vec3().distance(rays[0].direction.into()) < 1e-6,
                 "{kind:?}"
             );
             let block = [7, 8, 16, 17].map(|pixel| [0, 1, 2].map(|c| truth.data[3 * pixel + c]));
@@ -631,7 +642,7 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &[mean], &mut [[0.0; 3]]) < 1e-10, "{kind:?}");
             joined.set_progress(1.0);
             // LR images have what they had.
-            let plain = supersampling(given("a", 5, 4), None, &options(kind, [2.0, 2.0]));
+            let plain = supersampling(given(&camera, "a", 5, 4), None, &options(kind, [2.0, 2.0]));
             let drawn = |of: &Supersampling| (0..).find(|&g| of.pixel(g) == (0, 7)).unwrap();
             let colours = [[0.9, 0.1, 0.4], [0.2, 0.3, 0.5], [0.6, 0.6, 0.1], [0.4, 0.8, 0.7]];
             let mut gradients = [[[0.0; 3]; 4]; 2];
@@ -641,8 +652,8 @@ mod tests {
         }
         // Of a larger one no more is drawn.
         let larger = supersampling(
-            given("a", 5, 4),
-            Some(given("a", 20, 16)),
+            given(&camera, "a", 5, 4),
+            Some(given(&camera, "a", 20, 16)),
             &options(Supervision::Kernel, [2.0, 2.0]),
         );
         assert_eq!(larger.sampler.numbers(), 20 + 80);

@@ -34,6 +34,11 @@ fn read(name: &str, weights: &Weights) -> Result<Box<dyn Network>, nets::Weights
     })
 }
 
+fn case(weights: &Weights, number: usize, what: &str) -> Tensor {
+    let name = format!("golden.{what}.{number}");
+    weights.tensor(&name, &weights.shape::<4>(&name).unwrap()).unwrap()
+}
+
 #[test]
 fn networks_are_those_of_pytorch() {
     nets::deterministic();
@@ -42,11 +47,8 @@ fn networks_are_those_of_pytorch() {
         let network = read(name, &weights).unwrap();
         let mut cases = 0;
         while weights.has(&format!("golden.input.{cases}")) {
-            let tensor = |what: &str| {
-                let name = format!("golden.{what}.{cases}");
-                weights.tensor(&name, &weights.shape::<4>(&name).unwrap()).unwrap()
-            };
-            let (input, expected) = (tensor("input"), tensor("output"));
+            let (input, expected) =
+                (case(&weights, cases, "input"), case(&weights, cases, "output"));
             let [.., rows, columns] = expected.size()[..] else { unreachable!() };
             let found = no_grad(|| network.enlarge(&input, [rows, columns])).unwrap();
             assert_eq!(found.size(), expected.size(), "{name}, case {cases}");

@@ -22,7 +22,7 @@ const SHIFT: f64 = 1e-6;
 /// Added to an area, so that there is always some.
 const LEAST_AREA: f64 = 1e-9;
 /// Pixels that are decoded at a time.
-const CHUNK: usize = 16_384;
+const CHUNK_PIXELS: usize = 16_384;
 
 impl Liif {
     pub(crate) fn read(weights: &Weights) -> Result<Self, WeightsError> {
@@ -138,8 +138,8 @@ impl Network for Liif {
             across: sides.map(|s| nearest(lr_columns, columns, s)),
         };
         let mut chunks = Vec::new();
-        for start in (0..(rows * columns) as usize).step_by(CHUNK) {
-            let pixels = start..(start + CHUNK).min((rows * columns) as usize);
+        for start in (0..(rows * columns) as usize).step_by(CHUNK_PIXELS) {
+            let pixels = start..(start + CHUNK_PIXELS).min((rows * columns) as usize);
             let mut sum = None::<Tensor>;
             for (v, h) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                 let (mut index, mut offsets, mut share) = (Vec::new(), Vec::new(), Vec::new());

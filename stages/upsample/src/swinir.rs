@@ -25,7 +25,7 @@ const SLOPE: f64 = 0.2;
 /// What leaks through the ReLU before enlarging.
 const HEAD_SLOPE: f64 = 0.01;
 /// What keeps places in a window that aren't neighbours in the image from seeing each other.
-const FAR: f32 = -100.0;
+const UNRELATED_BIAS: f32 = -100.0;
 
 /// Transformer blocks, and a convolution after them.
 struct Group {
@@ -342,9 +342,9 @@ fn far(rows: i64, columns: i64, window: i64) -> Result<Tensor, TchError> {
             })
             .collect();
         mask.extend(
-            regions
-                .iter()
-                .flat_map(|a| regions.iter().map(move |b| if a == b { 0.0 } else { FAR })),
+            regions.iter().flat_map(|a| {
+                regions.iter().map(move |b| if a == b { 0.0 } else { UNRELATED_BIAS })
+            }),
         );
     }
     Tensor::f_from_slice(&mask)?.f_reshape([down * across, 1, places, places])

@@ -16,9 +16,9 @@ const PLACES: usize = 2;
 /// Places of a voxel.
 const ALL_PLACES: usize = PLACES * PLACES * PLACES;
 /// Directions at most for which a voxel's colour is fitted.
-const DIRECTIONS: usize = 16;
+const MOST_DIRECTIONS: usize = 16;
 /// Opacity below which a voxel is empty: less than half a step of a byte.
-const FAINT: f32 = 0.5 / 255.0;
+const LEAST_OPACITY: f32 = 0.5 / 255.0;
 
 /// A baked field.
 #[derive(Clone, Debug, PartialEq)]
@@ -55,7 +55,7 @@ pub(crate) fn bake<S: Source>(
     let opacity: Vec<f32> =
         bricks.places().par_iter().flat_map_iter(|&b| opacities(sources, b, resolution)).collect();
     let seen = with_neighbours(&bricks, &seen_by(&bricks, &opacity, cameras, bounds));
-    let kept = |voxel: usize| opacity[voxel] >= FAINT && seen[voxel] != 0;
+    let kept = |voxel: usize| opacity[voxel] >= LEAST_OPACITY && seen[voxel] != 0;
     let colours = Colours { sources, bounds, cameras, resolution };
     let voxels = (0..bricks.len())
         .into_par_iter()
@@ -203,7 +203,7 @@ impl<S: Source> Colours<'_, S> {
             .filter(|(i, _)| seen >> i & 1 == 1)
             .map(|c| c.1)
             .collect();
-        let count = seeing.len().min(DIRECTIONS);
+        let count = seeing.len().min(MOST_DIRECTIONS);
         (0..count)
             .filter_map(|k| (point - seeing[k * seeing.len() / count].centre()).try_normalize())
             .map(|direction| direction.as_vec3().to_array())
@@ -251,23 +251,24 @@ pub(crate) mod tests {
         pub(crate) density: f32,
     }
 
+    fn ball_sample(ball: &Ball, p: &[f32; 3]) -> PointSample {
+        let away = p.map(|c| (c - 0.5).powi(2)).iter().sum::<f32>().sqrt();
+        let mut view_features = [0.0; VIEW_FEATURES];
+        view_features[0] = 1.0;
+        PointSample {
+            density: if away < ball.radius { ball.density } else { 0.0 },
+            raw_colour: [if p[0] > 0.5 { 2.0 } else { -2.0 }, 0.0, 0.0],
+            view_features,
+        }
+    }
+
     impl Source for Ball {
         fn may_hold(&self, _low: [f32; 3], _high: [f32; 3]) -> bool {
             true
         }
 
         fn sample(&self, places: &[[f32; 3]]) -> Vec<PointSample> {
-            let sample = |p: &[f32; 3]| {
-                let away = p.map(|c| (c - 0.5).powi(2)).iter().sum::<f32>().sqrt();
-                let mut view_features = [0.0; VIEW_FEATURES];
-                view_features[0] = 1.0;
-                PointSample {
-                    density: if away < self.radius { self.density } else { 0.0 },
-                    raw_colour: [if p[0] > 0.5 { 2.0 } else { -2.0 }, 0.0, 0.0],
-                    view_features,
-                }
-            };
-            places.iter().map(sample).collect()
+            places.iter().map(|p| ball_sample(self, p)).collect()
         }
 
         fn view_colours(
@@ -283,19 +284,20 @@ pub(crate) mod tests {
         Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() }
     }
 
+    fn camera((x, y): (f64, f64)) -> Camera {
+        let back = DVec3::new(x, y, 1.0).normalize();
+        let right = DVec3::Y.cross(back).normalize();
+        let above = back.cross(right);
+        let row = |i: usize| [right[i], above[i], back[i], 4.0 * back[i]];
+        Camera {
+            name: format!("{x} {y}"),
+            intrinsics: Intrinsics::from_angle_x(64, 64, 0.6),
+            camera_to_world: [row(0), row(1), row(2)],
+        }
+    }
+
     /// Cameras on the side of +z that look at the middle.
     pub(crate) fn cameras() -> Vec<Camera> {
-        let camera = |(x, y): (f64, f64)| {
-            let back = DVec3::new(x, y, 1.0).normalize();
-            let right = DVec3::Y.cross(back).normalize();
-            let above = back.cross(right);
-            let row = |i: usize| [right[i], above[i], back[i], 4.0 * back[i]];
-            Camera {
-                name: format!("{x} {y}"),
-                intrinsics: Intrinsics::from_angle_x(64, 64, 0.6),
-                camera_to_world: [row(0), row(1), row(2)],
-            }
-        };
         [(0.0, 0.0), (0.5, 0.1), (-0.4, 0.3), (0.1, -0.6), (-0.7, -0.7)].map(camera).into()
     }
 
@@ -331,17 +333,18 @@ pub(crate) mod tests {
         }
     }
 
+    fn wall(along: usize, k: usize) -> Vec<PointSample> {
+        (0..ALL_PLACES)
+            .map(|i| {
+                let is_in = i / PLACES.pow(along as u32) % PLACES == k;
+                PointSample { density: if is_in { 5e3 } else { 0.0 }, ..PointSample::default() }
+            })
+            .collect()
+    }
+
     /// A wall thinner than a voxel is as opaque as it is, wherever in the voxel it lies.
     #[test]
     fn thin_walls_are_opaque() {
-        let wall = |along: usize, k: usize| -> Vec<PointSample> {
-            (0..ALL_PLACES)
-                .map(|i| {
-                    let is_in = i / PLACES.pow(along as u32) % PLACES == k;
-                    PointSample { density: if is_in { 5e3 } else { 0.0 }, ..PointSample::default() }
-                })
-                .collect()
-        };
         for (along, k) in [(0, 0), (1, 1), (2, 0)] {
             let opacity = opacity_of(&wall(along, k), 256);
             let expected = 1.0 - (-5e3f32 / 512.0).exp();
@@ -350,15 +353,15 @@ pub(crate) mod tests {
         assert_eq!(opacity_of(&[PointSample::default(); ALL_PLACES], 256), 0.0);
     }
 
+    fn baked_with(threads: usize) -> Volume {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        let balls = [Ball { radius: 0.3, density: 50.0 }, Ball { radius: 0.25, density: 900.0 }];
+        pool.install(|| bake(&balls, &bounds(), &cameras(), 48))
+    }
+
     #[test]
     fn threads_change_nothing() {
-        let baked = |threads: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            let balls =
-                [Ball { radius: 0.3, density: 50.0 }, Ball { radius: 0.25, density: 900.0 }];
-            pool.install(|| bake(&balls, &bounds(), &cameras(), 48))
-        };
-        let alone = baked(1);
-        assert!(alone == baked(3) && !alone.voxels.is_empty());
+        let alone = baked_with(1);
+        assert!(alone == baked_with(3) && !alone.voxels.is_empty());
     }
 }

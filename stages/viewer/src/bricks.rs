@@ -5,7 +5,7 @@ pub(crate) const SIDE: usize = 8;
 /// Voxels of a brick.
 pub(crate) const VOXELS: usize = SIDE * SIDE * SIDE;
 /// No brick.
-const NONE: u32 = u32::MAX;
+const NO_BRICK: u32 = u32::MAX;
 
 /// Which bricks there are of a grid of `resolution`³ voxels. Voxel (x, y, z) has its centre at
 /// (x + 0.5, y + 0.5, z + 0.5) / resolution. Bricks are numbered in the order of their places, x
@@ -30,7 +30,7 @@ impl Bricks {
             .map(|i| {
                 let place = [i % side, i / side % side, i / (side * side)];
                 if !is_kept(place) {
-                    return NONE;
+                    return NO_BRICK;
                 }
                 bricks.places.push(place);
                 bricks.places.len() as u32 - 1
@@ -57,7 +57,7 @@ impl Bricks {
     /// Number of a brick, where there is one.
     pub(crate) fn slot(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
         let slot = self.slots[x + self.side() * (y + self.side() * z)];
-        (slot != NONE).then_some(slot as usize)
+        (slot != NO_BRICK).then_some(slot as usize)
     }
 
     /// Number of a voxel among those of all bricks, where there is one.
@@ -79,7 +79,7 @@ impl Bricks {
     pub(crate) fn distances(&self) -> Vec<u8> {
         let side = self.side();
         let mut distances: Vec<u8> =
-            self.slots.iter().map(|&slot| if slot == NONE { 255 } else { 0 }).collect();
+            self.slots.iter().map(|&slot| if slot == NO_BRICK { 255 } else { 0 }).collect();
         // The largest difference of three: one axis after the other, as long as something changes.
         for _ in 0..side {
             let mut next = distances.clone();

@@ -41,7 +41,7 @@ pub(crate) struct Components {
 }
 
 /// Standard deviations that a component's scale reaches to.
-const REACH: f64 = 4.0;
+const SCALE_DEVIATIONS: f64 = 4.0;
 
 impl Components {
     /// The `count` strongest, of numbers with weights.
@@ -68,7 +68,8 @@ impl Components {
         order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
         order.truncate(count);
         let axis = |&k: &usize| std::array::from_fn(|i| eigen.eigenvectors[(i, k)] as f32);
-        let scale = |&k: &usize| (REACH * eigen.eigenvalues[k].max(0.0).sqrt()).max(1e-6) as f32;
+        let scale =
+            |&k: &usize| (SCALE_DEVIATIONS * eigen.eigenvalues[k].max(0.0).sqrt()).max(1e-6) as f32;
         Self { axes: order.iter().map(axis).collect(), scales: order.iter().map(scale).collect() }
     }
 
@@ -125,14 +126,15 @@ mod tests {
         assert_eq!(fit(&[], &[]), ([0.0; 3], [0.0; NUMBERS]));
     }
 
+    fn on_plane(a: f32, b: f32) -> [f32; NUMBERS] {
+        std::array::from_fn(|i| a * (i as f32 * 0.7).sin() + b * (i as f32 * 1.3).cos())
+    }
+
     /// Numbers on a plane are two components.
     #[test]
     fn few_combinations_say_all() {
-        let of = |a: f32, b: f32| -> [f32; NUMBERS] {
-            std::array::from_fn(|i| a * (i as f32 * 0.7).sin() + b * (i as f32 * 1.3).cos())
-        };
         let all: Vec<[f32; NUMBERS]> =
-            (0..50).map(|i| of((i as f32).sin(), 0.3 * (2.0 * i as f32).cos())).collect();
+            (0..50).map(|i| on_plane((i as f32).sin(), 0.3 * (2.0 * i as f32).cos())).collect();
         let components = Components::of(all.iter().map(|numbers| (numbers, 1.0)), 2);
         for numbers in &all {
             let mut rebuilt = [0.0; NUMBERS];

@@ -10,13 +10,13 @@ use scene::{Bounds, Camera};
 use crate::bricks::{Bricks, SIDE};
 
 /// Cameras that look, at most: a bit each.
-pub(crate) const CAMERAS: usize = 64;
+pub(crate) const MOST_CAMERAS: usize = 64;
 /// Share of a ray's light that a voxel must stop to be seen.
-const SEEN: f32 = 0.01;
+const LEAST_LIGHT: f32 = 0.01;
 
 /// Some of the cameras, spread evenly over the list, with as many pixels as a voxel needs.
 pub(crate) fn looking(cameras: &[&Camera], resolution: usize) -> Vec<Camera> {
-    let count = cameras.len().min(CAMERAS);
+    let count = cameras.len().min(MOST_CAMERAS);
     (0..count)
         .map(|i| {
             let camera = cameras[i * cameras.len() / count];
@@ -69,7 +69,7 @@ impl March<'_> {
         let step = 1.0 / self.bricks.resolution as f32;
         let per_brick = SIDE as f32 * step;
         let (mut t, mut through) = (ray.enter + 0.5 * step, 1.0f32);
-        while t < ray.leave && through > SEEN {
+        while t < ray.leave && through > LEAST_LIGHT {
             let place = ray.position(t).map(|x| x * self.bricks.resolution as f32 - 0.5);
             let far = self.distance(place);
             if far > 1 {
@@ -78,7 +78,7 @@ impl March<'_> {
             }
             let corners = self.corners(place);
             let stopped: f32 = corners.iter().map(|(_, alpha)| alpha).sum();
-            if through * stopped >= SEEN {
+            if through * stopped >= LEAST_LIGHT {
                 corners.iter().filter(|(_, alpha)| *alpha > 0.0).for_each(|(v, _)| sees(*v));
             }
             through *= 1.0 - stopped;
@@ -115,6 +115,14 @@ mod tests {
     use super::*;
     use scene::Intrinsics;
 
+    fn camera_at(z: f64) -> Camera {
+        Camera {
+            name: "a".into(),
+            intrinsics: Intrinsics::from_angle_x(32, 32, 0.5),
+            camera_to_world: [[z.signum(), 0., 0., 0.], [0., 1., 0., 0.], [0., 0., z.signum(), z]],
+        }
+    }
+
     /// A wall hides the one behind it; what looks from the other side sees that one.
     #[test]
     fn walls_hide_each_other() {
@@ -126,12 +134,7 @@ mod tests {
         }
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.0, far: 9.0, ..Bounds::default() };
-        let camera = |z: f64| Camera {
-            name: "a".into(),
-            intrinsics: Intrinsics::from_angle_x(32, 32, 0.5),
-            camera_to_world: [[z.signum(), 0., 0., 0.], [0., 1., 0., 0.], [0., 0., z.signum(), z]],
-        };
-        let cameras = [camera(4.0), camera(-4.0)];
+        let cameras = [camera_at(4.0), camera_at(-4.0)];
         let seen = seen_by(&bricks, &opacity, &cameras, &bounds);
         let at = |z: usize| seen[bricks.voxel([16, 16, z]).unwrap()];
         assert_eq!([at(20), at(10), at(15)], [0b01, 0b10, 0]);
@@ -139,13 +142,16 @@ mod tests {
         assert!(alone.install(|| seen_by(&bricks, &opacity, &cameras, &bounds)) == seen);
     }
 
-    #[test]
-    fn cameras_are_spread_over_the_list() {
-        let camera = |i: usize| Camera {
+    fn camera(i: usize) -> Camera {
+        Camera {
             name: i.to_string(),
             intrinsics: Intrinsics::from_angle_x(100, 50, 0.5),
             camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]],
-        };
+        }
+    }
+
+    #[test]
+    fn cameras_are_spread_over_the_list() {
         let all: Vec<Camera> = (0..128).map(camera).collect();
         let chosen = looking(&all.iter().collect::<Vec<_>>(), 256);
         assert_eq!((chosen.len(), chosen[1].name.as_str()), (64, "2"));

@@ -1,10 +1,10 @@
 /// Names longer than this are no slips of the pen.
-const LONGEST: usize = 64;
+const LONGEST_NAME: usize = 64;
 
 /// The known name that an unknown one is a misspelling of: at most one letter in three wrong, left
 /// out, added or swapped with the next.
 pub fn nearest<'a>(name: &str, known: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
-    if name.len() > LONGEST {
+    if name.len() > LONGEST_NAME {
         return None;
     }
     let lower = name.to_lowercase();

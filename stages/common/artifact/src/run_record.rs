@@ -227,16 +227,17 @@ impl RunRecord {
 mod tests {
     use super::*;
 
+    fn node(point: &str) -> RunNode {
+        serde_json::from_value(serde_json::json!({
+            "stage": "train-ss", "point": point, "kind": "field", "key": "", "output": "",
+            "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 0.0,
+            "threads": 1,
+        }))
+        .unwrap()
+    }
+
     #[test]
     fn a_sweeps_folders_are_numbered_and_named() {
-        let node = |point: &str| -> RunNode {
-            serde_json::from_value(serde_json::json!({
-                "stage": "train-ss", "point": point, "kind": "field", "key": "", "output": "",
-                "folder": "", "parameters": {}, "inputs": {}, "started_unix": 0, "seconds": 0.0,
-                "threads": 1,
-            }))
-            .unwrap()
-        };
         let nodes = [node("rays=3, scale=2"), node("data=a/../b"), node("")];
         assert_eq!(
             folders_of(&nodes.each_ref()),

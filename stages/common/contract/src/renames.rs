@@ -115,15 +115,16 @@ pub fn renamed_in<'a>(
 mod tests {
     use super::*;
 
+    fn renamed_parameter(programs: &[&str], old: &str) -> Option<String> {
+        renamed_in(Named::Parameter, programs.iter().copied(), old, None)
+    }
+
     #[test]
     fn a_name_is_old_for_its_own_program_only() {
         assert!(renamed(Named::Parameter, "train-refine", "rate").is_none());
         assert!(renamed(Named::Parameter, "train-ss", "field").is_none());
-        let says = |programs: &[&str], old: &str| {
-            renamed_in(Named::Parameter, programs.iter().copied(), old, None)
-        };
-        assert_eq!(says(&["eval"], "samples"), None);
-        let both = says(&["demo-scene", "train-ss"], "samples").unwrap();
+        assert_eq!(renamed_parameter(&["eval"], "samples"), None);
+        let both = renamed_parameter(&["demo-scene", "train-ss"], "samples").unwrap();
         assert_eq!(both, "is called samples_per_axis now, or is called samples_per_step now");
     }
 }

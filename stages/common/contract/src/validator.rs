@@ -1,5 +1,5 @@
-//! Checks JSON values against the part of JSON Schema (draft 2020-12) that parameters need. The whole
-//! of it would be most of a stage's compile time, and of its start.
+//! Checks JSON values against the part of JSON Schema (draft 2020-12) that parameters need. The
+//! whole of it would be most of a stage's compile time, and of its start.
 
 use std::cmp::Ordering;
 
@@ -31,7 +31,7 @@ const UNSUPPORTED: [&str; 20] = [
 ];
 const TYPES: [&str; 7] = ["array", "boolean", "integer", "null", "number", "object", "string"];
 /// Deeper than any value that was read; only a schema that leads back to itself comes here.
-const DEEPEST: usize = 512;
+const DEEPEST_NESTING: usize = 512;
 
 /// A schema whose keywords are all understood.
 #[derive(Clone, Debug)]
@@ -143,7 +143,7 @@ impl<'a> Check<'a> {
             }
             return;
         };
-        if depth > DEEPEST {
+        if depth > DEEPEST_NESTING {
             self.misfit(value, "its schema leads back to itself".to_owned());
             return;
         }

@@ -14,9 +14,9 @@ impl<'a> Reader<'a> {
         Self { root }
     }
 
-    /// A value as a schema reads it: where that has `number`, 2 becomes 2.0; elsewhere 2.0 becomes 2.
-    /// Arrays and objects likewise inside. What doesn't fit the schema stays, for the validator to
-    /// name.
+    /// A value as a schema reads it. Where the schema has `number`, 2 becomes 2.0. Elsewhere 2.0
+    /// becomes 2. Arrays and objects likewise inside. What doesn't fit the schema stays, for the
+    /// validator to name.
     pub(crate) fn read(&self, schema: &'a Value, value: &Value) -> Value {
         self.read_by(&self.alternatives(&[schema]), value)
     }

@@ -503,6 +503,13 @@ mod tests {
         ]
     }
 
+    fn with_relative_images(set: &Dataset) -> Vec<Frame> {
+        set.frames
+            .iter()
+            .map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() })
+            .collect()
+    }
+
     #[test]
     fn binary_and_text_are_the_same() {
         let [cameras, images, points] = binary();
@@ -519,13 +526,7 @@ mod tests {
             "{:?}",
             one.notes
         );
-        let relative = |set: &Dataset| -> Vec<Frame> {
-            set.frames
-                .iter()
-                .map(|f| Frame { image: f.image.file_name().unwrap().into(), ..f.clone() })
-                .collect()
-        };
-        assert_eq!(relative(&one), relative(&other));
+        assert_eq!(with_relative_images(&one), with_relative_images(&other));
         let [a, b] = &one.frames[..] else { panic!("two frames") };
         assert_eq!((a.name.as_str(), b.name.as_str()), ("a", "b 1"));
         // Images of half the size; a turn by 180° about z; a camera that looks along +z sees (0, 0,
@@ -555,6 +556,11 @@ mod tests {
         );
     }
 
+    fn read_frames(dir: &Path) -> Vec<(String, Intrinsics, scene::Pose, Option<[f64; 2]>)> {
+        let frames = Dataset::read(dir).unwrap().frames;
+        frames.into_iter().map(|f| (f.name, f.taken_with, f.camera_to_world, f.depths)).collect()
+    }
+
     /// As an editor on Windows leaves them.
     #[test]
     fn text_may_have_a_mark_and_other_line_ends() {
@@ -564,14 +570,7 @@ mod tests {
             folder("sparse/0", &text(CAMERAS, IMAGES, POINTS)),
             folder("sparse/0", &text(&changed[0], &changed[1], &changed[2])),
         );
-        let poses = |dir: &tempfile::TempDir| -> Vec<_> {
-            let frames = Dataset::read(dir.path()).unwrap().frames;
-            frames
-                .into_iter()
-                .map(|f| (f.name, f.taken_with, f.camera_to_world, f.depths))
-                .collect()
-        };
-        assert_eq!(poses(&plain), poses(&other));
+        assert_eq!(read_frames(plain.path()), read_frames(other.path()));
         let latin = folder(
             "sparse/0",
             &[
@@ -594,11 +593,12 @@ mod tests {
         assert!(set.notes[1].contains("sparse/0 has 1, sparse/1 has 2"), "{:?}", set.notes);
     }
 
+    fn read_texts(cameras: &str, images: &str) -> Result<Dataset, DatasetError> {
+        Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path())
+    }
+
     #[test]
     fn mistakes_are_named() {
-        let reads = |cameras: &str, images: &str| {
-            Dataset::read(folder("sparse/0", &text(cameras, images, POINTS)).path())
-        };
         for (from, to, words) in [
             ("SIMPLE_RADIAL", "FOV", "line 2: FOV has 5 parameters"),
             (
@@ -614,7 +614,7 @@ mod tests {
             ("30 -0.1", "30 inf", "lens distortion (k1 inf,"),
             ("70 40 30", "70 x 30", "line 2: parameter: \"x\""),
         ] {
-            let message = reads(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();
+            let message = read_texts(&CAMERAS.replace(from, to), IMAGES).unwrap_err().to_string();
             assert!(message.contains(words), "{message}");
         }
         for (from, to, words) in [
@@ -623,56 +623,63 @@ mod tests {
             (" 1 b 1.png", "", "line 2: camera id is missing"),
             (" b 1.png", "", "line 2: an image's name is missing"),
         ] {
-            let message = reads(CAMERAS, &IMAGES.replace(from, to)).unwrap_err().to_string();
+            let message = read_texts(CAMERAS, &IMAGES.replace(from, to)).unwrap_err().to_string();
             assert!(message.contains(words), "{message}");
         }
-        let gone = reads(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
+        let gone = read_texts(CAMERAS, &IMAGES.replace("a.png", "gone.png")).unwrap();
         assert!(
             gone.frames.len() == 1 && gone.notes[1].contains("1 of 2 images have no picture"),
             "{:?}",
             gone.notes
         );
-        let forged = reads(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
+        let forged = read_texts(CAMERAS, &IMAGES.replace("a.png", "\u{1b}[31m.png")).unwrap();
         assert!(forged.notes[1].ends_with(r"first \u{1b}[31m.png"), "{:?}", forged.notes);
-        let none = reads(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
+        let none = read_texts(CAMERAS, &IMAGES.replace(".png", ".jpg")).unwrap_err().to_string();
         assert!(none.contains("not one of its 2 images"), "{none}");
         assert!(
-            reads(CAMERAS, "# nothing\n").unwrap_err().to_string().contains("it has no images")
+            read_texts(CAMERAS, "# nothing\n")
+                .unwrap_err()
+                .to_string()
+                .contains("it has no images")
         );
+    }
+
+    fn read_binaries(files: &[Vec<u8>; 3]) -> Result<Dataset, DatasetError> {
+        let named = [
+            ("cameras.bin", &files[0][..]),
+            ("images.bin", &files[1][..]),
+            ("points3D.bin", &files[2][..]),
+        ];
+        Dataset::read(folder("sparse/0", &named).path())
     }
 
     #[test]
     fn binaries_cut_anywhere_or_with_other_bytes_are_errors_and_no_panic() {
         let whole = binary();
-        let read = |files: &[Vec<u8>; 3]| {
-            let named = [
-                ("cameras.bin", &files[0][..]),
-                ("images.bin", &files[1][..]),
-                ("points3D.bin", &files[2][..]),
-            ];
-            Dataset::read(folder("sparse/0", &named).path())
-        };
-        assert!(read(&whole).is_ok());
+        assert!(read_binaries(&whole).is_ok());
         for file in 0..3 {
             for end in 0..whole[file].len() {
                 let mut cut = whole.clone();
                 cut[file].truncate(end);
-                assert!(read(&cut).is_err(), "{file} {end}");
+                assert!(read_binaries(&cut).is_err(), "{file} {end}");
             }
             for place in 0..whole[file].len() {
                 let mut other = whole.clone();
                 other[file][place] ^= 0xff;
                 // Many are still a model; none may panic or allocate what isn't there.
-                drop(read(&other));
+                drop(read_binaries(&other));
             }
             let mut longer = whole.clone();
             longer[file].push(0);
             assert!(
-                read(&longer).unwrap_err().to_string().contains("there is more after the last")
+                read_binaries(&longer)
+                    .unwrap_err()
+                    .to_string()
+                    .contains("there is more after the last")
             );
         }
         let mut huge = whole.clone();
         huge[1][..8].copy_from_slice(&u64::MAX.to_le_bytes());
-        assert!(read(&huge).unwrap_err().to_string().contains("can't be in the"));
+        assert!(read_binaries(&huge).unwrap_err().to_string().contains("can't be in the"));
     }
 }

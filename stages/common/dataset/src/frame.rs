@@ -122,22 +122,23 @@ fn first_twice(names: &[String]) -> Option<usize> {
 mod tests {
     use super::*;
 
+    fn names_of(paths: &[&str]) -> Result<Vec<String>, DatasetError> {
+        names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
+    }
+
     #[test]
     fn names_are_as_short_as_can_be() {
-        let of = |paths: &[&str]| {
-            names("list".as_ref(), &paths.iter().map(PathBuf::from).collect::<Vec<_>>())
-        };
-        assert_eq!(of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
-        assert_eq!(of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
+        assert_eq!(names_of(&["images/a.jpg", "images/b.png"]).unwrap(), ["a", "b"]);
+        assert_eq!(names_of(&["left/a.jpg", "right/a.jpg"]).unwrap(), ["left_a", "right_a"]);
         assert!(
-            of(&["x/a.jpg", "x/a.png"])
+            names_of(&["x/a.jpg", "x/a.png"])
                 .unwrap_err()
                 .to_string()
                 .contains("frame 1 (x/a.png): a second view named \"a\"")
         );
-        assert_eq!(of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
+        assert_eq!(names_of(&["a\u{1b}[31m\n.png", "b.png"]).unwrap(), ["a_[31m_", "b"]);
         assert!(
-            of(&["a\n.png", "a\t.png"])
+            names_of(&["a\n.png", "a\t.png"])
                 .unwrap_err()
                 .to_string()
                 .contains("frame 1 (a\\t.png): a second view named \"a_\"")

@@ -222,22 +222,23 @@ mod tests {
         assert_eq!(frame.depths, Some([1.5, 9.0]));
     }
 
+    fn distortion_and_notes(folder: &Path) -> (f64, String) {
+        let set = Dataset::read(folder).unwrap();
+        (set.frames[0].taken_with.distortion.radial[0], set.notes.join("; "))
+    }
+
     /// The file can't say what its poses' lens does to lines; the model that they come from can.
     #[test]
     fn distortion_is_that_of_the_model_beside_them() {
         let dir = folder(&npy(&[ROW]), &[("images", 1)]);
-        let distortion = || {
-            let set = Dataset::read(dir.path()).unwrap();
-            (set.frames[0].taken_with.distortion.radial[0], set.notes.join("; "))
-        };
-        assert_eq!(distortion().0, 0.0);
+        assert_eq!(distortion_and_notes(dir.path()).0, 0.0);
         std::fs::create_dir_all(dir.path().join("sparse/0")).unwrap();
         let cameras =
             |text: &str| std::fs::write(dir.path().join("sparse/0/cameras.txt"), text).unwrap();
         // Its images are twice as large.
         cameras("1 SIMPLE_RADIAL 160 120 140 80 60 0.02\n");
         assert_eq!(
-            distortion(),
+            distortion_and_notes(dir.path()),
             (
                 0.02,
                 "LLFF (poses_bounds.npy): 1 photograph from images; 1 photograph has lens \
@@ -252,7 +253,7 @@ mod tests {
             ("1 SIMPLE_PINHOLE 160 120 140 80 60\n", "LLFF"),
         ] {
             cameras(text);
-            let (found, notes) = distortion();
+            let (found, notes) = distortion_and_notes(dir.path());
             assert!(found == 0.0 && notes.contains(words), "{text}: {found} {notes}");
         }
     }

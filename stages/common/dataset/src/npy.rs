@@ -92,33 +92,35 @@ mod tests {
         Ok(Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() })
     }
 
+    fn padded_header(kind: &str, order: &str) -> String {
+        format!("{{'descr': '{kind}', 'fortran_order': {order}, 'shape': (2, 3), }}   \n")
+    }
+
     #[test]
     fn every_version_order_and_float_is_read() {
         let data = [1.5f64, 2.0, 3.0, 4.0, 5.0, -6.5];
         let little: Vec<u8> = data.iter().flat_map(|v| v.to_le_bytes()).collect();
         let big: Vec<u8> = data.iter().flat_map(|v| v.to_be_bytes()).collect();
         let single: Vec<u8> = data.iter().flat_map(|v| (*v as f32).to_le_bytes()).collect();
-        let header = |kind: &str, order: &str| {
-            format!("{{'descr': '{kind}', 'fortran_order': {order}, 'shape': (2, 3), }}   \n")
-        };
         for version in [1, 2, 3] {
             for (kind, bytes) in [("<f8", &little), (">f8", &big), ("<f4", &single)] {
-                let bytes = file(version, &header(kind, "False"), bytes);
+                let bytes = file(version, &padded_header(kind, "False"), bytes);
                 assert_eq!(read_matrix(&bytes), matrix(data), "{version} {kind}");
             }
         }
         // Column by column.
-        let bytes = file(1, &header("<f8", "True"), &little);
+        let bytes = file(1, &padded_header("<f8", "True"), &little);
         assert_eq!(read_matrix(&bytes), matrix([1.5, 3.0, 5.0, 2.0, 4.0, -6.5]));
         let old = r#"{"descr": "<f8", "fortran_order": False, "shape": (2L, 3L)}"#;
         assert_eq!(read_matrix(&file(1, old, &little)), matrix(data));
     }
 
+    fn header(kind: &str, shape: &str) -> String {
+        format!("{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}")
+    }
+
     #[test]
     fn other_files_are_refused_in_words() {
-        let header = |kind: &str, shape: &str| {
-            format!("{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}")
-        };
         let data = [0; 48];
         let huge = format!("({0}, {0})", usize::MAX);
         for (kind, shape, words) in [

@@ -240,7 +240,10 @@ pub(crate) mod tests {
         // The same with an EXIF block (APP1) that asks for a quarter turn: right where the camera's
         // shape says so, else left alone.
         let mut turned = bytes[..2].to_vec();
-        turned.extend(b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0");
+        turned.extend(
+            b"\xff\xe1\x00\x22Exif\0\0II\x2a\0\x08\0\0\0\
+            \x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0",
+        );
         turned.extend(&bytes[2..]);
         std::fs::write(&path, &turned).unwrap();
         let stored = look(&path).unwrap();
@@ -263,6 +266,27 @@ pub(crate) mod tests {
         assert!(look(&other).unwrap_err().to_string().contains("neither PNG, JPEG nor EXR"));
     }
 
+    /// Smooth in the direction of the ray, so that what each lens sees is known exactly.
+    fn colour_towards([u, v]: [f64; 2]) -> [u8; 4] {
+        [(128.0 + 90.0 * (6.0 * u).sin()) as u8, (128.0 + 90.0 * (5.0 * v).cos()) as u8, 60, 255]
+    }
+
+    /// Where a distorted position comes from, by fixed-point iteration.
+    fn ray_through(intrinsics: &Intrinsics, x: f64, y: f64) -> [f64; 2] {
+        let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
+        let mut at = seen;
+        for _ in 0..50 {
+            let there = intrinsics.distortion.distort(at);
+            at = [at[0] + seen[0] - there[0], at[1] + seen[1] - there[1]];
+        }
+        at
+    }
+
+    fn image_of(ray: &dyn Fn(f64, f64) -> [f64; 2]) -> Rgba8 {
+        let pixel = |i: usize| colour_towards(ray((i % 120) as f64 + 0.5, (i / 120) as f64 + 0.5));
+        Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
+    }
+
     /// A pinhole image seen through a lens and undone is the pinhole image again.
     #[test]
     fn distortion_is_undone() {
@@ -276,34 +300,12 @@ pub(crate) mod tests {
             cy: 44.0,
             distortion,
         };
-        // Smooth in the direction of the ray, so that what each lens sees is known exactly.
-        let colour = |[u, v]: [f64; 2]| {
-            [
-                (128.0 + 90.0 * (6.0 * u).sin()) as u8,
-                (128.0 + 90.0 * (5.0 * v).cos()) as u8,
-                60,
-                255,
-            ]
-        };
-        // Where a distorted position comes from, by fixed-point iteration.
-        let ray = |x: f64, y: f64| {
-            let seen = [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy];
-            let mut at = seen;
-            for _ in 0..50 {
-                let there = distortion.distort(at);
-                at = [at[0] + seen[0] - there[0], at[1] + seen[1] - there[1]];
-            }
-            at
-        };
-        let image = |of: &dyn Fn(f64, f64) -> [f64; 2]| {
-            let pixel = |i: usize| colour(of((i % 120) as f64 + 0.5, (i / 120) as f64 + 0.5));
-            Rgba8::new(120, 90, (0..120 * 90).flat_map(pixel).collect())
-        };
         let pinhole = intrinsics.pinhole().unwrap();
         assert!(pinhole.fx != intrinsics.fx);
         let expected =
-            image(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
-        let found = undistorted(&image(&ray), &intrinsics, &pinhole);
+            image_of(&|x, y| [(x - pinhole.cx) / pinhole.fx, (y - pinhole.cy) / pinhole.fy]);
+        let found =
+            undistorted(&image_of(&|x, y| ray_through(&intrinsics, x, y)), &intrinsics, &pinhole);
         let worst =
             found.data.iter().zip(&expected.data).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
         assert!(worst <= 3, "{worst}");

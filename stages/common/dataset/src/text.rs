@@ -44,11 +44,12 @@ fn is_utf16(bytes: &[u8]) -> bool {
 mod tests {
     use super::*;
 
+    fn utf16(text: &str, bytes_of: fn(u16) -> [u8; 2]) -> Vec<u8> {
+        text.encode_utf16().flat_map(bytes_of).collect()
+    }
+
     #[test]
     fn marks_are_no_text_and_other_encodings_are_named() {
-        let utf16 = |text: &str, of: fn(u16) -> [u8; 2]| {
-            text.encode_utf16().flat_map(of).collect::<Vec<_>>()
-        };
         assert_eq!(decoded(b"\xef\xbb\xbf{}".to_vec()).unwrap(), "{}");
         assert_eq!(decoded("Bäume\r\n".into()).unwrap(), "Bäume\r\n");
         assert_eq!(decoded(Vec::new()).unwrap(), "");

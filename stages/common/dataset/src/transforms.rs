@@ -237,7 +237,9 @@ impl LensEntry {
     /// What is said here, and where nothing is, what `other` says.
     fn or(&self, other: &Self) -> Self {
         macro_rules! both {
-            ($($name:ident),*) => { Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* } };
+            ($($name:ident),*) => {
+                Self { $($name: self.$name.clone().or_else(|| other.$name.clone())),* }
+            };
         }
         both!(
             camera_model,

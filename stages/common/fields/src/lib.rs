@@ -3,6 +3,7 @@
 //!
 //! * [`Members`]: all fields of an artifact. What they render is averaged: each errs in its own way
 //!   where images leave it open.
+//! * [`mean`], [`middle`]: what a pixel shows of several fields or rays.
 //!
 //! ```no_run
 //! use artifact::GivenInput;
@@ -16,9 +17,9 @@ use std::path::PathBuf;
 use artifact::{Failure, FailureExt as _, GivenInput};
 use radiance::{FIELD_FILE, Field, FieldFile, FieldModel, Pixel, Ray, RayField, RenderError};
 
-/// Variables of the environment that change what fields render, whether this was built with libtorch
-/// or not. libtorch's own lets CUDA's products use TensorFloat-32, with ten bits behind the point; it
-/// is off unless it is 1.
+/// Variables of the environment that change what fields render, whether this was built with
+/// libtorch or not. libtorch's own lets CUDA's products use TensorFloat-32, with ten bits behind
+/// the point. It is off unless it is 1.
 pub const ENVIRONMENT: &[&str] = &["TORCH_ALLOW_TF32_CUBLAS_OVERRIDE"];
 
 /// The fields of an artifact.
@@ -63,29 +64,32 @@ impl RayField for Members {
             .map(|ray| {
                 seen.clear();
                 seen.extend(rendered.iter().map(|pixels| pixels[ray]));
-                mean(&mut seen)
+                together(&mut seen)
             })
             .collect();
         if pixels.iter().all(Pixel::is_finite) { Ok(pixels) } else { Err(RenderError::NotFinite) }
     }
 }
 
-/// The mean of what fields see along a ray.
-fn mean(seen: &mut [Pixel]) -> Pixel {
-    let share = 1.0 / seen.len().max(1) as f32;
-    let of = |value: &dyn Fn(&Pixel) -> f32| share * seen.iter().map(value).sum::<f32>();
-    let mut pixel = Pixel {
-        colour: [0, 1, 2].map(|c| of(&|p| p.colour[c])),
-        premultiplied: [0, 1, 2].map(|c| of(&|p| p.premultiplied[c])),
-        opacity: of(&|p| p.opacity),
-        depth: of(&|p| p.depth),
-        median_depth: 0.0,
-    };
-    pixel.median_depth = middle(seen, |p| p.median_depth).map_or(0.0, |p| p.median_depth);
-    pixel
+/// What fields see along a ray, as one.
+fn together(seen: &mut [Pixel]) -> Pixel {
+    Pixel {
+        colour: [0, 1, 2].map(|c| mean(seen, |p| p.colour[c])),
+        premultiplied: [0, 1, 2].map(|c| mean(seen, |p| p.premultiplied[c])),
+        opacity: mean(seen, |p| p.opacity),
+        depth: mean(seen, |p| p.depth),
+        median_depth: middle(seen, |p| p.median_depth).map_or(0.0, |p| p.median_depth),
+    }
 }
 
-/// The one in the middle by a distance; of two the nearer.
+/// The mean of a number that each of some has: what a pixel shows of several rays or fields.
+pub fn mean<T>(items: &[T], number: impl Fn(&T) -> f32) -> f32 {
+    let share = 1.0 / items.len().max(1) as f32;
+    share * items.iter().map(number).sum::<f32>()
+}
+
+/// The one in the middle by a distance; of two the nearer. NaN lies beyond all numbers, on the side
+/// of its sign.
 pub fn middle<T>(items: &mut [T], distance: impl Fn(&T) -> f32) -> Option<&T> {
     items.sort_unstable_by(|a, b| distance(a).total_cmp(&distance(b)));
     items.get(items.len().saturating_sub(1) / 2)
@@ -159,16 +163,18 @@ mod tests {
     use super::*;
     use radiance::Architecture;
     use scene::{Background, Bounds};
+    use std::path::Path;
 
-    /// What isn't finite has exit code 4, and what a library refuses 1.
-    #[test]
-    fn rendering_failures_have_exit_codes() {
-        struct Broken(f32);
-        impl RayField for Broken {
-            fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
-                Ok(vec![Pixel { opacity: self.0, ..Pixel::default() }; rays.len()])
-            }
+    /// A field of one opacity everywhere.
+    struct Even(f32);
+
+    impl RayField for Even {
+        fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
+            Ok(vec![Pixel { opacity: self.0, ..Pixel::default() }; rays.len()])
         }
+    }
+
+    fn seen(opacity: f32) -> Result<Vec<Pixel>, RenderError> {
         let file = FieldFile {
             format: radiance::FIELD_FORMAT,
             field: FieldModel::Grid(Architecture::default()),
@@ -176,16 +182,68 @@ mod tests {
             bounds: Bounds::default(),
             background: Background::White,
         };
-        let seen = |opacity| {
-            let members = Members { file, fields: vec![Box::new(Broken(opacity))] };
-            members.render(&[Ray::default()])
-        };
+        let members = Members { file, fields: vec![Box::new(Even(opacity))] };
+        members.render(&[Ray::default()])
+    }
+
+    /// What isn't finite has exit code 4, and what a library refuses 1.
+    #[test]
+    fn rendering_failures_have_exit_codes() {
         assert_eq!(seen(0.5).unwrap()[0].opacity, 0.5);
         let failure = rendering_failure(seen(f32::NAN).unwrap_err());
         assert_eq!(artifact::exit_code(&failure), 4);
         let refused = rendering_failure(RenderError::Backend("out of memory".to_owned()));
         assert_eq!(artifact::exit_code(&refused), 1);
         assert_eq!(refused.to_string(), "the field can't be rendered: out of memory");
+    }
+
+    /// Order and ties change nothing.
+    #[test]
+    fn the_middle_one_is_found_in_any_order() {
+        let nan = f32::NAN.copysign(1.0);
+        let cases: [(&[f32], Option<f32>); 9] = [
+            (&[], None),
+            (&[5.0], Some(5.0)),
+            (&[2.0, 9.0], Some(2.0)),
+            (&[2.0, 4.0, 9.0], Some(4.0)),
+            (&[1.0, 2.0, 3.0, 100.0], Some(2.0)),
+            (&[1.0, 7.0, 7.0], Some(7.0)),
+            (&[1.0, 1.0, 7.0, 7.0], Some(1.0)),
+            (&[1.0, 2.0, f32::INFINITY, nan, nan], Some(f32::INFINITY)),
+            (&[-nan, 1.0, 2.0], Some(1.0)),
+        ];
+        for (distances, expected) in cases {
+            for turn in 0..distances.len().max(1) {
+                let mut items = distances.to_vec();
+                items.rotate_left(turn);
+                let mut mirrored: Vec<f32> = items.iter().rev().copied().collect();
+                assert_eq!(middle(&mut items, |d| *d).copied(), expected, "{distances:?}");
+                assert_eq!(middle(&mut mirrored, |d| *d).copied(), expected, "{distances:?}");
+            }
+        }
+    }
+
+    /// The middle one comes whole: what belongs to its distance belongs to it.
+    #[test]
+    fn the_middle_one_keeps_what_belongs_to_it() {
+        let mut items = [(3.0, "far"), (1.0, "near"), (2.0, "middle")];
+        assert_eq!(middle(&mut items, |item| item.0), Some(&(2.0, "middle")));
+        assert_eq!(mean(&items, |item| item.0 + 1.0), 3.0);
+    }
+
+    fn write_file(folder: &Path, architecture: Architecture, bounds: Bounds, members: u32) {
+        let file = FieldFile {
+            format: radiance::FIELD_FORMAT,
+            field: FieldModel::Grid(architecture),
+            members,
+            bounds,
+            background: Background::White,
+        };
+        std::fs::write(folder.join(FIELD_FILE), serde_json::to_vec(&file).unwrap()).unwrap();
+    }
+
+    fn ray(x: f32) -> Ray {
+        Ray { origin: [x, 0.1, 4.0], direction: [0.0, 0.0, -1.0], background: [1.0; 3] }
     }
 
     /// All members are read, and what they see is averaged; one that is missing, and numbers that
@@ -202,29 +260,13 @@ mod tests {
             ..Architecture::default()
         };
         let folder = tempfile::tempdir().unwrap();
-        let write = |members: u32| {
-            let file = FieldFile {
-                format: radiance::FIELD_FORMAT,
-                field: FieldModel::Grid(architecture),
-                members,
-                bounds,
-                background: Background::White,
-            };
-            std::fs::write(folder.path().join(FIELD_FILE), serde_json::to_vec(&file).unwrap())
-                .unwrap();
-        };
         let fields: Vec<Field> = [3, 4].map(|seed| Field::new(architecture, bounds, seed)).into();
         for (i, field) in (0..).zip(&fields) {
             field.write(&folder.path().join(FieldFile::member(i))).unwrap();
         }
         let read = || Members::read(&GivenInput::open("field", folder.path()).unwrap(), "cpu");
-        let ray = |x: f32| Ray {
-            origin: [x, 0.1, 4.0],
-            direction: [0.0, 0.0, -1.0],
-            background: [1.0; 3],
-        };
         let rays: Vec<Ray> = [-0.5, 0.0, 0.7].map(ray).into();
-        write(2);
+        write_file(folder.path(), architecture, bounds, 2);
         let together = RayField::render(&read().unwrap(), &rays).unwrap();
         let apart: Vec<_> = fields.iter().map(|f| f.render(&rays)).collect();
         for (i, pixel) in together.iter().enumerate() {
@@ -239,7 +281,7 @@ mod tests {
             assert_eq!(pixel.median_depth, nearer);
         }
         for (members, expected) in [(3, "field-2.safetensors"), (0, "members = 0")] {
-            write(members);
+            write_file(folder.path(), architecture, bounds, members);
             let message = format!("{:#}", read().err().unwrap());
             assert!(message.contains(expected), "{message}");
         }

@@ -9,7 +9,7 @@ use std::path::Path;
 use artifact::GivenInput;
 use fields::Members;
 use radiance::{FIELD_FILE, FieldFile, Ray, RayField as _};
-use scene::{Camera, Views};
+use scene::{Camera, Intrinsics, Views};
 
 fn goldens() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/goldens"))
@@ -25,13 +25,15 @@ fn artifact(name: &str) -> tempfile::TempDir {
     folder
 }
 
+fn ray(camera: &Camera, i: u32) -> Ray {
+    let width = camera.intrinsics.width;
+    let ray = camera.ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
+    Ray::new(&ray, [1.0; 3])
+}
+
 fn rays(camera: &Camera) -> Vec<Ray> {
-    let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
-    let ray = |i: u32| {
-        let ray = camera.ray(f64::from(i % width) + 0.5, f64::from(i / width) + 0.5);
-        Ray::new(&ray, [1.0; 3])
-    };
-    (0..width * height).map(ray).collect()
+    let Intrinsics { width, height, .. } = camera.intrinsics;
+    (0..width * height).map(|i| ray(camera, i)).collect()
 }
 
 /// Compares a render with the EXR file that the older build wrote, whose colours have half

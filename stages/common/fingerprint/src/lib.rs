@@ -23,7 +23,7 @@ use toml::{Table, Value};
 /// Environment of a build script that changes the machine code.
 const BUILD_ENV: [&str; 5] = ["TARGET", "PROFILE", "OPT_LEVEL", "DEBUG", "CARGO_ENCODED_RUSTFLAGS"];
 
-/// Sets `STAGE_FINGERPRINT` for the crate being built, and has its program look for libraries beside
+/// Sets `STAGE_FINGERPRINT` for the crate being built. Its program will look for libraries beside
 /// itself: there `make install` puts libtorch.
 ///
 /// # Panics
@@ -60,8 +60,9 @@ pub fn emit() {
     println!("cargo:rustc-env=STAGE_FINGERPRINT={}", hash.0.finalize().to_hex());
 }
 
-/// Adds what a crate of a workspace is made of: its sources and those of the workspace crates that it
-/// uses, the profiles, and the locked packages that they reach. Returns the folders of those crates.
+/// Adds what a crate of a workspace is made of: its sources and those of the workspace crates that
+/// it uses, the profiles, and the locked packages that they reach. Returns the folders of those
+/// crates.
 fn add_sources(hash: &mut Hash, root: &Path, crate_dir: &Path) -> Vec<PathBuf> {
     let workspace = read_toml(&root.join("Cargo.toml"));
     let profile = workspace.get("profile").map(ToString::to_string).unwrap_or_default();
@@ -248,7 +249,7 @@ mod tests {
         hash.0.finalize().to_hex().to_string()
     }
 
-    /// What a stage is made of is in its key, however far down; and nothing else, nor where it lies.
+    /// What a stage is made of is in its key, however far down. Nothing else is, nor where it lies.
     #[test]
     fn an_edited_dependency_changes_it_and_an_unused_one_does_not() {
         let own = fingerprint(None);
@@ -273,14 +274,15 @@ mod tests {
         }
     }
 
+    fn hash_of(parts: &[(&str, &str)]) -> blake3::Hash {
+        let mut hash = Hash::default();
+        parts.iter().for_each(|(name, bytes)| hash.part(name, bytes.as_bytes()));
+        hash.0.finalize()
+    }
+
     #[test]
     fn parts_do_not_run_into_each_other() {
-        let of = |parts: &[(&str, &str)]| {
-            let mut hash = Hash::default();
-            parts.iter().for_each(|(name, bytes)| hash.part(name, bytes.as_bytes()));
-            hash.0.finalize()
-        };
-        assert_ne!(of(&[("a", "bc")]), of(&[("ab", "c")]));
-        assert_ne!(of(&[("a", "b"), ("c", "")]), of(&[("a", ""), ("b", "c")]));
+        assert_ne!(hash_of(&[("a", "bc")]), hash_of(&[("ab", "c")]));
+        assert_ne!(hash_of(&[("a", "b"), ("c", "")]), hash_of(&[("a", ""), ("b", "c")]));
     }
 }

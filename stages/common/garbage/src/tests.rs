@@ -281,9 +281,12 @@ proptest! {
         let made = make(&case);
         let store = &made.store;
         let stays = expected(&case, &made);
-        let records: BTreeSet<String> = stays.iter().filter(|key| store.record(key).is_some()).cloned().collect();
-        let unfinished: BTreeSet<String> = stays.iter().filter(|key| store.partial(key).exists()).cloned().collect();
-        let objects: BTreeSet<String> = records.iter().map(|key| store.record(key).unwrap().output).collect();
+        let records: BTreeSet<String> =
+            stays.iter().filter(|key| store.record(key).is_some()).cloned().collect();
+        let unfinished: BTreeSet<String> =
+            stays.iter().filter(|key| store.partial(key).exists()).cloned().collect();
+        let objects: BTreeSet<String> =
+            records.iter().map(|key| store.record(key).unwrap().output).collect();
         let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
         let plan = Root {
             why: "the plan".into(),
@@ -309,7 +312,8 @@ proptest! {
         }
         prop_assert_eq!(fs::read_dir(store.root().join("trash")).unwrap().count(), 0);
         for run in store.runs().unwrap() {
-            prop_assert!(run.in_progress || unix_time() - run.used_unix() < case.keep_days * 86_400);
+            let is_recent = || unix_time() - run.used_unix() < case.keep_days * 86_400;
+            prop_assert!(run.in_progress || is_recent());
         }
     }
 }
@@ -342,24 +346,24 @@ fn orphans_go() {
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
 }
 
+fn old_action(content: u8) -> Action {
+    Action { stage: 0, parameter: 0, inputs: vec![], content, days_old: 90, state: Finished::Yes }
+}
+
 /// What has a key of an older version stays, with what it was made of, until it is asked to go.
 #[test]
 fn what_an_older_version_made_stays_until_it_is_dropped() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
-    let action = |content| Action {
-        stage: 0,
-        parameter: 0,
-        inputs: vec![],
-        content,
-        days_old: 90,
-        state: Finished::Yes,
-    };
     let map = |parts: Value| parts.as_object().unwrap().clone();
-    let old =
-        make_action(&store, &action(1), &map(json!({"key version": 1, "parameter lr": 100})), &[]);
+    let old = make_action(
+        &store,
+        &old_action(1),
+        &map(json!({"key version": 1, "parameter lr": 100})),
+        &[],
+    );
     let now = map(json!({KEY_VERSION_PART: KEY_VERSION, "parameter lr_width": 100}));
-    make_action(&store, &action(2), &now, &[]);
+    make_action(&store, &old_action(2), &now, &[]);
     for (drop_old, expected) in [(false, vec![old]), (true, vec![])] {
         let verdict = judge(
             &store,

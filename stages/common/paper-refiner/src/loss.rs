@@ -28,7 +28,7 @@ const CAFFE_MEAN: [f32; 3] = [103.939, 116.779, 123.68];
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
 /// Keeps a mean feature of 0 from dividing.
-const LEAST: f64 = 1e-6;
+const MEAN_EPSILON: f64 = 1e-6;
 
 impl PerceptualLoss {
     /// Reads VGG-19's weights, as far as they go; the first block must be whole.
@@ -83,7 +83,7 @@ impl PerceptualLoss {
         let expected = tch::no_grad(|| self.features(truth))?;
         for ((a, b), share) in features.iter().zip(&expected).zip(SHARES) {
             let scale = if self.caffe {
-                b.f_abs()?.f_mean(Kind::Float)?.f_double_value(&[])? + LEAST
+                b.f_abs()?.f_mean(Kind::Float)?.f_double_value(&[])? + MEAN_EPSILON
             } else {
                 1.0
             };

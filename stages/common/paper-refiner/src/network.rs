@@ -65,12 +65,12 @@ const TAPS: [usize; 4] = [1, 3, 5, 6];
 /// Channels of a colour.
 pub(crate) const COLOURS: i64 = 3;
 /// Pixels of a patch's side are a multiple of this.
-pub(crate) const COARSEST: usize = 8;
+pub(crate) const PATCH_MULTIPLE: usize = 8;
 /// PyTorch's defaults.
 const MOMENTUM: f64 = 0.1;
 const EPSILON: f64 = 1e-5;
 /// Widest network that is read.
-const WIDEST: u32 = 1024;
+const MOST_WIDTH: u32 = 1024;
 /// Purpose of draws.
 const WEIGHTS: u64 = 320;
 
@@ -103,7 +103,7 @@ impl PaperRefiner {
     /// Reads weights that [`PaperRefiner::write`] wrote.
     pub fn read(path: &Path, width: u32) -> Result<Self, RefinementError> {
         // Before anything is made of such a number.
-        if !(1..=WIDEST).contains(&width) {
+        if !(1..=MOST_WIDTH).contains(&width) {
             return Err(RefinementError::Architecture { channels: width, blocks: 0 });
         }
         let weights = Weights::read(path)?;

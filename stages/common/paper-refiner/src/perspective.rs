@@ -5,15 +5,15 @@ use pixels::Image;
 /// most a share of its half width and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Perspective {
-    /// From places of the warped image to those of the image: (ax + by + c, dx + ey + f) / (gx + hy +
-    /// 1).
+    /// From places of the warped image to those of the image: (ax + by + c) / w and (dx + ey + f) /
+    /// w, where w is gx + hy + 1.
     map: [f64; 8],
     /// The rectangle that the image fills once it is warped: x, y, and one past the end.
     pub(crate) filled: [usize; 4],
 }
 
 /// How far corners move, as a share.
-const DISTORTION: f64 = 0.3;
+const MOST_CORNER_SHIFT: f64 = 0.3;
 
 impl Perspective {
     /// No change.
@@ -24,7 +24,7 @@ impl Perspective {
     /// A random one.
     pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
         let mut inwards =
-            |size: usize| rng.below((DISTORTION * (size / 2) as f64) as u64 + 1) as f64;
+            |size: usize| rng.below((MOST_CORNER_SHIFT * (size / 2) as f64) as u64 + 1) as f64;
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {

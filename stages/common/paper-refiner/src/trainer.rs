@@ -5,7 +5,7 @@ use nets::Adam;
 use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};
 
-use crate::network::{COARSEST, COLOURS};
+use crate::network::{COLOURS, PATCH_MULTIPLE};
 use crate::perspective::Perspective;
 use crate::{PaperRefiner, PerceptualLoss};
 
@@ -40,7 +40,7 @@ pub struct PaperTrainer {
 /// Perspectives of an image, the one that changes nothing among them.
 const PERSPECTIVES: u64 = 200;
 /// Pixels that a reference patch lies away at most.
-const WINDOW: usize = 64;
+const REFERENCE_REACH: usize = 64;
 /// Purposes of draws.
 const WARPS: u64 = 321;
 const PATCHES: u64 = 322;
@@ -197,7 +197,7 @@ fn within(low: usize, high: usize, rng: &mut CounterRng) -> usize {
 
 /// A draw from the window around a place, which ends at `last`.
 fn near(at: usize, last: usize, rng: &mut CounterRng) -> usize {
-    within(at.saturating_sub(WINDOW).min(last), (at + WINDOW).min(last), rng)
+    within(at.saturating_sub(REFERENCE_REACH).min(last), (at + REFERENCE_REACH).min(last), rng)
 }
 
 impl PaperTraining {
@@ -209,9 +209,12 @@ impl PaperTraining {
                 small.rendered.camera.name.clone(),
                 format!("smaller than a patch of {0}×{0} pixels", self.patch),
             ),
-            None if self.patch == 0 || !self.patch.is_multiple_of(COARSEST) => (
+            None if self.patch == 0 || !self.patch.is_multiple_of(PATCH_MULTIPLE) => (
                 "any".to_owned(),
-                format!("patches of {} pixels: a multiple of {COARSEST} is expected", self.patch),
+                format!(
+                    "patches of {} pixels: a multiple of {PATCH_MULTIPLE} is expected",
+                    self.patch
+                ),
             ),
             None => return Ok(()),
         };

@@ -11,11 +11,11 @@ pub struct Exposure {
 }
 
 /// Samples beyond these are clipped, and say nothing of an exposure.
-const CLIPPED: [f32; 2] = [0.02, 0.98];
+const UNCLIPPED_RANGE: [f32; 2] = [0.02, 0.98];
 /// Fewer blocks say too little.
 const LEAST_BLOCKS: f64 = 12.0;
 /// Factors beyond these are no exposure: the images show different things.
-const POSSIBLE: [f32; 2] = [0.1, 10.0];
+const POSSIBLE_FACTORS: [f32; 2] = [0.1, 10.0];
 
 impl Exposure {
     /// The exposure of an image against another of its size that has the right one: the line
@@ -37,7 +37,7 @@ impl Exposure {
                 return None;
             }
             let gain = together / spread;
-            if !(POSSIBLE[0]..=POSSIBLE[1]).contains(&(gain as f32)) {
+            if !(POSSIBLE_FACTORS[0]..=POSSIBLE_FACTORS[1]).contains(&(gain as f32)) {
                 return None;
             }
             (exposure.gain[c], exposure.offset[c]) = (gain as f32, ((y - gain * x) / n) as f32);
@@ -85,7 +85,7 @@ fn block_mean(
     [x, y]: [usize; 2],
 ) -> Option<[f64; 2]> {
     let (width, height) = (images[1].width, images[1].height);
-    let is_known = |v: f32| (CLIPPED[0]..=CLIPPED[1]).contains(&v);
+    let is_known = |v: f32| (UNCLIPPED_RANGE[0]..=UNCLIPPED_RANGE[1]).contains(&v);
     let (mut n, mut sum) = (0usize, [0.0f64; 2]);
     for row in y..(y + block).min(height) {
         for column in x..(x + block).min(width) {

@@ -133,7 +133,7 @@ fn header<'a>(
         }
     });
     let list = ChannelList::new(described.collect());
-    // Measured in facts/pipelines.md: the crate's default line order wrote 40 different files of 40.
+    // With the crate's default line order 40 files of 40 differed.
     let mut header = Header::new(Text::from("views"), size, list.list).with_encoding(
         Compression::ZIP16,
         BlockDescription::ScanLines,

@@ -1,6 +1,6 @@
 //! Experiments to nodes, with stages that would describe themselves so.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::{Value, json};
 
@@ -31,6 +31,14 @@ experiment:
     - {name: 'one ray, shown', parameters: {score.samples: 1}}
 ";
 
+fn whole((name, kind, inputs, parameters): (&str, &str, Value, Value)) -> (String, Description) {
+    let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs,
+        "output": {"kind": kind},
+        "parameters": {"properties": parameters}, "sink": name == "table",
+        "partial": name == "table"});
+    (name.to_owned(), serde_json::from_value(text).unwrap())
+}
+
 fn descriptions() -> BTreeMap<String, Description> {
     let integer = |default: u64| json!({"type": "integer", "default": default});
     let described = [
@@ -55,13 +63,6 @@ fn descriptions() -> BTreeMap<String, Description> {
         ),
         ("table", "table", json!({"run": {"kinds": ["run"], "summary": ""}}), json!({})),
     ];
-    let whole = |(name, kind, inputs, parameters): (&str, &str, Value, Value)| {
-        let text = json!({"name": name, "version": "", "code": "", "summary": "", "inputs": inputs,
-            "output": {"kind": kind},
-            "parameters": {"properties": parameters}, "sink": name == "table",
-            "partial": name == "table"});
-        (name.to_owned(), serde_json::from_value(text).unwrap())
-    };
     described.map(whole).into()
 }
 
@@ -89,6 +90,14 @@ fn data() -> tempfile::TempDir {
 
 fn labels(plan: &Plan) -> Vec<String> {
     plan.nodes.iter().map(Node::label).collect()
+}
+
+fn folder_of(plan: &Plan, node: usize, input: &str) -> PathBuf {
+    let input = plan.nodes[node].inputs.iter().find(|one| one.name == input).unwrap();
+    match &input.from {
+        Origin::Folder(folder) => folder.clone(),
+        Origin::Node { .. } => panic!("{input:?}"),
+    }
 }
 
 /// Variants form no product, and what they have in common is one node.
@@ -122,32 +131,29 @@ fn scenes_protocols_and_variants_are_axes() {
         (&plan.nodes[0].parameters["lr_width"], &plan.nodes[2].parameters["rays"]),
         (&json!(100), &json!(1000))
     );
-    let folder = |node: usize, input: &str| {
-        let input = plan.nodes[node].inputs.iter().find(|one| one.name == input).unwrap();
-        match &input.from {
-            Origin::Folder(folder) => folder.clone(),
-            Origin::Node { .. } => panic!("{input:?}"),
-        }
-    };
-    assert!(folder(1, "dataset").ends_with("second/lego") && folder(0, "dataset").ends_with("own"));
-    assert!(folder(6, "weights").ends_with("weights"));
+    assert!(
+        folder_of(&plan, 1, "dataset").ends_with("second/lego")
+            && folder_of(&plan, 0, "dataset").ends_with("own")
+    );
+    assert!(folder_of(&plan, 6, "weights").ends_with("weights"));
     assert_eq!(plan.sinks[0].shows.len(), 6);
+}
+
+fn scores(data: &Path, change: &dyn Fn(&mut Request)) -> Vec<String> {
+    let plan = plan_of(EXPERIMENT, data, change).unwrap();
+    labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect()
 }
 
 #[test]
 fn the_command_line_chooses_and_wins() {
     let data = data();
-    let scores = |change: &dyn Fn(&mut Request)| -> Vec<String> {
-        let plan = plan_of(EXPERIMENT, data.path(), change).unwrap();
-        labels(&plan).into_iter().filter(|label| label.starts_with("score")).collect()
-    };
     let named = |names: &[&str]| names.iter().map(|name| (*name).to_owned()).collect::<Vec<_>>();
     assert_eq!(
-        scores(&|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))),
+        scores(data.path(), &|r| (r.choice.scenes, r.choice.first) = (named(&["chair"]), Some(1))),
         ["score"]
     );
     assert_eq!(
-        scores(&|r| (r.choice.scenes, r.choice.variants) =
+        scores(data.path(), &|r| (r.choice.scenes, r.choice.variants) =
             (named(&["demo"]), named(&["no warm-up", "as it is"]))),
         ["score [variant=as it is]", "score [variant=no warm-up]"]
     );
@@ -227,17 +233,18 @@ fn shown() -> String {
     text.replace("  variants:\n", "  needs: {train-large: 'weights/x{rays}'}\n  variants:\n")
 }
 
+fn plan_showing(data: &Path, show: &[&str]) -> Result<Plan, PlanError> {
+    plan_of(&shown(), data, |r| {
+        (r.choice.scenes, r.choice.protocols, r.choice.first) =
+            (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
+        r.choice.show = show.iter().map(|name| (*name).to_owned()).collect();
+    })
+}
+
 #[test]
 fn only_what_is_to_be_shown_is_made() {
     let data = data();
     std::fs::write(data.path().join("weights/x500"), "").unwrap();
-    let plan = |show: &[&str]| {
-        plan_of(&shown(), data.path(), |r| {
-            (r.choice.scenes, r.choice.protocols, r.choice.first) =
-                (vec!["lego".to_owned()], vec!["50x3".to_owned()], Some(1));
-            r.choice.show = show.iter().map(|name| (*name).to_owned()).collect();
-        })
-    };
     for (show, expected) in [
         (&[][..], &["prep", "prep-large", "train", "score", "train-large", "score-large"][..]),
         (
@@ -247,7 +254,7 @@ fn only_what_is_to_be_shown_is_made() {
         (&["small"], &["prep", "train", "score"]),
         (&["score-large"], &["prep-large", "train-large", "score-large"]),
     ] {
-        let mut made = labels(&plan(show).unwrap());
+        let mut made = labels(&plan_showing(data.path(), show).unwrap());
         let mut expected: Vec<&str> = expected.to_vec();
         made.sort_unstable();
         expected.sort_unstable();
@@ -255,7 +262,7 @@ fn only_what_is_to_be_shown_is_made() {
     }
     // The scene is every block's that has the pipeline's own otherwise; sizes follow from the
     // protocol.
-    let large = &plan(&["large"]).unwrap().nodes;
+    let large = &plan_showing(data.path(), &["large"]).unwrap().nodes;
     let folder = NodeInput {
         name: "dataset".to_owned(),
         from: Origin::Folder(data.path().join("second/lego").canonicalize().unwrap()),
@@ -265,9 +272,9 @@ fn only_what_is_to_be_shown_is_made() {
         (&[folder][..], &json!(150))
     );
     assert_eq!(large[2].parameters["samples"], json!(3));
-    let problem = |show: &[&str]| plan(show).map(|plan| labels(&plan)).unwrap_err().to_string();
+    let unknown = plan_showing(data.path(), &["larg"]).map(|plan| labels(&plan));
     assert_eq!(
-        problem(&["larg"]),
+        unknown.unwrap_err().to_string(),
         "--show larg: table has no such input; did you mean large? known: large, score, \
         score-large, small"
     );

@@ -10,6 +10,18 @@ use crate::pipeline::Pipeline;
 /// Most files in a chain of which each extends the next.
 const DEEPEST: usize = 8;
 
+/// Two pipelines that can't be one: a block of one is another in the other.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("block {block} isn't the same in {one} and in {two}")]
+pub struct JoinError {
+    /// The block's name.
+    pub block: String,
+    /// The file that one has it from.
+    pub one: PathBuf,
+    /// The file that the other has it from.
+    pub two: PathBuf,
+}
+
 impl Pipeline {
     /// Reads a file and those that it extends.
     pub fn read(path: &Path) -> Result<Self, PipelineError> {
@@ -31,13 +43,13 @@ impl Pipeline {
         extended(file, &mut trail)
     }
 
-    /// Both pipelines as one, where no block of one is another in the other; else what is wrong.
-    pub fn joined(mut self, other: Self) -> Result<Self, String> {
+    /// Both pipelines as one, where no block of one is another in the other.
+    pub fn joined(mut self, other: Self) -> Result<Self, JoinError> {
         let mut shared = other.stages.keys().filter(|name| self.stages.contains_key(*name));
         if let Some(name) = shared.find(|name| !self.has_same(&other, name)) {
             let [one, two] =
-                [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.display());
-            return Err(format!("block {name} isn't the same in {one} and in {two}"));
+                [&self, &other].map(|pipeline| pipeline.file_of_block(name).path.clone());
+            return Err(JoinError { block: name.clone(), one, two });
         }
         self.stages.extend(other.stages);
         self.experiment.change(&other.experiment);

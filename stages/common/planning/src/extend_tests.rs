@@ -6,6 +6,7 @@ use tempfile::TempDir;
 
 use super::*;
 use crate::part::Part;
+use crate::request::PlanError;
 use crate::{renames, targets};
 
 /// A folder with files.
@@ -158,6 +159,11 @@ fn files_that_cannot_be_extended() {
     }
 }
 
+fn find(home: &Path, names: &[&str]) -> Result<(Pipeline, Vec<String>), PlanError> {
+    let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
+    targets::find(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
+}
+
 /// Names are looked for in pipeline.yaml, then among the files of `pipelines/`, then among the
 /// blocks of those.
 #[test]
@@ -177,10 +183,6 @@ fn targets_are_found_beside_the_pipeline() {
     ];
     let folder = base_and(&shelf);
     let home = folder.path().canonicalize().unwrap();
-    let find = |names: &[&str]| {
-        let names: Vec<String> = names.iter().map(|name| (*name).to_owned()).collect();
-        targets::find(&Pipeline::read(&home.join("pipeline.yaml")).unwrap(), &names)
-    };
     for (names, blocks, stages) in [
         (&[][..], &[][..], &["a", "b"][..]),
         (&["a"], &["a"], &["a", "b"]),
@@ -190,7 +192,7 @@ fn targets_are_found_beside_the_pipeline() {
         (&["b", "c", "other"], &["b", "c", "other"], &["a", "b", "c", "inner", "other"]),
         (&["e"], &["e"], &["a", "b", "e"]),
     ] {
-        let (pipeline, found) = find(names).unwrap();
+        let (pipeline, found) = find(&home, names).unwrap();
         assert_eq!(found, blocks, "{names:?}");
         assert_eq!(pipeline.stages.keys().collect::<Vec<_>>(), stages, "{names:?}");
     }
@@ -208,9 +210,20 @@ fn targets_are_found_beside_the_pipeline() {
         ),
         (&["joined"], &["no stage \"joined\"; it is called hr-finetune now"]),
     ] {
-        let error = find(names).unwrap_err().to_string();
+        let error = find(&home, names).unwrap_err().to_string();
         assert!(words.iter().all(|words| error.contains(words)), "{error}");
     }
+}
+
+fn home_of(folder: &Path, file: &str) -> PathBuf {
+    let pipeline = Pipeline::read(&folder.join(file)).unwrap();
+    pipeline
+        .home()
+        .canonicalize()
+        .unwrap()
+        .strip_prefix(folder.canonicalize().unwrap())
+        .unwrap()
+        .to_owned()
 }
 
 /// A file of `pipelines/` shares store and pages with pipeline.yaml; a pipeline of its own has its
@@ -223,16 +236,6 @@ fn the_store_lies_beside_the_pipeline() {
         ("other/x.yaml", "extends: ../pipelines/c.yaml"),
     ];
     let folder = base_and(&more);
-    let home = |file: &str| {
-        let pipeline = Pipeline::read(&folder.path().join(file)).unwrap();
-        pipeline
-            .home()
-            .canonicalize()
-            .unwrap()
-            .strip_prefix(folder.path().canonicalize().unwrap())
-            .unwrap()
-            .to_owned()
-    };
     for (file, expected) in [
         ("pipeline.yaml", ""),
         ("pipelines/c.yaml", ""),
@@ -240,7 +243,7 @@ fn the_store_lies_beside_the_pipeline() {
         ("pipelines/alone.yaml", "pipelines"),
         ("other/x.yaml", "other"),
     ] {
-        assert_eq!(home(file), Path::new(expected), "{file}");
+        assert_eq!(home_of(folder.path(), file), Path::new(expected), "{file}");
     }
 }
 

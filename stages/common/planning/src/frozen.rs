@@ -12,7 +12,7 @@ use serde_json::Value;
 use slurm::Resources;
 
 use crate::node::{Devices, Node, NodeInput, Origin, Plan, Sink};
-use crate::stages::StageProgram;
+use crate::stages::{ProgramError, StageProgram};
 
 /// A plan without what can be made again from the rest.
 #[derive(Serialize, Deserialize)]
@@ -68,8 +68,8 @@ pub enum FrozenError {
     #[error("the submission has no task {0}")]
     Task(usize),
     /// A program isn't described as it should be.
-    #[error("{0}")]
-    Program(String),
+    #[error(transparent)]
+    Program(#[from] ProgramError),
 }
 
 impl Frozen {
@@ -178,10 +178,9 @@ impl Frozen {
         if let Some(program) = known.get(path) {
             return Ok(Arc::clone(program));
         }
-        let absent = || FrozenError::Program(format!("nothing describes {}", path.display()));
+        let absent = || ProgramError::Undescribed(path.to_path_buf());
         let description = self.programs.get(path).ok_or_else(absent)?;
-        let program =
-            Arc::new(StageProgram::new(path, description.clone()).map_err(FrozenError::Program)?);
+        let program = Arc::new(StageProgram::new(path, description.clone())?);
         known.insert(path, Arc::clone(&program));
         Ok(program)
     }

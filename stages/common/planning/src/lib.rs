@@ -42,6 +42,7 @@ mod targets;
 
 pub use changes::{Change, changes, short};
 pub use experiment::{Experiment, Selection, Variant};
+pub use extend::JoinError;
 pub use file::{PipelineFile, StageBlock};
 pub use frozen::{Frozen, FrozenError};
 pub use key::{explain, nearest, nearest_changes, parts};
@@ -51,5 +52,5 @@ pub use pipeline::Pipeline;
 pub use plan::{input_hashes, source_hash};
 pub use renames::known_blocks;
 pub use request::{PlanError, Request};
-pub use stages::{Asking, Programs, StageProgram, executable};
+pub use stages::{Asking, ProgramError, Programs, StageProgram, executable};
 pub use targets::find;

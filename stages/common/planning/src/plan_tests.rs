@@ -27,6 +27,19 @@ stages:
     inputs: {run: score}
 ";
 
+fn whole(mut one: Value) -> (String, Description) {
+    for (name, value) in [
+        ("version", json!("1")),
+        ("code", json!("1")),
+        ("summary", json!("")),
+        ("inputs", json!({})),
+        ("parameters", json!({})),
+    ] {
+        one.as_object_mut().unwrap().entry(name).or_insert(value);
+    }
+    (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+}
+
 /// What the stages of [`PIPELINE`] say of themselves.
 fn descriptions() -> BTreeMap<String, Description> {
     let seed = json!({"type": "integer", "format": "uint64", "default": 0});
@@ -65,18 +78,6 @@ fn descriptions() -> BTreeMap<String, Description> {
             "inputs": {"run": {"kinds": ["run"], "summary": "a run"}},
          "parameters": {"properties": {"views": {"type": "integer", "default": 4}}}}
     ]);
-    let whole = |mut one: Value| -> (String, Description) {
-        for (name, value) in [
-            ("version", json!("1")),
-            ("code", json!("1")),
-            ("summary", json!("")),
-            ("inputs", json!({})),
-            ("parameters", json!({})),
-        ] {
-            one.as_object_mut().unwrap().entry(name).or_insert(value);
-        }
-        (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
-    };
     described.as_array().unwrap().iter().cloned().map(whole).collect()
 }
 
@@ -153,14 +154,15 @@ fn a_block_follows_the_one_it_extends_save_in_what_it_says() {
     assert_eq!((&of("again")["rays"], &of("again")["supersample"]), (&json!(7), &json!(3.0)));
 }
 
+fn keys(text: &str, arguments: &[&str]) -> Vec<String> {
+    let plan = plan_of(text, arguments).unwrap();
+    plan.nodes.iter().map(|node| artifact::hash_json(&key::parts(node, &[], "cpu"))).collect()
+}
+
 /// What is equal is one key, however it is written and wherever it is said; a default is the same
 /// said and unsaid.
 #[test]
 fn equal_values_are_one_key() {
-    let keys = |text: &str, arguments: &[&str]| -> Vec<String> {
-        let plan = plan_of(text, arguments).unwrap();
-        plan.nodes.iter().map(|node| artifact::hash_json(&key::parts(node, &[], "cpu"))).collect()
-    };
     let same: [(&[&str], &[&str]); 9] = [
         (&[], &["-p", "supersample=2"]),
         (&[], &["-p", "supersample=2e0", "-p", "size=4.0", "-p", "train.seed=0"]),
@@ -462,6 +464,18 @@ fn resources_follow_extends_and_gpus_are_the_clusters_affair() {
     }
 }
 
+fn ancestors(plan: &Plan, of: usize) -> usize {
+    let mut wanted = BTreeSet::from([of]);
+    (0..=of)
+        .rev()
+        .filter(|&i| wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some())
+        .count()
+}
+
+fn parent_labels(plan: &Plan, node: &Node) -> Vec<String> {
+    node.parents().map(|p| plan.nodes[p].label()).collect()
+}
+
 /// A task's part of a plan, written and read, is what its job works with.
 #[test]
 fn a_frozen_plan_has_all_that_a_task_needs() {
@@ -471,25 +485,13 @@ fn a_frozen_plan_has_all_that_a_task_needs() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("plan.json"), &text).unwrap();
     let frozen = Frozen::read(&folder.path().join("plan.json")).unwrap();
-    let ancestors = |plan: &Plan, of: usize| {
-        let mut wanted = BTreeSet::from([of]);
-        (0..=of)
-            .rev()
-            .filter(|&i| {
-                wanted.contains(&i).then(|| wanted.extend(plan.nodes[i].parents())).is_some()
-            })
-            .count()
-    };
     for (index, node) in plan.nodes.iter().enumerate() {
         let part = frozen.part(index).unwrap();
         let last = part.nodes.last().unwrap();
         assert_eq!((last.label(), &last.parameters), (node.label(), &node.parameters));
-        let labels = |plan: &Plan, node: &Node| {
-            node.parents().map(|p| plan.nodes[p].label()).collect::<Vec<_>>()
-        };
         assert_eq!(
-            (labels(&part, last), part.nodes.len()),
-            (labels(&plan, node), ancestors(&plan, index))
+            (parent_labels(&part, last), part.nodes.len()),
+            (parent_labels(&plan, node), ancestors(&plan, index))
         );
     }
     let page = frozen.part(plan.nodes.len()).unwrap();

@@ -13,10 +13,10 @@ use std::sync::atomic::AtomicBool;
 use std::time::UNIX_EPOCH;
 
 use artifact::{nearest, write_atomically};
-use contract::{Description, Schema};
+use contract::{Description, DescriptionError, Schema, SchemaError};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use stage_call::{Answers, Interrupted, ask_all};
+use stage_call::{DescribeError, Interrupted, ask_all};
 use store::Store;
 
 use crate::file::StageBlock;
@@ -34,14 +34,54 @@ pub struct StageProgram {
     pub schema: Schema,
 }
 
+/// Why a stage's program can't be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ProgramError {
+    /// Its file can't be used.
+    #[error("{path}: {problem}")]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, and what to do.
+        problem: String,
+    },
+    /// It isn't built.
+    #[error("{path} isn't built; {remedy}")]
+    Unbuilt {
+        /// Where it would be.
+        path: PathBuf,
+        /// What to do.
+        remedy: String,
+    },
+    /// It is somebody's file, which only a run may start.
+    #[error("{0} is no part of nerf-sr: `nerf-sr run` starts it; read it first")]
+    Foreign(PathBuf),
+    /// It doesn't say what it is.
+    #[error(transparent)]
+    Describe(#[from] DescribeError),
+    /// Nobody says what it is.
+    #[error("nothing describes {0}")]
+    Undescribed(PathBuf),
+    /// What it says of itself is wrong.
+    #[error("what {path} says of itself can't be used: {problem}")]
+    Description {
+        /// The program.
+        path: PathBuf,
+        /// What is wrong.
+        problem: DescriptionError,
+    },
+    /// Its parameters can't be checked.
+    #[error(transparent)]
+    Schema(#[from] SchemaError),
+}
+
 impl StageProgram {
     /// A program by what it says; fails where that can't be used.
-    pub fn new(path: &Path, description: Description) -> Result<Self, String> {
+    pub fn new(path: &Path, description: Description) -> Result<Self, ProgramError> {
         description
             .check()
-            .map_err(|e| format!("what {} says of itself can't be used: {e}", path.display()))?;
-        let schema =
-            Schema::new(&description.name, &description.parameters).map_err(|e| e.to_string())?;
+            .map_err(|problem| ProgramError::Description { path: path.to_path_buf(), problem })?;
+        let schema = Schema::new(&description.name, &description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
     }
 
@@ -88,9 +128,9 @@ impl Programs {
     pub fn of(pipeline: &Pipeline, descriptions: &BTreeMap<String, Description>) -> Self {
         Self::new(pipeline, |stage| {
             let name = program_name(pipeline, stage);
-            let description =
-                descriptions.get(name).cloned().ok_or_else(|| format!("nothing describes {name}"));
-            description.and_then(|description| StageProgram::new(Path::new(name), description))
+            let absent = || ProgramError::Undescribed(PathBuf::from(name));
+            let description = descriptions.get(name).cloned().ok_or_else(absent)?;
+            StageProgram::new(Path::new(name), description)
         })
     }
 
@@ -108,7 +148,8 @@ impl Programs {
             .ok()
             .and_then(|b| serde_json::from_slice(&b).ok())
             .unwrap_or_default();
-        let (mut answers, mut unasked) = (Answers::new(), BTreeMap::new());
+        let mut answers: BTreeMap<PathBuf, Result<Description, ProgramError>> = BTreeMap::new();
+        let mut unasked = BTreeMap::new();
         let paths: BTreeMap<&str, PathBuf> =
             pipeline.stages.keys().map(|s| (s.as_str(), executable(pipeline, s))).collect();
         for (stage, path) in &paths {
@@ -122,9 +163,7 @@ impl Programs {
                         _ = unasked.insert(path.clone(), identity);
                     }
                     None => {
-                        let problem =
-                            "is no part of nerf-sr: `nerf-sr run` starts it; read it first";
-                        answers.insert(path.clone(), Err(format!("{} {problem}", path.display())));
+                        answers.insert(path.clone(), Err(ProgramError::Foreign(path.clone())));
                     }
                 },
             }
@@ -133,7 +172,10 @@ impl Programs {
             Asking::Run(stop) => Some(stop),
             Asking::Look => None,
         };
-        answers.extend(ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?);
+        let asked = ask_all(&unasked.keys().cloned().collect::<Vec<_>>(), stop)?;
+        answers.extend(
+            asked.into_iter().map(|(path, answer)| (path, answer.map_err(ProgramError::Describe))),
+        );
         for (path, identity) in &unasked {
             if let Ok(description) = &answers[path] {
                 cache.0.insert(
@@ -154,11 +196,11 @@ impl Programs {
     }
 
     /// What each stage's program turns out to be; what is wrong with it, is wrong with the block.
-    fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, String>) -> Self {
+    fn new(pipeline: &Pipeline, find: impl Fn(&str) -> Result<StageProgram, ProgramError>) -> Self {
         let programs = pipeline.stages.keys().map(|stage| {
             let program = find(stage)
                 .map(Arc::new)
-                .map_err(|problem| pipeline.error(stage, Part::Field("run"), problem));
+                .map_err(|e| pipeline.error(stage, Part::Field("run"), e.to_string()));
             (stage.clone(), program)
         });
         Self(programs.collect())
@@ -233,7 +275,8 @@ fn own_folder() -> PathBuf {
 }
 
 /// What a program is known by; else what is wrong and what to do.
-fn identify(path: &Path, name: &str) -> Result<Identity, String> {
+fn identify(path: &Path, name: &str) -> Result<Identity, ProgramError> {
+    let fail = |problem: String| ProgramError::File { path: path.to_path_buf(), problem };
     let meta = std::fs::metadata(path).and_then(|meta| {
         let kind = std::io::ErrorKind::IsADirectory;
         if meta.is_dir() { Err(std::io::Error::from(kind)) } else { Ok(meta) }
@@ -244,19 +287,19 @@ fn identify(path: &Path, name: &str) -> Result<Identity, String> {
             Ok(Identity { size: meta.len(), modified: modified(&meta), blake3: None })
         }
         Ok(meta) => {
-            let hash = hash_file(path).map_err(|e| format!("{}: {e}", path.display()))?;
+            let hash = hash_file(path).map_err(|e| fail(e.to_string()))?;
             Ok(Identity { size: meta.len(), modified: 0, blake3: Some(hash) })
         }
         Err(e) if name.contains('/') => {
-            Err(format!("{}: {e}; set `run:` to the stage's executable", path.display()))
+            Err(fail(format!("{e}; set `run:` to the stage's executable")))
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
             let meant =
                 neighbour(name).map(|other| format!("did you mean {other}? ")).unwrap_or_default();
-            let problem = format!("{} isn't built", path.display());
-            Err(format!("{problem}; {meant}run `make build`, or set `run:` to another program"))
+            let remedy = format!("{meant}run `make build`, or set `run:` to another program");
+            Err(ProgramError::Unbuilt { path: path.to_path_buf(), remedy })
         }
-        Err(e) => Err(format!("{}: {e}", path.display())),
+        Err(e) => Err(fail(e.to_string())),
     }
 }
 

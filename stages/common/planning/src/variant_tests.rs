@@ -22,6 +22,10 @@ stages:
       ensemble: 2
 ";
 
+fn named(one: Value) -> (String, Description) {
+    (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
+}
+
 fn descriptions() -> BTreeMap<String, Description> {
     let parameters: Value =
         serde_json::from_str(include_str!("../../../../schemas/parameters/train-ss.json")).unwrap();
@@ -33,9 +37,6 @@ fn descriptions() -> BTreeMap<String, Description> {
                "inputs": {"scene": {"kinds": ["scene"], "summary": ""}},
                "output": {"kind": "field", "resolved": "training.json"}}),
     ];
-    let named = |one: Value| {
-        (one["name"].as_str().unwrap().to_owned(), serde_json::from_value(one).unwrap())
-    };
     described.into_iter().map(named).collect()
 }
 
@@ -51,32 +52,33 @@ fn plan_of(text: &str, arguments: &[&str]) -> Result<Plan, PlanError> {
     )
 }
 
+fn values(node: &Node, names: &[&str]) -> Vec<Value> {
+    names.iter().map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent"))).collect()
+}
+
 /// The trainings of a plan: point and some parameters.
 fn trainings(text: &str, arguments: &[&str], names: &[&str]) -> Vec<(String, Vec<Value>)> {
     let plan = plan_of(text, arguments).unwrap();
     let nodes = plan.nodes.iter().filter(|node| node.stage == "train-ss");
-    let values = |node: &Node| {
-        names
-            .iter()
-            .map(|name| node.parameters.get(name).cloned().unwrap_or(json!("absent")))
-            .collect()
-    };
-    nodes.map(|node| (node.point.clone(), values(node))).collect()
+    nodes.map(|node| (node.point.clone(), values(node, names))).collect()
+}
+
+fn grid(rays: u64, n_levels: u32) -> Vec<Value> {
+    vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)]
+}
+
+fn mlp(rays: Value, layers: u32) -> Vec<Value> {
+    vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)]
+}
+
+fn pointed(points: &[(&str, Vec<Value>)]) -> Vec<(String, Vec<Value>)> {
+    points.iter().map(|(point, values)| ((*point).to_owned(), values.clone())).collect()
 }
 
 #[test]
 fn every_form_reaches_a_parameter_of_a_variant() {
     let names = ["field", "rays", "n_levels", "layers", "hidden_dim"];
-    let grid = |rays: u64, n_levels: u32| {
-        vec![json!("grid"), json!(rays), json!(n_levels), json!("absent"), json!(64)]
-    };
-    let mlp = |rays: Value, layers: u32| {
-        vec![json!("mlp"), rays, json!("absent"), json!(layers), json!(256)]
-    };
     let one = |values: Vec<Value>| vec![(String::new(), values)];
-    let pointed = |points: &[(&str, Vec<Value>)]| -> Vec<(String, Vec<Value>)> {
-        points.iter().map(|(point, values)| ((*point).to_owned(), values.clone())).collect()
-    };
     let nested = &PIPELINE.replace("rays: 12000000", "field: {grid: {n_levels: 4}}")[..];
     let beside = &PIPELINE.replace("rays: 12000000", "rays: 12000000\n      n_levels: 4")[..];
     let paper = &PIPELINE.replace("rays: 12000000", "field: mlp\n      layers: 4")[..];
@@ -127,15 +129,16 @@ fn every_form_reaches_a_parameter_of_a_variant() {
     }
 }
 
+fn of_other(text: &str, arguments: &[&str], name: &str) -> Value {
+    let text = text.replace("default: [train-ss]", "default: [train-ss, other]");
+    let plan = plan_of(&text, arguments).unwrap();
+    let node = plan.nodes.iter().find(|node| node.stage == "other").unwrap();
+    node.parameters.get(name).cloned().unwrap_or_default()
+}
+
 /// A block that extends another has its variant, unless it says otherwise.
 #[test]
 fn a_block_that_extends_follows_the_choice() {
-    let of = |text: &str, arguments: &[&str], name: &str| {
-        let text = text.replace("default: [train-ss]", "default: [train-ss, other]");
-        let plan = plan_of(&text, arguments).unwrap();
-        let node = plan.nodes.iter().find(|node| node.stage == "other").unwrap();
-        node.parameters.get(name).cloned().unwrap_or_default()
-    };
     let own = &PIPELINE.replace("ensemble: 2", "field: {grid: {n_levels: 3}}")[..];
     for (text, arguments, name, expected) in [
         (PIPELINE, &["field=mlp"][..], "field", json!("mlp")),
@@ -145,7 +148,7 @@ fn a_block_that_extends_follows_the_choice() {
         (own, &["train-ss.n_levels=4"], "n_levels", json!(3)),
         (own, &["train-ss.field=mlp"], "field", json!("grid")),
     ] {
-        assert_eq!(of(text, arguments, name), expected, "{arguments:?}");
+        assert_eq!(of_other(text, arguments, name), expected, "{arguments:?}");
     }
 }
 
@@ -215,17 +218,18 @@ fn files_with_wrong_variants() {
     }
 }
 
+fn training_key(text: &str, arguments: &[&str]) -> String {
+    let plan = plan_of(text, arguments).unwrap();
+    artifact::hash_json(&key::parts(&plan.nodes[1], &[], "cpu"))
+}
+
 /// The key has the chosen variant's parameters, each by its name, however they were written.
 #[test]
 fn one_choice_is_one_key() {
-    let key = |text: &str, arguments: &[&str]| {
-        let plan = plan_of(text, arguments).unwrap();
-        artifact::hash_json(&key::parts(&plan.nodes[1], &[], "cpu"))
-    };
     let nested = PIPELINE.replace("rays: 12000000", "field: {grid: {rays: 12000000, n_levels: 4}}");
-    assert_eq!(key(&nested, &[]), key(PIPELINE, &["n_levels=4"]));
-    assert_eq!(key(PIPELINE, &["field=grid"]), key(PIPELINE, &[]));
-    assert_ne!(key(PIPELINE, &["field=mlp"]), key(PIPELINE, &[]));
+    assert_eq!(training_key(&nested, &[]), training_key(PIPELINE, &["n_levels=4"]));
+    assert_eq!(training_key(PIPELINE, &["field=grid"]), training_key(PIPELINE, &[]));
+    assert_ne!(training_key(PIPELINE, &["field=mlp"]), training_key(PIPELINE, &[]));
     let plan = plan_of(PIPELINE, &[]).unwrap();
     let open: Vec<String> = plan.nodes[1].by_scene(Path::new("")).keys().cloned().collect();
     assert!(

@@ -23,13 +23,16 @@
 //! use pixels::Image;
 //! use radiance::{Architecture, Field, RenderError};
 //! use scene::{Bounds, Camera, Intrinsics};
-//! let bounds = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Default::default() };
+//! let (min, max) = ([-1.0; 3], [1.0; 3]);
+//! let bounds = Bounds { min, max, near: 2.0, far: 6.0, ..Default::default() };
 //! let field = Field::new(Architecture::default(), bounds, 7);
 //! let intrinsics = Intrinsics::from_angle_x(16, 16, 0.69);
-//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
+//! let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]];
+//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world };
 //! let photograph = Image::new(16, 16, 3, vec![0.5; 16 * 16 * 3]);
 //! let pyramid = Pyramid::new(&photograph, 2);
-//! let Refinement { camera: found, before, after, .. } = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
+//! let refined = refine(&field, &camera, &pyramid, 0, &Default::default()).unwrap();
+//! let Refinement { camera: found, before, after, .. } = refined;
 //! // A grey wall says nothing of where it was seen from.
 //! assert!(found == camera && before == after);
 //! ```
@@ -79,13 +82,13 @@ impl Telling {
 }
 
 /// Smaller levels have too little to go by.
-const SMALLEST: usize = 12;
+const LEAST_LEVEL_SIDE: usize = 12;
 /// At most so many pixels of a level are rendered, spread over all that tell something.
-const MOST: usize = 4096;
+const MOST_PIXELS: usize = 4096;
 /// Fewer say nothing.
-const LEAST: usize = 24;
+const LEAST_PIXELS: usize = 24;
 /// A pixel tells something where a channel changes by more, from a pixel to the next.
-const STEEP: f32 = 3.0 / 255.0;
+const LEAST_SLOPE: f32 = 3.0 / 255.0;
 
 impl Pyramid {
     /// Of an RGB image over its background; NaN where nothing is known. Each level has half the
@@ -97,7 +100,8 @@ impl Pyramid {
         assert_eq!(photograph.channels, 3, "a photograph over its background");
         let size =
             |level: u32| [photograph.width, photograph.height].map(|n| n.div_ceil(1 << level));
-        let is_large = |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= SMALLEST);
+        let is_large =
+            |level: &u32| *level == 0 || size(*level).into_iter().all(|n| n >= LEAST_LEVEL_SIDE);
         let levels = (0..=smaller).take_while(is_large).map(|level| {
             let [width, height] = size(level);
             let shrink = Resampling::new(
@@ -124,7 +128,7 @@ impl PyramidLevel {
             .flat_map(|y| inner(width).map(move |x| (x, y)))
             .filter_map(|(x, y)| telling(image, x, y))
             .collect();
-        let every = all.len().div_ceil(MOST).max(1);
+        let every = all.len().div_ceil(MOST_PIXELS).max(1);
         Self { width, height, telling: all.into_iter().step_by(every).collect() }
     }
 }
@@ -138,7 +142,7 @@ fn telling(image: &Image, x: usize, y: usize) -> Option<Telling> {
     let pixel = Telling { x, y, colour: colour(x, y), gradient };
     let numbers = gradient.as_flattened();
     let is_known = numbers.iter().chain(&pixel.colour).all(|v| v.is_finite());
-    (is_known && numbers.iter().any(|g| g.abs() > STEEP)).then_some(pixel)
+    (is_known && numbers.iter().any(|g| g.abs() > LEAST_SLOPE)).then_some(pixel)
 }
 
 /// How to refine.
@@ -183,7 +187,7 @@ pub fn refine(
     let level = &pyramid.levels[(level as usize).min(pyramid.levels.len() - 1)];
     let start = Equations::of(field, camera, level, options)?;
     let before = start.error;
-    let (mut best, mut equations, mut damping) = (camera.clone(), start, DAMPING);
+    let (mut best, mut equations, mut damping) = (camera.clone(), start, FIRST_DAMPING);
     for _ in 1..options.renderings {
         let Some(motion) = equations.solve(damping) else { break };
         let moved = motion.applied_to(&best);
@@ -198,13 +202,13 @@ pub fn refine(
 }
 
 /// Damping of the first step, as a share of the equations' own diagonal.
-const DAMPING: f64 = 1e-3;
+const FIRST_DAMPING: f64 = 1e-3;
 /// Errors of colours beyond this are outliers: what moved, or was never learnt.
-const HUBER: f64 = 0.1;
+const HUBER_ERROR: f64 = 0.1;
 /// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to
 /// pull from both sides: their inner halves alone would make everything too large, and cameras back
 /// away.
-const THIN: f32 = 0.02;
+const LEAST_OPACITY: f32 = 0.02;
 
 /// Least squares for a small motion of the camera, linear about where it is.
 struct Equations {
@@ -234,7 +238,7 @@ impl Equations {
             .map(|(pixel, seen)| {
                 let distance = if seen.opacity > 0.5 { seen.median_depth } else { seen.depth };
                 let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel).0);
-                (seen.opacity > THIN && depth.is_finite() && depth > 0.0).then_some(depth)
+                (seen.opacity > LEAST_OPACITY && depth.is_finite() && depth > 0.0).then_some(depth)
             })
             .collect();
         let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();
@@ -260,7 +264,8 @@ impl Equations {
                 let [right, down] = pixel.gradient[c].map(|g| f64::from(g * options.exposure[c]));
                 // What is seen would have to move by the opposite of the error over the gradient.
                 let row = [0, 1].map(|part| -(motion[0][part] * right + motion[1][part] * down));
-                let weight = if error.abs() > HUBER { HUBER / error.abs() } else { 1.0 };
+                let weight =
+                    if error.abs() > HUBER_ERROR { HUBER_ERROR / error.abs() } else { 1.0 };
                 sums.matrix.add(weight, row);
                 for (sum, part) in sums.right.iter_mut().zip(row) {
                     *sum += weight * error * part;
@@ -273,7 +278,7 @@ impl Equations {
 
     /// The motion that they ask for; none where they say too little.
     fn solve(&self, damping: f64) -> Option<Motion> {
-        if self.pixels < LEAST || !self.error.is_finite() {
+        if self.pixels < LEAST_PIXELS || !self.error.is_finite() {
             return None;
         }
         let [turn, shift] = self.matrix.damped(damping).solve(self.right)?;
@@ -289,7 +294,7 @@ fn cast(camera: &Camera, [x, y]: [f64; 2], background: f32) -> (scene::CameraRay
 
 fn huber(error: f64) -> f64 {
     let size = error.abs();
-    if size > HUBER { HUBER * (2.0 * size - HUBER) } else { size * size }
+    if size > HUBER_ERROR { HUBER_ERROR * (2.0 * size - HUBER_ERROR) } else { size * size }
 }
 
 /// How far what is seen at an image position moves to the right and down when the camera turns
@@ -358,7 +363,7 @@ pub struct Moved {
 }
 
 /// Poses that are known at all are commonly right to within these.
-const FAR_TURN: f64 = 1.0;
+const FAR_TURN_DEGREES: f64 = 1.0;
 const FAR_PIXELS: f64 = 3.0;
 
 impl Moved {
@@ -383,7 +388,7 @@ impl Moved {
     /// Whether that is farther than given poses are commonly off: by more than 1°, or by more than
     /// 3 pixels of the photographs.
     pub fn is_far(&self) -> bool {
-        self.angle.to_degrees() > FAR_TURN || self.pixels > FAR_PIXELS
+        self.angle.to_degrees() > FAR_TURN_DEGREES || self.pixels > FAR_PIXELS
     }
 }
 

@@ -17,15 +17,15 @@ pub struct Shot<'a> {
 }
 
 /// Photographs that are looked at, at most, spread over all.
-const VIEWS: usize = 64;
+const MOST_VIEWS: usize = 64;
 /// Pixels of each that are looked at, at most, spread over all that tell something.
-const PIXELS: usize = 1024;
+const MOST_PIXELS_PER_VIEW: usize = 1024;
 /// Others that each is compared with: those that were taken from nearest by.
 const NEIGHBOURS: usize = 2;
 /// Of less than this opacity no surface is known.
-const SURFACE: f32 = 0.5;
+const LEAST_OPACITY: f32 = 0.5;
 /// Two distances of one surface differ by at most this share of them.
-const SAME: f64 = 0.02;
+const SAME_DISTANCE_SHARE: f64 = 0.02;
 
 /// Photometric error between photographs of the same surfaces: mean robust error (Huber's, of
 /// colours) between what one shows and what its neighbours show there, where the field says that
@@ -40,7 +40,7 @@ pub fn photometric_error(
     background: f32,
 ) -> Result<Option<f64>, RenderError> {
     let (mut sum, mut count) = (0.0, 0usize);
-    for i in (0..shots.len()).step_by(shots.len().div_ceil(VIEWS).max(1)) {
+    for i in (0..shots.len()).step_by(shots.len().div_ceil(MOST_VIEWS).max(1)) {
         let places = surfaces(field, &shots[i], background)?;
         for other in neighbours(shots, i) {
             for error in errors(field, &places, other, background)? {
@@ -64,14 +64,14 @@ fn surfaces(
     background: f32,
 ) -> Result<Vec<Place>, RenderError> {
     let telling = PyramidLevel::new(shot.photograph).telling;
-    let every = telling.len().div_ceil(PIXELS).max(1);
+    let every = telling.len().div_ceil(MOST_PIXELS_PER_VIEW).max(1);
     let pixels: Vec<_> = telling.into_iter().step_by(every).collect();
     let places = pixels.iter().map(|pixel| [pixel.x as f64 + 0.5, pixel.y as f64 + 0.5]);
     let (lines, rays): (Vec<_>, Vec<_>) =
         places.map(|place| cast(shot.camera, place, background)).unzip();
     let seen = pixels.iter().zip(lines).zip(field.render(&rays)?);
     Ok(seen
-        .filter(|(_, seen)| seen.opacity > SURFACE && seen.median_depth.is_finite())
+        .filter(|(_, seen)| seen.opacity > LEAST_OPACITY && seen.median_depth.is_finite())
         .map(|((pixel, line), seen)| {
             let colour = [0, 1, 2].map(|c| pixel.colour[c] * shot.exposure[c]);
             Place { at: line.at(f64::from(seen.median_depth)), colour }
@@ -104,9 +104,10 @@ fn errors(
     let mut found = Vec::with_capacity(3 * rays.len());
     for ((place, [x, y]), seen) in inside.into_iter().zip(at).zip(field.render(&rays)?) {
         let distance = camera.centre().distance(place.at);
-        let is_same = (f64::from(seen.median_depth) - distance).abs() <= SAME * distance;
+        let is_same =
+            (f64::from(seen.median_depth) - distance).abs() <= SAME_DISTANCE_SHARE * distance;
         let colour = shot.photograph.colour_at([x as f32, y as f32]);
-        if seen.opacity > SURFACE && is_same && colour.iter().all(|v| v.is_finite()) {
+        if seen.opacity > LEAST_OPACITY && is_same && colour.iter().all(|v| v.is_finite()) {
             let error = |c: usize| huber(f64::from(colour[c] * shot.exposure[c] - place.colour[c]));
             found.extend([0, 1, 2].map(error));
         }

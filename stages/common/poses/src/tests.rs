@@ -22,19 +22,20 @@ impl BallAndWall {
     }
 }
 
+fn seen_along(ray: &Ray) -> Pixel {
+    let (origin, direction) = (
+        DVec3::from(ray.origin.map(f64::from)),
+        DVec3::from(ray.direction.map(f64::from)).normalize(),
+    );
+    let distance = BallAndWall::hit(origin, direction);
+    let colour = BallAndWall::paint(origin + distance * direction);
+    let depth = distance as f32;
+    Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
+}
+
 impl RayField for BallAndWall {
     fn render(&self, rays: &[Ray]) -> Result<Vec<Pixel>, RenderError> {
-        let pixel = |ray: &Ray| {
-            let (origin, direction) = (
-                DVec3::from(ray.origin.map(f64::from)),
-                DVec3::from(ray.direction.map(f64::from)).normalize(),
-            );
-            let distance = Self::hit(origin, direction);
-            let colour = Self::paint(origin + distance * direction);
-            let depth = distance as f32;
-            Pixel { colour, premultiplied: colour, opacity: 1.0, depth, median_depth: depth }
-        };
-        Ok(rays.iter().map(pixel).collect())
+        Ok(rays.iter().map(seen_along).collect())
     }
 }
 
@@ -79,17 +80,18 @@ fn photograph(camera: &Camera) -> Image {
     Image::new(width, height, 3, subs.chunks_exact(9).flat_map(mean).collect())
 }
 
+fn distance_at(a: &Camera, b: &Camera, (x, y): (f64, f64)) -> f64 {
+    let ray = a.ray(x, y);
+    let (u, v, _) = b.project(ray.at(BallAndWall::hit(ray.origin, ray.direction))).unwrap();
+    (u - x).hypot(v - y)
+}
+
 /// Mean distance in pixels at which two cameras see the same places.
 fn pixels_apart(a: &Camera, b: &Camera) -> f64 {
     let places: Vec<(f64, f64)> = (0..6)
         .flat_map(|x| (0..5).map(move |y| (4.0 + 11.0 * f64::from(x), 4.0 + 10.0 * f64::from(y))))
         .collect();
-    let distance = |&(x, y): &(f64, f64)| {
-        let ray = a.ray(x, y);
-        let (u, v, _) = b.project(ray.at(BallAndWall::hit(ray.origin, ray.direction))).unwrap();
-        (u - x).hypot(v - y)
-    };
-    places.iter().map(distance).sum::<f64>() / places.len() as f64
+    places.iter().map(|&place| distance_at(a, b, place)).sum::<f64>() / places.len() as f64
 }
 
 fn motion(turn: [f64; 3], shift: [f64; 3]) -> Motion {
@@ -222,6 +224,11 @@ fn motions_are_told() {
     assert_eq!(Moved::between(std::iter::empty()).distance, 0.0);
 }
 
+fn between(list: &[Camera]) -> (DQuat, DVec3) {
+    let (a, b) = (rotation(&list[2]), rotation(&list[5]));
+    (a.inverse() * b, (a.inverse() * (list[5].centre() - list[2].centre())).normalize())
+}
+
 #[test]
 fn common_motion_is_taken_back() {
     let were: Vec<Camera> = (0..7).map(camera).collect();
@@ -238,14 +245,22 @@ fn common_motion_is_taken_back() {
     // What cameras do beside that stays, relative to each other.
     let mut cameras = were.clone();
     cameras[2] = motion([0.02, 0.0, 0.01], [0.1, 0.0, 0.0]).applied_to(&cameras[2]);
-    let between = |list: &[Camera]| {
-        let (a, b) = (rotation(&list[2]), rotation(&list[5]));
-        (a.inverse() * b, (a.inverse() * (list[5].centre() - list[2].centre())).normalize())
-    };
     let expected = between(&cameras);
     take_back_common_motion(&mut cameras, &were);
     let found = between(&cameras);
     assert!(expected.0.angle_between(found.0) < 1e-7 && (expected.1 - found.1).length() < 1e-9);
+}
+
+fn judged(
+    photographs: &[Image],
+    cameras: &[Camera],
+    exposure: &dyn Fn(usize) -> [f32; 3],
+) -> Option<f64> {
+    let shots = cameras.iter().zip(photographs).enumerate();
+    let shots: Vec<Shot> = shots
+        .map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) })
+        .collect();
+    photometric_error(&BallAndWall, &shots, 1.0).unwrap()
 }
 
 /// By the true surfaces the photometric error is small from where photographs were taken, and not
@@ -257,14 +272,7 @@ fn photometric_error_is_least_from_where_photographs_were_taken() {
     photographs[2].data.iter_mut().for_each(|v| *v *= 0.5);
     photographs[3].data[..64 * 3].fill(f32::NAN);
     let exposure = |i: usize| if i == 2 { [2.0; 3] } else { [1.0; 3] };
-    let judged = |cameras: &[Camera], exposure: &dyn Fn(usize) -> [f32; 3]| {
-        let shots = cameras.iter().zip(&photographs).enumerate();
-        let shots: Vec<Shot> = shots
-            .map(|(i, (camera, photograph))| Shot { camera, photograph, exposure: exposure(i) })
-            .collect();
-        photometric_error(&BallAndWall, &shots, 1.0).unwrap()
-    };
-    let right = judged(&cameras, &exposure).unwrap();
+    let right = judged(&photographs, &cameras, &exposure).unwrap();
     assert!(right < 3e-4, "{right}");
     let off: Vec<Camera> = (0..6)
         .map(|i| {
@@ -272,9 +280,9 @@ fn photometric_error_is_least_from_where_photographs_were_taken() {
                 .applied_to(&cameras[i])
         })
         .collect();
-    let wrong = judged(&off, &exposure).unwrap();
+    let wrong = judged(&photographs, &off, &exposure).unwrap();
     assert!(wrong > 5.0 * right, "{wrong} {right}");
-    assert!(judged(&cameras, &|_| [1.0; 3]).unwrap() > 5.0 * right);
+    assert!(judged(&photographs, &cameras, &|_| [1.0; 3]).unwrap() > 5.0 * right);
     // One alone has none to be compared with.
-    assert_eq!(judged(&cameras[..1], &exposure), None);
+    assert_eq!(judged(&photographs, &cameras[..1], &exposure), None);
 }

@@ -6,7 +6,7 @@ use crate::view::{KnownView, Rendered};
 use crate::warped_pixel::WarpedPixel;
 
 /// Pixels that a reference is moved at most.
-const FARTHEST: f64 = 2.0;
+const MOST_SHIFT_PIXELS: f64 = 2.0;
 
 /// What a reference shows of rows from one on, each pixel from where what lies around it fits what
 /// is rendered: one step of Lucas and Kanade (1981) from where geometry puts it, held back by the
@@ -80,7 +80,7 @@ impl WarpedRows<'_> {
         if !length.is_finite() || length == 0.0 {
             return *own;
         }
-        let share = (FARTHEST / length).min(1.0);
+        let share = (MOST_SHIFT_PIXELS / length).min(1.0);
         let across =
             step((x > 0).then(|| &warped[i - 1]), own, (x + 1 < width).then(|| &warped[i + 1]));
         let down =

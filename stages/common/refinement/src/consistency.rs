@@ -13,7 +13,7 @@ pub struct LrObservations<'a> {
 }
 
 /// LR pixels that the nearest image looks at on each side.
-const REACH: usize = 12;
+const INVERSE_REACH: usize = 12;
 
 impl<'a> LrObservations<'a> {
     /// Those of a scene's training views, with the kernel that made them.
@@ -70,7 +70,7 @@ impl<'a> LrObservations<'a> {
         }
         let share =
             (refined.width * refined.height) as f32 / (photograph.width * photograph.height) as f32;
-        let mut moved = kernel.inverse(REACH).adjoint(&residual);
+        let mut moved = kernel.inverse(INVERSE_REACH).adjoint(&residual);
         for (m, r) in moved.data.iter_mut().zip(&refined.data) {
             *m = (share * *m + r).clamp(0.0, 1.0);
         }
@@ -82,6 +82,17 @@ impl<'a> LrObservations<'a> {
 mod tests {
     use super::*;
 
+    fn level(hr_width: usize, i: usize, c: usize) -> f32 {
+        0.5 + 0.3
+            * ((i % hr_width * (c + 3)) as f32 * 0.08).sin()
+            * ((i / hr_width) as f32 * 0.21).cos()
+    }
+
+    fn error(a: &Image, b: &Image) -> f64 {
+        let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
+        (squares.sum::<f64>() / a.data.len() as f64).sqrt()
+    }
+
     #[test]
     fn what_is_consistent_stays_and_what_is_not_is_moved() {
         for (filter, hr_width, lr_width) in
@@ -89,13 +100,9 @@ mod tests {
         {
             let hr_size = (hr_width, hr_width * 2 / 3);
             let lr_size = (lr_width, lr_width * 2 / 3);
-            let level = |i: usize, c: usize| {
-                0.5 + 0.3
-                    * ((i % hr_width * (c + 3)) as f32 * 0.08).sin()
-                    * ((i / hr_width) as f32 * 0.21).cos()
-            };
-            let data =
-                (0..hr_size.0 * hr_size.1).flat_map(|i| [0, 1, 2].map(|c| level(i, c))).collect();
+            let data = (0..hr_size.0 * hr_size.1)
+                .flat_map(|i| [0, 1, 2].map(|c| level(hr_width, i, c)))
+                .collect();
             let truth = Image::new(hr_size.0, hr_size.1, 3, data);
             let kernel = Resampling::new(filter, hr_size, lr_size);
             let lr = Photograph::from(kernel.apply(&truth));
@@ -103,10 +110,6 @@ mod tests {
             let folder = tempfile::tempdir().unwrap();
             let input = GivenInput::open("photographs", folder.path()).unwrap();
             let observations = LrObservations { input: &input, views, filter };
-            let error = |a: &Image, b: &Image| {
-                let squares = a.data.iter().zip(&b.data).map(|(a, b)| f64::from(a - b).powi(2));
-                (squares.sum::<f64>() / a.data.len() as f64).sqrt()
-            };
             assert!(error(&observations.project(&truth, &lr), &truth) < 1e-5, "{filter:?}");
             let softer = Image {
                 data: truth.data.iter().map(|v| 0.45 + 0.2 * (v - 0.5)).collect(),

@@ -86,9 +86,11 @@ pub struct Refiner {
 
 /// Pixels along a tile's side: with what a network sees around it small enough for the cache, large
 /// enough that little is seen twice.
-const TILE: usize = 128;
-/// Most channels, and most blocks, of a network that is read.
-const MOST: u32 = 4096;
+const TILE_SIDE: usize = 128;
+/// Most channels of a network that is read.
+const MOST_CHANNELS: u32 = 4096;
+/// Most blocks of a network that is read.
+const MOST_BLOCKS: u32 = 4096;
 /// Purpose of draws.
 const WEIGHTS: u64 = 300;
 
@@ -120,7 +122,7 @@ impl Refiner {
     pub fn read(path: &Path, architecture: RefinerArchitecture) -> Result<Self, RefinementError> {
         let RefinerArchitecture { channels, blocks, .. } = architecture;
         // Before anything is made of such numbers.
-        if !(1..=MOST).contains(&channels) || blocks > MOST {
+        if !(1..=MOST_CHANNELS).contains(&channels) || blocks > MOST_BLOCKS {
             return Err(RefinementError::Architecture { channels, blocks });
         }
         let weights = nets::Weights::read(path)?;
@@ -195,15 +197,15 @@ impl Refiner {
         let turns = &Turn::ALL[..(turns as usize).clamp(1, Turn::ALL.len())];
         let (width, height) = (view.width, view.height);
         let tiles: Vec<(usize, usize, Self)> = (0..height)
-            .step_by(TILE)
-            .flat_map(|y| (0..width).step_by(TILE).map(move |x| (x, y)))
+            .step_by(TILE_SIDE)
+            .flat_map(|y| (0..width).step_by(TILE_SIDE).map(move |x| (x, y)))
             .map(|(x, y)| (x, y, self.share()))
             .collect();
         let refined: Vec<(Square, Vec<f32>)> = tiles
             .into_par_iter()
             .map(|(x, y, refiner)| -> Result<_, TchError> {
                 let side =
-                    |from: usize, size: usize| (size - from).min(TILE).next_multiple_of(FOLD);
+                    |from: usize, size: usize| (size - from).min(TILE_SIDE).next_multiple_of(FOLD);
                 let square = Square {
                     x: x as isize,
                     y: y as isize,
@@ -349,6 +351,10 @@ mod tests {
         }
     }
 
+    fn added_to(refiner: &Refiner, view: &Image) -> Vec<f32> {
+        refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap()
+    }
+
     /// Internal learning from little pushes features below 0 everywhere. What the network adds must
     /// still follow what it sees, or it would never learn again.
     #[test]
@@ -357,12 +363,26 @@ mod tests {
         let mut refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         refiner.parameters[1] = Tensor::from_slice(&[-10f32; 6]);
         let (dark, view) = (Image::new(16, 16, INPUTS, vec![0.0; 16 * 16 * INPUTS]), image(16, 16));
-        let added = |view: &Image| {
-            refiner.added(view, Square { x: 4, y: 4, size: (8, 8) }, &Turn::ALL[..1]).unwrap()
-        };
-        let apart =
-            added(&dark).iter().zip(added(&view)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        let apart = added_to(&refiner, &dark)
+            .iter()
+            .zip(added_to(&refiner, &view))
+            .map(|(a, b)| (a - b).abs())
+            .fold(0.0, f32::max);
         assert!(apart > 0.01, "{apart}");
+    }
+
+    fn mirrored(p: &Image) -> Image {
+        let data = p
+            .data
+            .chunks_exact(p.width * p.channels)
+            .flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
+        Image::new(p.width, p.height, p.channels, data.collect())
+    }
+
+    fn apart_by(refiner: &Refiner, view: &Image, turns: u32) -> f32 {
+        let straight = mirrored(&refiner.refine_by(view, 1.0, turns).unwrap());
+        let turned = refiner.refine_by(&mirrored(view), 1.0, turns).unwrap();
+        straight.data.iter().zip(&turned.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
     }
 
     /// Asked in all eight ways, a network treats a turned view as it treats the view itself.
@@ -371,20 +391,8 @@ mod tests {
         nets::deterministic();
         let refiner = random(RefinerArchitecture { channels: 6, blocks: 1, guidance: None });
         let view = image(150, 10);
-        let mirrored = |p: &Image| {
-            let data = p
-                .data
-                .chunks_exact(p.width * p.channels)
-                .flat_map(|row| row.chunks_exact(p.channels).rev().flatten().copied());
-            Image::new(p.width, p.height, p.channels, data.collect())
-        };
-        let apart = |turns: u32| {
-            let straight = mirrored(&refiner.refine_by(&view, 1.0, turns).unwrap());
-            let turned = refiner.refine_by(&mirrored(&view), 1.0, turns).unwrap();
-            straight.data.iter().zip(&turned.data).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
-        };
-        assert!(apart(8) < 1e-5, "{}", apart(8));
-        assert!(apart(1) > 0.01, "{}", apart(1));
+        assert!(apart_by(&refiner, &view, 8) < 1e-5, "{}", apart_by(&refiner, &view, 8));
+        assert!(apart_by(&refiner, &view, 1) > 0.01, "{}", apart_by(&refiner, &view, 1));
     }
 
     #[test]

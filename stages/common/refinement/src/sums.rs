@@ -1,6 +1,6 @@
 /// Pixels to each side over which what is shown is compared with what is rendered: in their mean
 /// the detail that rendering lacks evens out.
-pub(crate) const AROUND: usize = 5;
+pub(crate) const COMPARED_RADIUS: usize = 5;
 
 /// Sums of numbers that pixels have, over all that lies above and to the left of each.
 pub(crate) struct Sums<const N: usize> {
@@ -28,8 +28,10 @@ impl<const N: usize> Sums<N> {
 
     /// Over the pixels around one, as many as there are.
     pub(crate) fn around(&self, x: usize, y: usize) -> [f64; N] {
-        let (left, right) = (x.saturating_sub(AROUND), (x + AROUND + 1).min(self.width));
-        let (top, bottom) = (y.saturating_sub(AROUND), (y + AROUND + 1).min(self.height));
+        let (left, right) =
+            (x.saturating_sub(COMPARED_RADIUS), (x + COMPARED_RADIUS + 1).min(self.width));
+        let (top, bottom) =
+            (y.saturating_sub(COMPARED_RADIUS), (y + COMPARED_RADIUS + 1).min(self.height));
         let at = |x: usize, y: usize, i: usize| self.sums[y * (self.width + 1) + x][i];
         std::array::from_fn(|i| {
             at(right, bottom, i) - at(left, bottom, i) - at(right, top, i) + at(left, top, i)
@@ -47,7 +49,7 @@ mod tests {
         let value = |i: usize| [(i * i % 29) as f64, 1.0];
         let sums = Sums::new(width, &(0..width * height).map(value).collect::<Vec<_>>());
         for (x, y) in [(0, 0), (8, 6), (16, 12), (3, 12)] {
-            let near = |a: usize, b: usize| a.abs_diff(b) <= AROUND;
+            let near = |a: usize, b: usize| a.abs_diff(b) <= COMPARED_RADIUS;
             let pixels = (0..width * height).filter(|i| near(i % width, x) && near(i / width, y));
             let expected =
                 pixels.map(value).fold([0.0; 2], |sum, v| [sum[0] + v[0], sum[1] + v[1]]);

@@ -74,8 +74,8 @@ impl Pool {
         guidance: Guidance,
         examples: &[KnownView],
     ) -> Self {
-        let view = |i: u64| drawn_view(round * POOL + i, options, guidance, examples);
-        Self { round, views: (0..POOL).map(view).collect() }
+        let view = |i: u64| drawn_view(round * POOL_VIEWS + i, options, guidance, examples);
+        Self { round, views: (0..POOL_VIEWS).map(view).collect() }
     }
 }
 
@@ -90,7 +90,7 @@ fn drawn_view(
     let mut draw = || rng.below(examples.len() as u64) as usize;
     let (chosen, drawn): (usize, Vec<usize>) =
         (draw(), (0..options.references).map(|_| draw()).collect());
-    let alone = rng.below(ALONE) == 0;
+    let alone = rng.below(NO_REFERENCE_EVERY) == 0;
     // A view is no reference for itself.
     let others: Vec<&KnownView> = drawn
         .iter()
@@ -103,17 +103,17 @@ fn drawn_view(
 /// Shards of a step: fixed, so that sums have one order at any thread count.
 const SHARDS: usize = 8;
 /// Steps over which the rate rises.
-const WARM_UP: u64 = 50;
+const WARM_UP_STEPS: u64 = 50;
 /// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach
 /// nothing.
-const CONTRAST: f32 = 0.08;
-const REDRAWS: usize = 8;
+const LEAST_CONTRAST: f32 = 0.08;
+const MOST_REDRAWS: usize = 8;
 /// A reference-based network gets no reference once in so many times, so that it can do without.
-const ALONE: u64 = 8;
+const NO_REFERENCE_EVERY: u64 = 8;
 /// Views that squares are drawn from at a time where there are references, and steps until they are
 /// drawn anew.
-const POOL: u64 = 32;
-const ROUND: u64 = 200;
+const POOL_VIEWS: u64 = 32;
+const POOL_STEPS: u64 = 200;
 /// Purposes of draws.
 const SQUARES: u64 = 301;
 const SCORES: u64 = 302;
@@ -208,7 +208,7 @@ impl RefinerTrainer {
 
     /// Draws references for examples anew, where the network takes some and a round begins.
     fn condition(&mut self, examples: &[KnownView]) {
-        let round = self.steps() / ROUND;
+        let round = self.steps() / POOL_STEPS;
         if let Some(guidance) = self.refiner.architecture().guidance
             && self.pool.as_ref().is_none_or(|pool| pool.round != round)
         {
@@ -254,7 +254,7 @@ impl Training for RefinerTrainer {
         if !loss.is_finite() || !nets::all_finite(&gradients)? {
             return Err(RefinementError::NotFinite { step });
         }
-        let warm = ((step + 1) as f64 / WARM_UP as f64).min(1.0);
+        let warm = ((step + 1) as f64 / WARM_UP_STEPS as f64).min(1.0);
         let cosine = 0.5 * (1.0 + (std::f64::consts::PI * step as f64 / steps as f64).cos());
         self.adam.step(self.refiner.parameters(), &gradients, rate * warm * cosine)?;
         Ok(Some(loss))
@@ -335,8 +335,8 @@ impl<'a> TrainingSquare<'a> {
     fn new(options: &RefinerTraining, number: u64, subjects: &[Subject<'a>]) -> Self {
         let mut rng = CounterRng::new(options.seed, SQUARES, number);
         let mut placed = place(subjects, options.square, &mut rng);
-        for _ in 0..REDRAWS {
-            if contrast(placed.0.truth, placed.1) >= CONTRAST {
+        for _ in 0..MOST_REDRAWS {
+            if contrast(placed.0.truth, placed.1) >= LEAST_CONTRAST {
                 break;
             }
             placed = place(subjects, options.square, &mut rng);
@@ -409,17 +409,20 @@ mod tests {
     use super::*;
     use crate::{RefinerArchitecture, Rendered};
 
+    fn level(phase: usize, i: usize, blur: bool) -> f32 {
+        let at = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };
+        let x = i % 32 + 1;
+        if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
+    }
+
     /// Stripes, and the same blurred by a pixel.
     fn example(phase: usize) -> KnownView {
-        let level = |i: usize, blur: bool| {
-            let at = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };
-            let x = i % 32 + 1;
-            if blur { (at(x - 1) + at(x) + at(x + 1)) / 3.0 } else { at(x) }
-        };
         let view = (0..32 * 32)
-            .flat_map(|i| [level(i, true), level(i, true), level(i, true), 1.0])
+            .flat_map(|i| {
+                [level(phase, i, true), level(phase, i, true), level(phase, i, true), 1.0]
+            })
             .collect();
-        let truth = (0..32 * 32).flat_map(|i| [level(i, false); 3]).collect();
+        let truth = (0..32 * 32).flat_map(|i| [level(phase, i, false); 3]).collect();
         let camera = Camera {
             name: phase.to_string(),
             intrinsics: Intrinsics {

@@ -122,13 +122,13 @@ impl KnownView {
 
 /// Pixels along the sides of blocks whose means are compared: in those, what a field lacks in
 /// detail evens out.
-const BLOCK: usize = 8;
+const BLOCK_SIDE: usize = 8;
 
 impl KnownView {
     /// The exposure of the true image against the rendered view, which has the exposure of the
     /// images that the field learnt from. None where too little says what it is.
     pub fn exposure(&self) -> Option<Exposure> {
-        Exposure::between(&self.rendered.view, &self.truth, BLOCK)
+        Exposure::between(&self.rendered.view, &self.truth, BLOCK_SIDE)
     }
 
     /// The same view with a true image as the rendered one's exposure would have made it.

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use crate::align::align;
 use crate::channels::{INPUTS, REFERENCE_INPUTS};
 use crate::guidance::Guidance;
-use crate::sums::{AROUND, Sums};
+use crate::sums::{COMPARED_RADIUS, Sums};
 use crate::view::{KnownView, Rendered};
 use crate::warped_pixel::WarpedPixel;
 
@@ -66,8 +66,8 @@ pub struct ConditionedView {
 
 /// A mean difference that halves the confidence, twice; and how far, in pixels, a reference may
 /// jump between neighbours before it does.
-const DIFFERENT: f32 = 0.1;
-const JUMP: f32 = 1.0;
+const HALVING_DIFFERENCE: f32 = 0.1;
+const HALVING_JUMP: f32 = 1.0;
 
 impl ReferenceFeatures {
     /// What references know of rows.
@@ -122,7 +122,7 @@ fn warp(
 ) -> Vec<WarpedPixel> {
     let (width, height) = (rendered.view.width, rendered.view.height);
     // What is looked at around a pixel was itself moved by what lies around it.
-    let around = if guidance.alignment { 2 * AROUND } else { AROUND };
+    let around = if guidance.alignment { 2 * COMPARED_RADIUS } else { COMPARED_RADIUS };
     let near = rows.start.saturating_sub(around)..(rows.end + around).min(height);
     let mut warped = shown(rendered, reference, near.clone(), guidance.occlusion);
     if guidance.alignment {
@@ -139,9 +139,10 @@ fn warp(
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
-                let apart = mean_difference(&sums, x, y) / DIFFERENT;
+                let apart = mean_difference(&sums, x, y) / HALVING_DIFFERENCE;
                 let jumped = neighbours.jumped(x, y);
-                own.confidence *= (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (JUMP * JUMP));
+                own.confidence *=
+                    (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (HALVING_JUMP * HALVING_JUMP));
             }
             all.push(own);
         }
@@ -220,9 +221,10 @@ pub fn with_references(
 ) -> ConditionedView {
     let (width, height) = (rendered.view.width, rendered.view.height);
     let mut data = vec![0.0; width * height * REFERENCE_INPUTS];
-    let bands = data.par_chunks_mut(width * BAND * REFERENCE_INPUTS).enumerate();
-    let uses: Vec<Vec<Use>> =
-        bands.map(|(i, out)| condition(out, i * BAND, rendered, references, guidance)).collect();
+    let bands = data.par_chunks_mut(width * BAND_ROWS * REFERENCE_INPUTS).enumerate();
+    let uses: Vec<Vec<Use>> = bands
+        .map(|(i, out)| condition(out, i * BAND_ROWS, rendered, references, guidance))
+        .collect();
     let mut sums = vec![Use::default(); references.len()];
     uses.iter()
         .for_each(|band| sums.iter_mut().zip(band).for_each(|(sum, of_use)| sum.add(of_use)));
@@ -238,7 +240,7 @@ fn condition(
     guidance: Guidance,
 ) -> Vec<Use> {
     let Image { width, height, .. } = rendered.view;
-    let rows = first..(first + BAND).min(height);
+    let rows = first..(first + BAND_ROWS).min(height);
     let features = ReferenceFeatures::new(rendered, references, rows.clone(), guidance);
     let pixels =
         rendered.view.data[rows.start * width * INPUTS..].chunks_exact(INPUTS).zip(&features.known);
@@ -250,7 +252,7 @@ fn condition(
 }
 
 /// Rows of a view that are looked at together: memory is bounded, whatever its size.
-const BAND: usize = 32;
+const BAND_ROWS: usize = 32;
 
 #[cfg(test)]
 mod tests {
@@ -262,20 +264,25 @@ mod tests {
     const WIDTH: usize = 96;
     const HEIGHT: usize = 48;
 
+    fn level(right: usize, x: isize, y: isize, c: u64) -> f32 {
+        let patch = (x + right as isize).div_euclid(6) * 1000 + y.div_euclid(6);
+        0.2 + 0.6 * uniform(4, c, patch as u64)
+    }
+
+    fn blurred(right: usize, x: isize, y: isize, c: u64) -> f32 {
+        (-1..=1).map(|i| level(right, x + i, y - i, c) + level(right, x + i, y + i, c)).sum::<f32>()
+            / 6.0
+    }
+
     /// A wall at distance 2 with patches of six pixels, as it is and blurred, from a camera so many
     /// pixels to the right; `depth` is what the field believes.
     fn wall(right: usize, depth: impl Fn(usize) -> f32) -> KnownView {
-        let level = |x: isize, y: isize, c: u64| {
-            let patch = (x + right as isize).div_euclid(6) * 1000 + y.div_euclid(6);
-            0.2 + 0.6 * uniform(4, c, patch as u64)
-        };
         let pixels = || (0..HEIGHT as isize).flat_map(|y| (0..WIDTH as isize).map(move |x| (x, y)));
-        let truth = pixels().flat_map(|(x, y)| [0, 1, 2].map(|c| level(x, y, c))).collect();
-        let blurred = |x: isize, y: isize, c: u64| {
-            (-1..=1).map(|i| level(x + i, y - i, c) + level(x + i, y + i, c)).sum::<f32>() / 6.0
-        };
+        let truth = pixels().flat_map(|(x, y)| [0, 1, 2].map(|c| level(right, x, y, c))).collect();
         let view = pixels()
-            .flat_map(|(x, y)| [blurred(x, y, 0), blurred(x, y, 1), blurred(x, y, 2), 1.0])
+            .flat_map(|(x, y)| {
+                [blurred(right, x, y, 0), blurred(right, x, y, 1), blurred(right, x, y, 2), 1.0]
+            })
             .collect();
         let camera = Camera {
             name: right.to_string(),
@@ -348,19 +355,25 @@ mod tests {
         assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
     }
 
+    fn off(depth: f32, alignment: bool) -> f64 {
+        let guidance = Guidance { alignment, ..Guidance::default() };
+        judged(&wall(0, |_| depth), &wall(24, |_| depth), guidance).2
+    }
+
     /// Depths a little off put what a reference shows a pixel and more to the side: it is moved
     /// back; where depths are right it stays.
     #[test]
     fn alignment_moves_what_is_shown_to_where_it_fits() {
-        let off = |depth: f32, alignment: bool| {
-            let guidance = Guidance { alignment, ..Guidance::default() };
-            judged(&wall(0, |_| depth), &wall(24, |_| depth), guidance).2
-        };
         for depth in [1.9, 2.1] {
             let (moved, was) = (off(depth, true), off(depth, false));
             assert!(moved < 0.7 * was, "depth {depth}: {moved} off where it was {was}");
         }
         assert!(off(2.0, true) < 0.01, "{}", off(2.0, true));
+    }
+
+    fn seen(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {
+        let guidance = Guidance { occlusion, ..Guidance::default() };
+        with_references(&view.rendered, &[reference], guidance).uses[0].seen
     }
 
     /// What something stands before is shown only by references that needn't see it.
@@ -370,11 +383,8 @@ mod tests {
         let plate =
             |i: usize| if (WIDTH / 3..2 * WIDTH / 3).contains(&(i % WIDTH)) { 1.0 } else { 2.0 };
         let (view, reference) = (wall(0, |_| 2.0), wall(24, plate));
-        let seen = |occlusion: bool| {
-            let guidance = Guidance { occlusion, ..Guidance::default() };
-            with_references(&view.rendered, &[&reference], guidance).uses[0].seen
-        };
-        let hidden = (seen(false) - seen(true)) as f64 / (WIDTH * HEIGHT) as f64;
+        let hidden = (seen(&view, &reference, false) - seen(&view, &reference, true)) as f64
+            / (WIDTH * HEIGHT) as f64;
         assert!((0.28..0.36).contains(&hidden), "{hidden} of the view is hidden");
     }
 

@@ -2,54 +2,9 @@ use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Distortion, Pose};
-
-/// A camera's inside, in pixels: a pinhole, and how its lens isn't one.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Intrinsics {
-    /// Columns.
-    pub width: u32,
-    /// Rows.
-    pub height: u32,
-    /// Focal length along x.
-    pub fx: f64,
-    /// Focal length along y.
-    pub fy: f64,
-    /// Principal point, x; the image's left edge is 0.
-    pub cx: f64,
-    /// Principal point, y; the image's top edge is 0.
-    pub cy: f64,
-    /// The lens's distortion; without it a pinhole.
-    #[serde(default, skip_serializing_if = "Distortion::is_none")]
-    pub distortion: Distortion,
-}
-
-impl Intrinsics {
-    /// A centred camera with square pixels that sees `angle_x` radians from left to right edge.
-    pub fn from_angle_x(width: u32, height: u32, angle_x: f64) -> Self {
-        let focal = 0.5 * f64::from(width) / (0.5 * angle_x).tan();
-        let (cx, cy) = (0.5 * f64::from(width), 0.5 * f64::from(height));
-        Self { width, height, fx: focal, fy: focal, cx, cy, distortion: Distortion::default() }
-    }
-
-    /// The same camera with another number of pixels on the same sensor. The scale may differ per
-    /// axis.
-    #[must_use]
-    pub fn resized(&self, width: u32, height: u32) -> Self {
-        let (sx, sy) =
-            (f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
-        Self {
-            width,
-            height,
-            fx: self.fx * sx,
-            fy: self.fy * sy,
-            cx: self.cx * sx,
-            cy: self.cy * sy,
-            ..*self
-        }
-    }
-}
+use crate::intrinsics::Intrinsics;
+use crate::lens::Distortion;
+use crate::pose::Pose;
 
 /// A camera: intrinsics and pose.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -136,8 +91,8 @@ pub enum CameraError {
     },
     /// A place that no scene reaches to.
     #[error(
-        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than {FARTHEST:e}; is \
-        the pose right, and its unit?",
+        "the camera's centre ({:e}, {:e}, {:e}) is farther from the origin than \
+        {FARTHEST_CENTRE:e}; is the pose right, and its unit?",
         .0[0], .0[1], .0[2]
     )]
     FarAway([f64; 3]),
@@ -163,15 +118,15 @@ pub enum CameraError {
 
 /// Scene units from the origin beyond which there are no cameras: f32, by which rays are cast,
 /// tells no neighbours apart there.
-const FARTHEST: f64 = 1e9;
+const FARTHEST_CENTRE: f64 = 1e9;
 
 /// Cameras that turn at most so far from their mean direction look one way: cos 45°.
-const ONE_WAY: f64 = 0.707;
+const ONE_WAY_COSINE: f64 = 0.707;
 
 /// The direction in which all cameras look, where they do: forward-facing photographs.
 pub fn common_direction<'a>(cameras: impl Iterator<Item = &'a Camera> + Clone) -> Option<DVec3> {
     let mean = cameras.clone().map(Camera::forward).sum::<DVec3>().try_normalize()?;
-    cameras.map(Camera::forward).all(|forward| forward.dot(mean) >= ONE_WAY).then_some(mean)
+    cameras.map(Camera::forward).all(|forward| forward.dot(mean) >= ONE_WAY_COSINE).then_some(mean)
 }
 
 impl Camera {
@@ -282,7 +237,7 @@ impl Camera {
             return Err(CameraError::Mirrored { determinant });
         }
         let centre = self.centre();
-        if centre.length() > FARTHEST {
+        if centre.length() > FARTHEST_CENTRE {
             Err(CameraError::FarAway(centre.to_array()))
         } else {
             Ok(())
@@ -308,7 +263,7 @@ mod tests {
                 cy: 12.5,
                 distortion: Distortion::default(),
             },
-            camera_to_world: crate::pose_of(r, centre),
+            camera_to_world: crate::pose::pose_of(r, centre),
         }
     }
 

@@ -21,14 +21,17 @@
 //! ```
 //! use scene::{Camera, Intrinsics};
 //! let intrinsics = Intrinsics::from_angle_x(200, 200, 0.69);
-//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world: [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]] };
+//! let camera_to_world = [[1., 0., 0., 0.], [0., 1., 0., 0.], [0., 0., 1., 4.]];
+//! let camera = Camera { name: "r_0".into(), intrinsics, camera_to_world };
 //! let ray = camera.ray(100.0, 100.0);
 //! assert_eq!(ray.direction, glam::DVec3::NEG_Z);
 //! let (x, y, depth) = camera.project(ray.at(3.0)).unwrap();
 //! assert_eq!((x, y, depth), (100.0, 100.0, 3.0));
 //! ```
 
+mod bounds;
 mod camera;
+mod intrinsics;
 mod lens;
 mod pose;
 mod space;
@@ -36,10 +39,12 @@ mod view_image;
 mod views;
 mod warp;
 
-pub use camera::{Camera, CameraError, CameraRay, CameraRays, Intrinsics, common_direction};
+pub use bounds::Bounds;
+pub use camera::{Camera, CameraError, CameraRay, CameraRays, common_direction};
+pub use intrinsics::Intrinsics;
 pub use lens::Distortion;
 pub use pose::{Pose, looking_at, pose_of};
 pub use space::{Frustum, Space};
 pub use view_image::{VIEW_CHANNELS, image_file, mask_file, preview_file, write_view_image};
-pub use views::{Background, Bounds, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
+pub use views::{Background, Conventions, Photograph, VIEWS_FILE, View, Views, ViewsError};
 pub use warp::{Surface, Visibility};

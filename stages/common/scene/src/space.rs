@@ -2,7 +2,7 @@ use glam::{DMat3, DVec3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::{Bounds, Pose};
+use crate::pose::Pose;
 
 /// How a field sees the world: what it keeps in its unit cube.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -80,22 +80,5 @@ impl Frustum {
         let depth = 1.0 / (1.0 / self.near - place.z * (1.0 / self.near - 1.0 / self.far));
         let [x, y] = [0, 1].map(|i| (place[i] * side + self.min[i]) * depth);
         self.column(3) + x * self.column(0) + y * self.column(1) - depth * self.column(2)
-    }
-}
-
-impl Bounds {
-    /// A world point's place in the unit cube that a field keeps.
-    pub fn to_cube(&self, point: DVec3) -> DVec3 {
-        match &self.space {
-            Space::Box => (point - DVec3::from(self.min)) / self.longest_side(),
-            Space::Ndc(frustum) => frustum.to_cube(frustum.to_camera(point)),
-            Space::Contraction => {
-                let centre = 0.5 * (DVec3::from(self.min) + DVec3::from(self.max));
-                let u = (point - centre) / (0.5 * self.longest_side());
-                let length = u.length();
-                let inside = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
-                0.25 * inside * u + 0.5
-            }
-        }
     }
 }

@@ -13,7 +13,7 @@ pub fn preview_file(name: &str) -> String {
     format!("previews/{name}.png")
 }
 
-/// Path of a view's [mask](View::mask): PNG.
+/// Path of a view's [mask](crate::View::mask): PNG.
 pub fn mask_file(name: &str) -> String {
     format!("masks/{name}.png")
 }

@@ -6,8 +6,8 @@ use pixels::{Image, Mask, PixelError, read_png, read_premultiplied};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::bounds::Bounds;
 use crate::camera::{Camera, CameraError};
-use crate::space::Space;
 
 /// Name of the file in every folder of views.
 pub const VIEWS_FILE: &str = "views.json";
@@ -172,41 +172,6 @@ impl Background {
     }
 }
 
-/// An axis-aligned box around the scene, the range of distances along rays at which it lies, and
-/// how a field sees it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Bounds {
-    /// Smallest corner.
-    pub min: [f64; 3],
-    /// Largest corner.
-    pub max: [f64; 3],
-    /// Distance before which there is nothing.
-    pub near: f64,
-    /// Distance behind which there is nothing.
-    pub far: f64,
-    /// What a field keeps in its unit cube.
-    #[serde(default)]
-    pub space: Space,
-}
-
-impl Bounds {
-    /// Whether box, range and space have an inside, all numbers finite.
-    pub fn is_valid(&self) -> bool {
-        let finite =
-            self.min.iter().chain(&self.max).chain([&self.near, &self.far]).all(|x| x.is_finite());
-        let inside =
-            (0..3).all(|i| self.min[i] < self.max[i]) && 0.0 <= self.near && self.near < self.far;
-        let space = if let Space::Ndc(frustum) = &self.space { frustum.is_valid() } else { true };
-        finite && inside && space
-    }
-
-    /// Length of the longest side.
-    pub fn longest_side(&self) -> f64 {
-        (0..3).map(|i| self.max[i] - self.min[i]).fold(f64::MIN_POSITIVE, f64::max)
-    }
-}
-
 /// A `views.json` that can't be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewsError {
@@ -317,7 +282,8 @@ fn check_path(path: &str) -> Result<(), ViewsError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Intrinsics;
+    use crate::intrinsics::Intrinsics;
+    use crate::space::Space;
 
     fn views() -> Views {
         let camera = Camera {

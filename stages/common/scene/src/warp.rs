@@ -25,10 +25,10 @@ pub struct Visibility {
 }
 
 /// Two depths of one surface differ by at most this share of them,
-const SAME: f64 = 0.02;
+const SAME_DEPTH_SHARE: f64 = 0.02;
 /// or what one view sees at the other's depth it sees in the same pixel, at most so many pixels
 /// away: of a far wall views from nearly one place tell depth badly, and it matters as little.
-const SAME_PLACE: f64 = 0.5;
+const SAME_PLACE_PIXELS: f64 = 0.5;
 
 impl Surface<'_> {
     /// Where another view sees what this one sees at each pixel, row by row:
@@ -118,11 +118,11 @@ fn around(v: f64, size: usize) -> [usize; 2] {
 }
 
 fn is_near(own: f64, depth: f64) -> bool {
-    (own - depth).abs() <= SAME * depth
+    (own - depth).abs() <= SAME_DEPTH_SHARE * depth
 }
 
 fn sees_at(camera: &Camera, point: DVec3, [x, y]: [f64; 2]) -> bool {
-    camera.project(point).is_some_and(|(u, v, _)| (u - x).hypot(v - y) <= SAME_PLACE)
+    camera.project(point).is_some_and(|(u, v, _)| (u - x).hypot(v - y) <= SAME_PLACE_PIXELS)
 }
 
 #[cfg(test)]
@@ -130,14 +130,14 @@ mod tests {
     use glam::{DMat3, DVec3};
 
     use super::*;
-    use crate::Intrinsics;
+    use crate::intrinsics::Intrinsics;
 
     fn camera(centre: DVec3, turn: f64) -> Camera {
         let r = DMat3::from_axis_angle(DVec3::Y, turn);
         Camera {
             name: "c".into(),
             intrinsics: Intrinsics::from_angle_x(64, 48, 0.9),
-            camera_to_world: crate::pose_of(r, centre),
+            camera_to_world: crate::pose::pose_of(r, centre),
         }
     }
 
@@ -207,29 +207,34 @@ mod tests {
         );
     }
 
+    /// Pixels that a camera so far aside sees, too, where its depth is off by a factor.
+    fn seen_from_beside(baseline: f64, off: f32) -> usize {
+        let opacity = vec![1.0; 64 * 48];
+        let a = camera(DVec3::new(0.0, 0.0, 4.0), 0.0);
+        let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
+        let (da, db): (Vec<f32>, Vec<f32>) =
+            (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
+        let other = Surface { camera: &b, depth: &db, opacity: &opacity };
+        Surface { camera: &a, depth: &da, opacity: &opacity }
+            .seen_from(&other)
+            .iter()
+            .flatten()
+            .count()
+    }
+
     /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place:
     /// then it is seen in the same pixel.
     #[test]
     fn depth_matters_as_far_as_it_moves_what_is_seen() {
-        let opacity = vec![1.0; 64 * 48];
-        let a = camera(DVec3::new(0.0, 0.0, 4.0), 0.0);
-        let seen = |baseline: f64, off: f32| {
-            let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
-            let (da, db): (Vec<f32>, Vec<f32>) =
-                (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
-            let other = Surface { camera: &b, depth: &db, opacity: &opacity };
-            Surface { camera: &a, depth: &da, opacity: &opacity }
-                .seen_from(&other)
-                .iter()
-                .flatten()
-                .count()
-        };
         let all = 64 * 48;
         // 66 pixels of focal length: from 0.5 units aside 5 % of 4 units are 0.4 pixels, from 2
         // units 1.6.
-        assert!(seen(0.5, 1.05) > all * 3 / 4 && seen(0.5, 1.05) == seen(0.5, 1.0));
-        assert_eq!(seen(2.0, 1.05), 0);
-        assert!(seen(2.0, 1.015) > 0);
+        assert!(
+            seen_from_beside(0.5, 1.05) > all * 3 / 4
+                && seen_from_beside(0.5, 1.05) == seen_from_beside(0.5, 1.0)
+        );
+        assert_eq!(seen_from_beside(2.0, 1.05), 0);
+        assert!(seen_from_beside(2.0, 1.015) > 0);
     }
 
     #[test]

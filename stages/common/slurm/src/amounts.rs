@@ -6,6 +6,17 @@ use std::str::FromStr;
 
 use serde::de::{Deserializer, Error, Visitor};
 
+/// A text that is no amount.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum AmountError {
+    /// It is no amount of memory.
+    #[error("{0:?} is no amount of memory; write a number with M, G or T, such as 8G")]
+    Memory(String),
+    /// It is no time.
+    #[error("{0:?} is no time; write numbers with d, h, m or s, such as 2h or 1h30m")]
+    Period(String),
+}
+
 /// An amount of memory in whole MiB: `512M`, `8G`, `1T`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Memory {
@@ -36,10 +47,10 @@ const MEMORY_UNITS: [(char, u64); 3] = [('T', 1 << 20), ('G', 1 << 10), ('M', 1)
 const PERIOD_UNITS: [(char, u64); 4] = [('d', 86_400), ('h', 3600), ('m', 60), ('s', 1)];
 
 impl FromStr for Memory {
-    type Err = String;
+    type Err = AmountError;
 
-    fn from_str(text: &str) -> Result<Self, String> {
-        let problem = || no_memory(text);
+    fn from_str(text: &str) -> Result<Self, AmountError> {
+        let problem = || AmountError::Memory(text.to_owned());
         let (count, last) = split_unit(text).ok_or_else(problem)?;
         let unit = MEMORY_UNITS.iter().find(|(unit, _)| *unit == last).ok_or_else(problem)?.1;
         let mib = count.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
@@ -48,17 +59,11 @@ impl FromStr for Memory {
     }
 }
 
-/// What is wrong with a text that is no amount of memory.
-fn no_memory(text: &str) -> String {
-    format!("{text:?} is no amount of memory; write a number with M, G or T, such as 8G")
-}
-
 impl FromStr for Period {
-    type Err = String;
+    type Err = AmountError;
 
-    fn from_str(text: &str) -> Result<Self, String> {
-        let problem =
-            || format!("{text:?} is no time; write numbers with d, h, m or s, such as 2h or 1h30m");
+    fn from_str(text: &str) -> Result<Self, AmountError> {
+        let problem = || AmountError::Period(text.to_owned());
         let mut units = PERIOD_UNITS.iter();
         let mut seconds = 0u64;
         for piece in text.split_inclusive(|c: char| !c.is_ascii_digit()) {
@@ -103,11 +108,11 @@ impl Display for Period {
 }
 
 /// Reads an amount; a bare number gets the amount's own error, which says what is missing.
-pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = String>>(
+pub(crate) fn read<'de, D: Deserializer<'de>, T: FromStr<Err = AmountError>>(
     deserializer: D,
 ) -> Result<T, D::Error> {
     struct Words<T>(PhantomData<T>);
-    impl<T: FromStr<Err = String>> Visitor<'_> for Words<T> {
+    impl<T: FromStr<Err = AmountError>> Visitor<'_> for Words<T> {
         type Value = T;
 
         fn expecting(&self, f: &mut Formatter<'_>) -> fmt::Result {
@@ -169,7 +174,8 @@ mod tests {
         for text in
             ["", "G", "8", "0G", "-8G", "8GB", "8g", "1.5G", "8 G", "18446744073709551615T", "８G"]
         {
-            assert!(text.parse::<Memory>().unwrap_err().contains("such as 8G"), "{text}");
+            let problem = text.parse::<Memory>().unwrap_err().to_string();
+            assert!(problem.contains("such as 8G"), "{text}: {problem}");
         }
     }
 
@@ -202,7 +208,8 @@ mod tests {
             "1h ",
             "99999999999999999999d",
         ] {
-            assert!(text.parse::<Period>().unwrap_err().contains("such as 2h"), "{text}");
+            let problem = text.parse::<Period>().unwrap_err().to_string();
+            assert!(problem.contains("such as 2h"), "{text}: {problem}");
         }
     }
 }

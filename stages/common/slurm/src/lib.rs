@@ -24,7 +24,7 @@ mod site;
 mod submission;
 mod submit;
 
-pub use amounts::{Memory, Period};
+pub use amounts::{AmountError, Memory, Period};
 pub use commands::{Slurm, cores, this_job};
 pub use error::SlurmError;
 pub use queue::{Job, Queue};

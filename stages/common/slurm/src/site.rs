@@ -86,16 +86,18 @@ impl Site {
 mod tests {
     use super::*;
 
+    fn site_of(file: &Path, text: &str) -> Result<Site, SlurmError> {
+        std::fs::write(file, text).unwrap();
+        Site::find(Some(file))
+    }
+
     #[test]
     fn a_site_is_a_file() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("slurm.yaml");
-        let read = |text: &str| {
-            std::fs::write(&file, text).unwrap();
-            Site::find(Some(&file))
-        };
-        assert_eq!(read("# nothing yet\n").unwrap(), Site::default());
-        let site = read(
+        assert_eq!(site_of(&file, "# nothing yet\n").unwrap(), Site::default());
+        let site = site_of(
+            &file,
             "partition: gpu\nsetup: [module load cuda]\narguments: \
                 [--exclusive]\nmax_submit: 5\nnotice: 5m\n",
         )
@@ -115,7 +117,7 @@ mod tests {
             ("notice: 1d", "at most 18h"),
             ("setup: module load cuda", "setup: invalid type"),
         ] {
-            let problem = read(text).unwrap_err().to_string();
+            let problem = site_of(&file, text).unwrap_err().to_string();
             assert!(problem.contains(words) && problem.contains("slurm.yaml"), "{problem}");
         }
         assert!(

@@ -129,6 +129,25 @@ mod tests {
         dir: tempfile::TempDir,
     }
 
+    fn task(name: &str, parents: &[usize]) -> Task {
+        Task {
+            stage: name.into(),
+            label: name.into(),
+            identity: format!("id-{name}"),
+            parents: parents.to_vec(),
+            ..Task::default()
+        }
+    }
+
+    fn queue_line(folder: &Path, (id, state, n): &(&str, &str, usize)) -> String {
+        let here = folder.display();
+        format!("{id}|{state}|None|{here}/slurm/one/job.sh {n}\n")
+    }
+
+    fn tells_apart(w: &&str) -> bool {
+        w.starts_with("--job-name") || w.starts_with("--dep") || w.starts_with("--kill")
+    }
+
     impl Fake {
         fn new() -> Self {
             let fake = Self { dir: tempfile::tempdir().unwrap() };
@@ -166,13 +185,6 @@ mod tests {
 
         /// A chain of two, and one by itself.
         fn submit(&self, id: &str, done: [bool; 3], most: usize) -> Submitted {
-            let task = |name: &str, parents: &[usize]| Task {
-                stage: name.into(),
-                label: name.into(),
-                identity: format!("id-{name}"),
-                parents: parents.to_vec(),
-                ..Task::default()
-            };
             let tasks = vec![task("prep", &[]), task("train", &[0, 0]), task("other", &[])];
             let (slurm, site) =
                 (Slurm::in_folder(self.path("bin")), Site { max_submit: most, ..Site::default() });
@@ -190,21 +202,15 @@ mod tests {
 
         /// What stands in the queue: jobs of the submission "one".
         fn queue(&self, jobs: &[(&str, &str, usize)]) {
-            let here = self.dir.path().display();
-            let line = |(id, state, n): &(&str, &str, usize)| {
-                format!("{id}|{state}|None|{here}/slurm/one/job.sh {n}\n")
-            };
-            std::fs::write(self.path("queue"), jobs.iter().map(line).collect::<String>()).unwrap();
+            let lines = jobs.iter().map(|job| queue_line(self.dir.path(), job));
+            std::fs::write(self.path("queue"), lines.collect::<String>()).unwrap();
         }
 
         /// The arguments that tell jobs apart, a call each.
         fn argv(&self) -> Vec<String> {
             let text = std::fs::read_to_string(self.path("argv")).unwrap_or_default();
-            let tells = |w: &&str| {
-                w.starts_with("--job-name") || w.starts_with("--dep") || w.starts_with("--kill")
-            };
             text.lines()
-                .map(|line| line.split(' ').filter(tells).collect::<Vec<_>>().join(" "))
+                .map(|line| line.split(' ').filter(tells_apart).collect::<Vec<_>>().join(" "))
                 .collect()
         }
     }

@@ -37,7 +37,7 @@ const ENVIRONMENT: [&str; 11] = [
 ];
 
 /// Last lines of a stage's stderr in which the reason of a failure is looked for.
-const TAIL: usize = 8;
+const TAIL_LINES: usize = 8;
 
 /// One call of a stage by the contract.
 pub struct Call<'a> {
@@ -259,7 +259,7 @@ impl Ear<'_> {
             if let Some(last) = tail.back() {
                 self.watcher.said(last);
             }
-            if tail.len() == TAIL {
+            if tail.len() == TAIL_LINES {
                 tail.pop_front();
             }
             tail.push_back(line);

@@ -12,9 +12,9 @@ use std::time::{Duration, Instant};
 use contract::Description;
 
 /// After so long a program that has said nothing is taken to hang.
-const LONGEST: Duration = Duration::from_secs(120);
+const LONGEST_ANSWER: Duration = Duration::from_secs(120);
 /// Asking that takes longer than this is said.
-const SILENCE: Duration = Duration::from_secs(1);
+const NOTICE_AFTER: Duration = Duration::from_secs(1);
 /// Descriptions are some kilobytes.
 const MOST_BYTES: u64 = 1 << 24;
 
@@ -22,8 +22,50 @@ const MOST_BYTES: u64 = 1 << 24;
 #[derive(Debug, PartialEq, Eq)]
 pub struct Interrupted;
 
+/// Why a program doesn't say what it is.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum DescribeError {
+    /// It can't be started or waited for.
+    #[error("`{program} describe`: {problem}")]
+    Start {
+        /// The program.
+        program: PathBuf,
+        /// What the system says.
+        problem: String,
+    },
+    /// It says nothing.
+    #[error(
+        "`{program} describe` gave no answer in {longest:?}; end what it waits for, or set `run:` \
+        to another program"
+    )]
+    Silent {
+        /// The program.
+        program: PathBuf,
+        /// How long it was waited for.
+        longest: Duration,
+    },
+    /// It fails.
+    #[error("`{program} describe` failed ({status}): {said}")]
+    Failed {
+        /// The program.
+        program: PathBuf,
+        /// How it ended.
+        status: ExitStatus,
+        /// Its last line on stderr.
+        said: String,
+    },
+    /// Its answer is no description.
+    #[error("`{program} describe` gave no description: {problem}")]
+    Form {
+        /// The program.
+        program: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+}
+
 /// What came of asking, by path.
-pub type Answers = BTreeMap<PathBuf, Result<Description, String>>;
+pub type Answers = BTreeMap<PathBuf, Result<Description, DescribeError>>;
 
 /// Asks programs, as many at once as there are cores.
 pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, Interrupted> {
@@ -39,7 +81,7 @@ pub fn ask_all(paths: &[PathBuf], stop: Option<&AtomicBool>) -> Result<Answers, 
             scope.spawn(move || ask_in_turn(paths, next, is_stopped, &sender));
         }
         drop(sender);
-        let mut patience = SILENCE;
+        let mut patience = NOTICE_AFTER;
         loop {
             match receiver.recv_timeout(patience) {
                 Ok((path, answer)) => _ = answers.insert(path, answer),
@@ -59,12 +101,12 @@ fn ask_in_turn(
     paths: &[PathBuf],
     next: &AtomicUsize,
     is_stopped: &dyn Fn() -> bool,
-    sender: &mpsc::Sender<(PathBuf, Result<Description, String>)>,
+    sender: &mpsc::Sender<(PathBuf, Result<Description, DescribeError>)>,
 ) {
     while let Some(path) = paths.get(next.fetch_add(1, Ordering::Relaxed)).filter(|_| !is_stopped())
     {
         // The receiver lives as long as the scope.
-        sender.send((path.clone(), ask(path, LONGEST, is_stopped))).ok();
+        sender.send((path.clone(), ask(path, LONGEST_ANSWER, is_stopped))).ok();
     }
 }
 
@@ -73,9 +115,12 @@ fn ask(
     path: &Path,
     longest: Duration,
     is_stopped: &dyn Fn() -> bool,
-) -> Result<Description, String> {
-    let command = format!("`{} describe`", path.display());
-    let fail = |problem: std::io::Error| format!("{command}: {problem}");
+) -> Result<Description, DescribeError> {
+    let program = || path.to_path_buf();
+    let fail = |problem: std::io::Error| DescribeError::Start {
+        program: program(),
+        problem: problem.to_string(),
+    };
     // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever
     // it has started.
     let mut child = Command::new(path)
@@ -95,18 +140,16 @@ fn ask(
     });
     let Some((status, stdout, stderr)) = answer else {
         end(&mut child);
-        return Err(format!(
-            "{command} gave no answer in {longest:?}; end what it waits for, or set `run:` to \
-            another program"
-        ));
+        return Err(DescribeError::Silent { program: program(), longest });
     };
     if !status.success() {
         let said = String::from_utf8_lossy(&stderr);
-        let last =
+        let said =
             said.trim_end().lines().last().unwrap_or_default().replace(char::is_control, " ");
-        return Err(format!("{command} failed ({status}): {last}"));
+        return Err(DescribeError::Failed { program: program(), status, said });
     }
-    serde_json::from_slice(&stdout).map_err(|e| format!("{command} gave no description: {e}"))
+    serde_json::from_slice(&stdout)
+        .map_err(|e| DescribeError::Form { program: program(), problem: e.to_string() })
 }
 
 /// Waits for a program to end; `None` where it is too late or nobody waits any more.
@@ -176,20 +219,20 @@ mod tests {
             ("#!/bin/sh\nsleep 1000 &\n", Duration::from_millis(200), "gave no answer in 200ms"),
             (
                 "#!/bin/sh\necho one >&2\nprintf 'two\\033[31m\\n' >&2\nexit 3\n",
-                LONGEST,
+                LONGEST_ANSWER,
                 "failed (exit status: 3): two [31m",
             ),
-            ("#!/bin/sh\necho '{}'\n", LONGEST, "gave no description: missing field"),
-            ("#!/nowhere/at/all\n", LONGEST, "describe`: No such file"),
+            ("#!/bin/sh\necho '{}'\n", LONGEST_ANSWER, "gave no description: missing field"),
+            ("#!/nowhere/at/all\n", LONGEST_ANSWER, "describe`: No such file"),
         ] {
             let path = program(folder.path(), "stage", text);
-            let problem = ask(&path, longest, &never).unwrap_err();
+            let problem = ask(&path, longest, &never).unwrap_err().to_string();
             assert!(problem.contains(words), "{problem}");
         }
         let path = program(folder.path(), "waits", "#!/bin/sh\nsleep 1000\n");
         let stop = AtomicBool::new(true);
         assert!(matches!(ask_all(std::slice::from_ref(&path), Some(&stop)), Err(Interrupted)));
         // Asked to end while it waits.
-        assert!(ask(&path, LONGEST, &|| true).is_err());
+        assert!(ask(&path, LONGEST_ANSWER, &|| true).is_err());
     }
 }

@@ -13,7 +13,7 @@ use crate::clock::seconds;
 
 /// Lines of a stage come at least so often, so that nobody takes it for dead: whoever waits ten
 /// seconds sees one.
-const SILENCE: Duration = Duration::from_secs(8);
+const LONGEST_SILENCE: Duration = Duration::from_secs(8);
 /// A bar moves so often, if only its spinner.
 const TICK: Duration = Duration::from_millis(500);
 
@@ -131,7 +131,7 @@ impl Watcher for StageView<'_> {
     /// Says where the stage is, where nothing has been said for long.
     fn alive(&self) {
         let mut shown = self.shown.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        if self.bar.is_some() || shown.when.elapsed() < SILENCE {
+        if self.bar.is_some() || shown.when.elapsed() < LONGEST_SILENCE {
             return;
         }
         shown.when = Instant::now();

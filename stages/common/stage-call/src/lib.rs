@@ -18,6 +18,6 @@ mod verdict;
 
 pub use call::{Call, Usage, Watcher};
 pub use clock::{seconds, utc};
-pub use describing::{Answers, Interrupted, ask_all};
+pub use describing::{Answers, DescribeError, Interrupted, ask_all};
 pub use display::{Display, StageView};
 pub use verdict::StageFailure;

@@ -5,7 +5,8 @@ use std::sync::atomic::AtomicBool;
 use artifact::Failure;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
-/// A flag that SIGINT, SIGTERM and SIGHUP set; the second of them ends the process at once, with 130.
+/// A flag that SIGINT, SIGTERM and SIGHUP set. The second of them ends the process at once, with
+/// exit code 130.
 ///
 /// SIGHUP stays ignored where it is (`nohup`): such a process shall outlive its terminal.
 pub fn stop_on_signals() -> io::Result<Arc<AtomicBool>> {
@@ -32,13 +33,15 @@ fn ignores(status: &str, signal: i32) -> bool {
 mod tests {
     use super::*;
 
+    fn status(mask: &str) -> String {
+        format!(
+            "Name:\tprep\nSigBlk:\tffffffffffffffff\nSigIgn:\t{mask}\n\
+            SigCgt:\tffffffffffffffff\n"
+        )
+    }
+
     #[test]
     fn what_nohup_leaves_behind_is_seen() {
-        let status = |mask: &str| {
-            format!(
-                "Name:\tprep\nSigBlk:\tffffffffffffffff\nSigIgn:\t{mask}\nSigCgt:\tffffffffffffffff\n"
-            )
-        };
         assert!(ignores(&status("0000000000001001"), SIGHUP));
         assert!(!ignores(&status("0000000000001000"), SIGHUP));
         assert!(!ignores("", SIGHUP));

@@ -1,12 +1,12 @@
 //! The first pipeline for a folder of posed photographs: what `nerf-sr init` writes.
 //!
-//! * [`Starter`]: the form of the folder, in words, and a commented pipeline file for it. The file is
-//!   whole: it runs as it is.
+//! * [`Starter`]: the form of the folder, in words, and a commented pipeline file for it. The file
+//!   is whole: it runs as it is.
 //! * [`Starter::write`]: the pipeline, and beside it `pipelines/` with the shipped further targets.
 //!   Nothing that is there is overwritten.
 //!
-//! Images up to [`LARGEST`] pixels wide keep their size. Larger ones are shrunk first: on a CPU,
-//! training on twelve million pixels a photograph takes hours.
+//! Images up to [`LARGEST_WIDTH`] pixels wide keep their size. Larger ones are shrunk first: on a
+//! CPU, training on twelve million pixels a photograph takes hours.
 //!
 //! ```no_run
 //! let starter = starter::Starter::new("photographs".as_ref(), "pipeline.yaml".as_ref())?;
@@ -27,11 +27,11 @@ use dataset::{Dataset, DatasetError, Frame};
 use pictures::Pictures;
 
 /// Widest images, in pixels, that keep their size.
-pub const LARGEST: u32 = 800;
+pub const LARGEST_WIDTH: u32 = 800;
 /// HR width over LR width.
 const SCALE: u32 = 2;
 /// Rays of the training.
-const RAYS: u64 = 20_000_000;
+const TRAINING_RAYS: u64 = 20_000_000;
 /// The shipped further targets, `pipelines/` of the repository: file names and texts.
 const TARGETS: &[(&str, &str)] = include!(concat!(env!("OUT_DIR"), "/targets.rs"));
 
@@ -177,7 +177,8 @@ fn found(set: &Dataset) -> String {
 fn text(set: &Dataset, found: &str, dataset: &str) -> String {
     let is_bent = set.frames.iter().any(|frame| frame.camera().check().is_err());
     let lens = if is_bent {
-        "\n      lens: undo # the lenses' distortion can't be followed everywhere; photographs lose a border"
+        "\n      lens: undo # the lenses' distortion can't be followed everywhere; photographs \
+        lose a border"
     } else {
         ""
     };
@@ -193,7 +194,7 @@ fn text(set: &Dataset, found: &str, dataset: &str) -> String {
         .replace("{images}", &images(set))
         .replace("{lens}", lens)
         .replace("{split}", split)
-        .replace("{rays}", &RAYS.to_string())
+        .replace("{rays}", &TRAINING_RAYS.to_string())
         // Last: what a folder is called is no part of the template.
         .replace("{dataset}", dataset)
 }
@@ -201,20 +202,20 @@ fn text(set: &Dataset, found: &str, dataset: &str) -> String {
 /// The parameters that say where LR images come from.
 fn images(set: &Dataset) -> String {
     let width = set.frames.iter().map(|frame| frame.intrinsics().width).min().unwrap_or(0);
-    if width > LARGEST {
-        let (lr, hr) = (LARGEST / SCALE, LARGEST);
+    if width > LARGEST_WIDTH {
+        let (lr, hr) = (LARGEST_WIDTH / SCALE, LARGEST_WIDTH);
         format!(
-            "      lr_width: {lr} # images are shrunk to {hr} pixels, and to {lr} to train on: views can be \
-            scored, and a CPU is done in minutes\n      \
+            "      lr_width: {lr} # images are shrunk to {hr} pixels, and to {lr} to train on: \
+            views can be scored, and a CPU is done in minutes\n      \
             # lr_source: photographs # instead of lr_width: trains on the photographs as they are"
         )
     } else if set.format.is_benchmark() {
-        "      lr_source: downscaled # LR images are made from these; `photographs` trains on them as \
-        they are"
+        "      lr_source: downscaled # LR images are made from these; `photographs` trains on them \
+        as they are"
             .to_owned()
     } else {
-        "      lr_source: photographs # they are trained on as they are; `downscaled` makes LR images \
-        from them first, to score views"
+        "      lr_source: photographs # they are trained on as they are; `downscaled` makes LR \
+        images from them first, to score views"
             .to_owned()
     }
 }

@@ -82,24 +82,25 @@ mod tests {
         }
     }
 
+    fn take_from(store: &Store, entered: &Entered, host: &str) -> (bool, String) {
+        let (folder, identity) = arriving(store, "1234");
+        store.take_in(entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
+        (store.take_in_record(entered, &record(&identity, host)).unwrap(), identity)
+    }
+
     /// The first record of a whole artifact stays; damaged objects give way.
     #[test]
     fn what_is_whole_stays() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         let entered = entered(&store);
-        let take = |host: &str| {
-            let (folder, identity) = arriving(&store, "1234");
-            store.take_in(&entered, &store.check_arrival(&folder, &identity).unwrap()).unwrap();
-            (store.take_in_record(&entered, &record(&identity, host)).unwrap(), identity)
-        };
-        let (is_new, identity) = take("first");
+        let (is_new, identity) = take_from(&store, &entered, "first");
         assert!(is_new);
-        assert!(!take("second").0);
+        assert!(!take_from(&store, &entered, "second").0);
         let key = record("", "").key();
         assert_eq!(store.hit(&key).unwrap().host, "first");
         fs::write(store.object(&identity).join("x"), "12").unwrap();
-        take("third");
+        take_from(&store, &entered, "third");
         store.verify(&identity).unwrap();
         assert_eq!(store.hit(&key).unwrap().host, "first");
     }

@@ -13,9 +13,11 @@ use crate::error::{StoreError, at};
 /// objects/HASH/         an artifact: artifact.json and its files
 /// actions/KEY.json      a finished action: its whole key, its output, when, where, in how long
 /// actions/KEY.log       what it said
-/// partial/KEY/          an action that hasn't finished: action.json, what it said, and in work/ its checkpoints
+/// partial/KEY/          an action that hasn't finished: action.json, what it said, and in work/
+///                       its checkpoints
 /// locks/KEY             one OS lock a key: the kernel drops it, whatever happens to the process
-/// runs/ID.jsonl         what a run needs, written while it goes on; pins/NAME.jsonl: what is kept for good
+/// runs/ID.jsonl         what a run needs, written while it goes on
+/// pins/NAME.jsonl       what is kept for good
 /// gate                  entered by runs for moments, closed by garbage collection
 /// format                version of all this
 /// ```

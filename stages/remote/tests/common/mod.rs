@@ -46,15 +46,15 @@ pub(crate) fn make(
     store.publish(&entered(store), checked, record).unwrap()
 }
 
+fn next_byte(state: &mut u64) -> u8 {
+    *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+    (*state >> 56) as u8
+}
+
 /// Bytes that no compression and no hole in a file makes smaller.
 pub(crate) fn bytes(count: usize, seed: u64) -> Vec<u8> {
     let mut state = seed;
-    let mut next = || {
-        state =
-            state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (state >> 56) as u8
-    };
-    (0..count).map(|_| next()).collect()
+    (0..count).map(|_| next_byte(&mut state)).collect()
 }
 
 /// prep and again make one artifact, train is made of prep and has a file in several parts, eval is

@@ -17,14 +17,14 @@ pub(crate) struct Need {
 }
 
 /// A stage of which nothing is known.
-const UNKNOWN: Need = Need { cores: 1, memory: 0 };
+const UNKNOWN_NEED: Need = Need { cores: 1, memory: 0 };
 
 impl Need {
     /// What the nearest measured run of a stage took; one core and no memory where there is none.
     pub(crate) fn of(key_parts: &Map<String, Value>, stage: &str, records: &[Record]) -> Self {
         let measured =
             records.iter().filter(|record| record.peak_memory.is_some() && record.stage == stage);
-        nearest(key_parts, measured).map_or(UNKNOWN, |record| Self {
+        nearest(key_parts, measured).map_or(UNKNOWN_NEED, |record| Self {
             cores: record
                 .processor_seconds
                 .map_or(1, |busy| (busy / record.seconds.max(1e-3)).round() as usize)
@@ -130,16 +130,19 @@ mod tests {
         places.place(wanted)
     }
 
+    fn said(place: Place) -> String {
+        match place {
+            Place::LaterForMemory(why) | Place::Never(why) => why,
+            other => panic!("{other:?}"),
+        }
+    }
+
     #[test]
     fn a_stage_starts_while_a_core_a_place_and_its_memory_are_left() {
         assert_eq!(place_beside(&[], need(64, 8)), Place::Free);
         assert_eq!(place_beside(&[need(3, 0)], need(4, 0)), Place::Free);
         assert_eq!(place_beside(&[need(4, 0)], need(1, 0)), Place::Later);
-        assert_eq!(place_beside(&[UNKNOWN; 3], UNKNOWN), Place::Later);
-        let said = |place| match place {
-            Place::LaterForMemory(why) | Place::Never(why) => why,
-            other => panic!("{other:?}"),
-        };
+        assert_eq!(place_beside(&[UNKNOWN_NEED; 3], UNKNOWN_NEED), Place::Later);
         let later = said(place_beside(&[need(1, 5)], need(1, 4)));
         assert_eq!(
             later,
@@ -157,24 +160,28 @@ mod tests {
     fn an_ended_stage_leaves_its_place() {
         let mut places = Places::new(BUDGET);
         places.take(7, need(4, 8));
-        assert_eq!(places.place(UNKNOWN), Place::Later);
+        assert_eq!(places.place(UNKNOWN_NEED), Place::Later);
         places.give_back(7);
         assert!(places.is_idle() && places.place(need(1, 8)) == Place::Free);
     }
 
-    #[test]
-    fn the_nearest_measured_run_tells() {
-        let parts = |scale: u64, seed: u64| {
-            json!({"scale": scale, "seed": seed}).as_object().unwrap().clone()
-        };
-        let record = |stage: &str, key_parts, gb: Option<u64>| Record {
+    fn parts(scale: u64, seed: u64) -> Map<String, Value> {
+        json!({"scale": scale, "seed": seed}).as_object().unwrap().clone()
+    }
+
+    fn record(stage: &str, key_parts: Map<String, Value>, gb: Option<u64>) -> Record {
+        Record {
             stage: stage.to_owned(),
             key_parts,
             seconds: 10.0,
             peak_memory: gb.map(|gb| gb * GB),
             processor_seconds: gb.map(|_| 17.0),
             ..Record::default()
-        };
+        }
+    }
+
+    #[test]
+    fn the_nearest_measured_run_tells() {
         let records = [
             record("train", parts(4, 0), Some(6)),
             record("train", parts(2, 0), Some(2)),
@@ -183,6 +190,6 @@ mod tests {
         ];
         assert_eq!(Need::of(&parts(4, 1), "train", &records), need(2, 6));
         assert_eq!(Need::of(&parts(2, 1), "train", &records), need(2, 2));
-        assert_eq!(Need::of(&parts(2, 1), "render", &records), UNKNOWN);
+        assert_eq!(Need::of(&parts(2, 1), "render", &records), UNKNOWN_NEED);
     }
 }

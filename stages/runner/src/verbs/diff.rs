@@ -9,7 +9,7 @@ use crate::session::{Session, of_stage};
 /// More files than these are counted, not listed.
 const MOST_FILES: usize = 4;
 /// The fewest letters by which a hash is known.
-const SHORTEST: usize = 6;
+const LEAST_HASH_LETTERS: usize = 6;
 
 /// Tells what differs between two results and all that they were made of.
 pub(crate) fn diff(
@@ -52,7 +52,7 @@ fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     if let Some(run) = store.runs()?.into_iter().chain(store.pins()?).find(|run| run.id == text) {
         return Ok(Lineage::of(store, run.keys));
     }
-    let is_hash = text.len() >= SHORTEST && text.bytes().all(|b| b.is_ascii_hexdigit());
+    let is_hash = text.len() >= LEAST_HASH_LETTERS && text.bytes().all(|b| b.is_ascii_hexdigit());
     if is_hash {
         let records = store.records()?;
         let mut found = records

@@ -158,7 +158,7 @@ impl Task<'_> {
                 "{} was built anew since this was submitted; run it again",
                 program.path.display()
             ),
-            Err(problem) => problem.clone(),
+            Err(problem) => problem.to_string(),
         };
         Err(StageFailure { code: 2, message })
     }

@@ -1,11 +1,11 @@
 use std::time::Duration;
 
 /// Share of the processor time that looks may take.
-const SHARE: f64 = 0.02;
+const MOST_TIME_SHARE: f64 = 0.02;
 /// Estimate before the first look, in seconds: starting the programs.
-const START: f64 = 0.3;
+const START_SECONDS: f64 = 0.3;
 /// Likewise: rendering and scoring one pixel.
-const PIXEL: f64 = 8e-6;
+const PIXEL_SECONDS: f64 = 8e-6;
 
 /// Processor time for looks.
 pub(super) struct LookBudget {
@@ -20,13 +20,17 @@ pub(super) struct LookBudget {
 impl LookBudget {
     /// Of a training with so many threads and a view with so many pixels.
     pub(super) fn new(threads: usize, pixels: u64) -> Self {
-        Self { threads: threads as f64, spent: 0.0, expected: START + PIXEL * pixels as f64 }
+        Self {
+            threads: threads as f64,
+            spent: 0.0,
+            expected: START_SECONDS + PIXEL_SECONDS * pixels as f64,
+        }
     }
 
     /// When the next look is due, from the training's start. By then all looks, this one included,
     /// fit into the share.
     pub(super) fn next(&self) -> Duration {
-        Duration::from_secs_f64((self.spent + self.expected) / (SHARE * self.threads))
+        Duration::from_secs_f64((self.spent + self.expected) / (MOST_TIME_SHARE * self.threads))
     }
 
     /// Expected processor time of the next look.
@@ -60,7 +64,7 @@ mod tests {
                 budget.took(Duration::from_secs_f64(cost));
                 (spent, looks) = (spent + cost, looks + 1);
             }
-            let most = SHARE * 3600.0 * threads as f64;
+            let most = MOST_TIME_SHARE * 3600.0 * threads as f64;
             assert!(spent <= most && spent > most - 2.0 * cost, "{looks} looks took {spent} s");
         }
     }

@@ -6,8 +6,8 @@ use pixels::{Filter, Rgba8, resize_pillow};
 const MOST_COLUMNS: usize = 64;
 const RESET: &str = "\x1b[0m";
 
-/// A picture as text for a terminal of some size. Each character is `▀`: the foreground is the upper
-/// pixel, the background the lower one.
+/// A picture as text for a terminal of some size. Each character is `▀`: the foreground is the
+/// upper pixel, the background the lower one.
 pub(super) fn half_blocks(image: &Rgba8, columns: u16, rows: u16) -> String {
     let columns = usize::from(columns).min(MOST_COLUMNS).min(image.width).max(1);
     // A third of the terminal is left for the lines above.

@@ -29,9 +29,9 @@ use one_view::OneView;
 const TICK: Duration = Duration::from_millis(50);
 /// Limit of a look, as a multiple of its expected time. Beyond it the watching ends: on a CPU the
 /// paper's field is too slow to watch.
-const MOST: u32 = 10;
+const MOST_EXPECTED_TIMES: u32 = 10;
 /// The limit is at least so long, for busy machines.
-const LEAST_LIMIT: Duration = Duration::from_secs(60);
+const LEAST_TIME_LIMIT: Duration = Duration::from_secs(60);
 
 /// The options of `--watch`.
 pub(crate) struct Watch {
@@ -75,7 +75,8 @@ impl Watching<'_> {
                 std::thread::sleep(TICK);
                 continue;
             }
-            let (started, limit) = (Instant::now(), LEAST_LIMIT.max(budget.expected() * MOST));
+            let (started, limit) =
+                (Instant::now(), LEAST_TIME_LIMIT.max(budget.expected() * MOST_EXPECTED_TIMES));
             let look = Look { watching: self, view: &view, deadline: started + limit };
             match look.at(training) {
                 Ok(Some(seen)) => {

@@ -36,8 +36,8 @@ impl OneView {
         Ok(Self { name, pixels: side("width") * side("height") })
     }
 
-    /// Makes `into`, a copy of `folder` by links, whose `views.json` lists this view alone. A folder
-    /// without `views.json` becomes one link.
+    /// Makes `into`, a copy of `folder` by links, whose `views.json` lists this view alone. A
+    /// folder without `views.json` becomes one link.
     pub(super) fn of(&self, folder: &Path, into: &Path) -> io::Result<()> {
         let Ok(mut list) = list(folder) else {
             return std::os::unix::fs::symlink(folder, into);

@@ -1,6 +1,32 @@
-//! Drawings of a plan: text and Graphviz.
+use std::process::ExitCode;
 
-use planning::{Origin, Plan, State};
+use artifact::print_lines;
+use planning::{Origin, Plan, Request, State};
+
+use crate::session::Session;
+
+/// As what a plan is drawn.
+// Its values are without texts of their own: clap would give every verb's help its long form.
+#[derive(Clone, Copy, clap::ValueEnum)]
+pub(crate) enum GraphFormat {
+    Ascii,
+    Dot,
+}
+
+/// Draws the plan: as text, or for Graphviz.
+pub(crate) fn graph(
+    session: &Session,
+    what: &Request,
+    format: GraphFormat,
+) -> anyhow::Result<ExitCode> {
+    let plan = session.plan(what)?;
+    let states = session.states(&plan)?;
+    print_lines(&match format {
+        GraphFormat::Ascii => ascii(&plan, &states),
+        GraphFormat::Dot => dot(&plan, &states),
+    });
+    Ok(ExitCode::SUCCESS)
+}
 
 /// A node or a sink, as it is drawn.
 struct Drawn<'a> {
@@ -72,7 +98,7 @@ fn drawn<'a>(plan: &'a Plan, states: &[State]) -> Vec<Drawn<'a>> {
     nodes.chain(sinks).collect()
 }
 
-pub(crate) fn ascii(plan: &Plan, states: &[State]) -> String {
+fn ascii(plan: &Plan, states: &[State]) -> String {
     let all = drawn(plan, states);
     let lines = all.iter().zip(depths(&all)).map(|(drawn, depth)| {
         let made_of = drawn.made_of.join(", ");
@@ -82,7 +108,7 @@ pub(crate) fn ascii(plan: &Plan, states: &[State]) -> String {
     lines.collect()
 }
 
-pub(crate) fn dot(plan: &Plan, states: &[State]) -> String {
+fn dot(plan: &Plan, states: &[State]) -> String {
     let mut text = "digraph pipeline {\n  rankdir=LR;\n  node [shape=box];\n".to_owned();
     for (i, drawn) in drawn(plan, states).iter().enumerate() {
         let shape = if drawn.state == Drawing::Sink { ", shape=note" } else { "" };
