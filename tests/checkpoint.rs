@@ -62,7 +62,8 @@ fn a_checkpoint_of_the_reference_is_rendered() {
     assert_eq!(views.join("images").read_dir().unwrap().count(), 1);
 }
 
-fn assert_no_checkpoint(fine: &Path, out: &Path, coarse: &Path, words: &[&str]) {
+#[track_caller]
+fn assert_no_checkpoint(coarse: &Path, fine: &Path, out: &Path, words: &[&str]) {
     let said = convert(coarse, fine, out);
     said.fails(1, words);
     assert_eq!(said.stderr.lines().count(), 1, "{}", said.stderr);
@@ -75,17 +76,17 @@ fn what_is_no_checkpoint_is_one_line() {
     let [coarse, fine] = ["tests/data/7_net_Coarse.pth", "tests/data/7_net_Fine.pth"].map(here);
     let out = project.path("out");
     assert_no_checkpoint(
+        &project.path("nowhere.pth"),
         &fine,
         &out,
-        &project.path("nowhere.pth"),
         &["nowhere.pth", "No such file"],
     );
-    assert_no_checkpoint(&fine, &out, &here("Cargo.toml"), &["Cargo.toml", "not a checkpoint"]);
+    assert_no_checkpoint(&here("Cargo.toml"), &fine, &out, &["Cargo.toml", "not a checkpoint"]);
     let bytes = std::fs::read(&coarse).unwrap();
     let cut = project.path("cut.pth");
     for length in [0, 1, bytes.len() / 3, bytes.len() - 1] {
         std::fs::write(&cut, &bytes[..length]).unwrap();
-        assert_no_checkpoint(&fine, &out, &cut, &["cut.pth", "not a"]);
+        assert_no_checkpoint(&cut, &fine, &out, &["cut.pth", "not a"]);
     }
     // A pickle that would run something.
     let hostile = project.path("hostile.pth");
@@ -94,7 +95,7 @@ fn what_is_no_checkpoint_is_one_line() {
                  + '.ran',)\n\
                  zipfile.ZipFile(sys.argv[1], 'w').writestr('x/data.pkl', pickle.dumps(Run()))\n";
     assert!(Command::new("python3").args(["-c", write]).arg(&hostile).status().unwrap().success());
-    assert_no_checkpoint(&fine, &out, &hostile, &["hostile.pth", "system"]);
+    assert_no_checkpoint(&hostile, &fine, &out, &["hostile.pth", "system"]);
     assert!(!hostile.with_extension("pth.ran").exists());
 }
 
@@ -105,6 +106,7 @@ fn convert_weights(network: &str, from: &str, out: &Path) -> Finished {
     )
 }
 
+#[track_caller]
 fn assert_no_weights(out: &Path, network: &str, from: &str, words: &[&str]) {
     let said = convert_weights(network, from, out);
     said.fails(1, words);

@@ -53,7 +53,7 @@ fn said(project: &Project, arguments: &[&str]) -> Vec<String> {
     project.ok(arguments).lines().map(plain).collect()
 }
 
-fn hidden(word: &str) -> String {
+fn without_hash(word: &str) -> String {
     let is_hash = |word: &str| word.len() == 10 && word.bytes().all(|b| b.is_ascii_hexdigit());
     if is_hash(word.trim_end_matches(';')) {
         word.replace(|c: char| c.is_ascii_hexdigit(), "#")
@@ -63,7 +63,7 @@ fn hidden(word: &str) -> String {
 }
 
 fn plain(line: &str) -> String {
-    let line = line.split(' ').map(hidden).collect::<Vec<_>>().join(" ");
+    let line = line.split(' ').map(without_hash).collect::<Vec<_>>().join(" ");
     match line.split_once("cached (") {
         Some((before, _)) => format!("{before}cached (…)"),
         None => line,

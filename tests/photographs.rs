@@ -35,6 +35,13 @@ fn views(folder: &Path) -> Vec<Value> {
     serde_json::from_str::<Value>(&text).unwrap()["views"].as_array().unwrap().clone()
 }
 
+/// Mean PSNR at LR of what a stage scored.
+#[track_caller]
+fn lr_psnr(project: &Project, stage: &str, settings: &[&str]) -> f64 {
+    let metrics = project.json(stage, "metrics.json", settings);
+    metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+}
+
 #[test]
 fn every_form_gives_the_same_cameras_and_images() {
     let project = Project::tiny();
@@ -145,11 +152,7 @@ fn scored_with(project: &Project, exposure: &str) -> (f64, Value) {
     // on.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", exposure];
     project.ok(&[&["run"], &settings[..]].concat());
-    let read = |stage: &str, file: &str| project.json(stage, file, &settings);
-    (
-        read("eval", "metrics.json")["mean"]["low_resolution"]["psnr"].as_f64().unwrap(),
-        read("train-ss", "training.json"),
-    )
+    (lr_psnr(project, "eval", &settings), project.json("train-ss", "training.json", &settings))
 }
 
 /// What a photograph's channels are multiplied by.
@@ -216,8 +219,7 @@ fn lens_psnr(project: &Project, lens: &str) -> f64 {
     // Seen through it the things touch the border: that looks like a scene that goes on.
     let settings = ["-i", "dataset=./transforms", "-p", "background=white", "-p", lens];
     project.ok(&[&["run"], &settings[..]].concat());
-    let metrics = project.json("eval", "metrics.json", &settings);
-    metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+    lr_psnr(project, "eval", &settings)
 }
 
 /// Photographs taken through a lens that bends lines: rays follow it, or it is undone; who ignores
@@ -280,10 +282,7 @@ fn lenses_are_followed_or_undone() {
 fn scored_registered(project: &Project, refined: &str) -> [f64; 2] {
     let settings = ["eval", "eval-registered", "-i", "dataset=./transforms", "-p", refined];
     project.ok(&[&["run"], &settings[..]].concat());
-    ["eval", "eval-registered"].map(|stage| {
-        let metrics = project.json(stage, "metrics.json", &settings);
-        metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
-    })
+    ["eval", "eval-registered"].map(|stage| lr_psnr(project, stage, &settings))
 }
 
 /// Photographs whose poses are off by about a pixel: cameras move while the field learns, and those
@@ -335,14 +334,13 @@ fn poses_are_refined_and_test_views_registered() {
     project.run(&open).fails(2, &["parameter pose_refinement", "open background"]);
 }
 
-fn scored_masked(project: &Project, file: &Path, transforms: &mut Value, masked: bool) -> f64 {
-    for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !masked) {
+fn psnr_with_masks(project: &Project, file: &Path, transforms: &mut Value, keep: bool) -> f64 {
+    for frame in transforms["frames"].as_array_mut().unwrap().iter_mut().filter(|_| !keep) {
         frame.as_object_mut().unwrap().remove("mask_path");
     }
     std::fs::write(file, transforms.to_string()).unwrap();
     project.ok(&["run", "-i", "dataset=./transforms"]);
-    let metrics = project.json("eval", "metrics.json", &["-i", "dataset=./transforms"]);
-    metrics["mean"]["low_resolution"]["psnr"].as_f64().unwrap()
+    lr_psnr(project, "eval", &["-i", "dataset=./transforms"])
 }
 
 /// Somebody walked through most of the photographs: what the masks leave out is neither learnt nor
@@ -376,7 +374,7 @@ fn what_masks_leave_out_is_not_learnt() {
     }
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
     project.replace("rays: 60000", "rays: 600000");
-    let masked = scored_masked(&project, &file, &mut transforms, true);
+    let masked = psnr_with_masks(&project, &file, &mut transforms, true);
     // With HR truth: PSNR is that of the pixels that count.
     let small = ["-i", "dataset=./transforms", "-p", "lr_width=16", "-p", "train-ss.rays=20000"];
     project.ok(&[&["run", "eval"], &small[..]].concat());
@@ -411,7 +409,7 @@ fn what_masks_leave_out_is_not_learnt() {
         let psnr = scores["scores"]["psnr"].as_f64().unwrap();
         assert!((psnr - by_hand).abs() < 1e-3, "{name}: {psnr}, by hand {by_hand}");
     }
-    let spoiled = scored_masked(&project, &file, &mut transforms, false);
+    let spoiled = psnr_with_masks(&project, &file, &mut transforms, false);
     println!("{masked:.2} dB with masks, {spoiled:.2} dB without");
     assert!(
         masked > 17.0 && masked > spoiled + 3.0,
@@ -419,6 +417,7 @@ fn what_masks_leave_out_is_not_learnt() {
     );
 }
 
+#[track_caller]
 fn refused(folder: &Path, out: &Path, params: &str, words: &[&str]) {
     stage("prep", params, &[("dataset", folder)], out, &[]).fails(2, words);
 }
@@ -474,7 +473,7 @@ fn the_papers_split_leaves_references_out() {
     assert_ne!(references[1], json!("r_1"));
 }
 
-fn mean(project: &Project, settings: [&str; 2]) -> (f64, f64) {
+fn psnr_and_depth_error(project: &Project, settings: [&str; 2]) -> (f64, f64) {
     let all = settings.into_iter().chain(["backdrop=true", "near=2", "far=80"]);
     let all: Vec<&str> = all.flat_map(|setting| ["-p", setting]).collect();
     project.ok(&[&["run"], &all[..]].concat());
@@ -494,8 +493,8 @@ fn worlds_without_end_have_a_space_of_their_own() {
         ("layout=forward", "space=ndc", 22.0, 0.7),
         ("layout=around", "space=contraction", 18.0, 0.7),
     ] {
-        let (psnr, depth) = mean(&project, [layout, space]);
-        let (psnr_of_box, _) = mean(&project, [layout, "space=box"]);
+        let (psnr, depth) = psnr_and_depth_error(&project, [layout, space]);
+        let (psnr_of_box, _) = psnr_and_depth_error(&project, [layout, "space=box"]);
         println!("{space}: {psnr:.2} dB, depth off by {depth:.3}; box {psnr_of_box:.2} dB");
         assert!(psnr > least && depth < depth_error, "{space}: {psnr} dB, depth off by {depth}");
         assert!(psnr > psnr_of_box, "{space}: {psnr} dB, box {psnr_of_box}");

@@ -165,13 +165,7 @@ fn views_are_consistent_with_their_own_photographs() {
     assert!(is_agreeing(&project, &["-p", "split=paper"]) && !is_agreeing(&project, &[]));
     let folder = |stage: &str| project.artifact(stage, &["refined", "-p", "split=paper"]);
     let (views, refiner) = (folder("render-depth"), folder("train-refine"));
-    let mut command = std::process::Command::new(common::bin("refine"));
-    command.arg("--output").arg(project.path("alone"));
-    command.args(
-        [("views", &views), ("refiner", &refiner)]
-            .map(|(input, folder)| format!("--input={input}={}", folder.display())),
-    );
-    let alone = Finished::of(command.output().unwrap());
+    let (alone, _) = refine_with(&project, &views, "alone", &refiner, &[]);
     assert_eq!(alone.code, 0, "{}", alone.stderr);
     assert!(
         alone.stderr.contains("trained on views consistent with LR photographs of their own"),
@@ -409,29 +403,14 @@ fn bad_references_do_no_harm() {
     let references = prep.join("references");
     let rendered = first_psnr(&prep, &views);
     let refined = |name: &str, views: &Path, references: &Path, reference_views: &Path| {
-        let inputs = [
-            ("views", views),
-            ("refiner", &refiner),
-            ("references", references),
-            ("reference-views", reference_views),
-        ];
-        let mut command = std::process::Command::new(common::bin("refine"));
-        command.arg("--output").arg(project.path(name));
-        command.args(inputs.map(|(input, folder)| format!("--input={input}={}", folder.display())));
-        let finished = Finished::of(command.output().unwrap());
+        let more = [("references", references), ("reference-views", reference_views)];
+        let (finished, output) = refine_with(&project, views, name, &refiner, &more);
         assert_eq!(finished.code, 0, "{}", finished.stderr);
-        let summary = std::fs::read_to_string(project.path(name).join("summary.txt")).unwrap();
-        println!(
-            "{name}: {:.2} dB, rendered {rendered:.2}; {summary}; {}",
-            first_psnr(&prep, &project.path(name)),
-            finished.stderr
-        );
+        let summary = std::fs::read_to_string(output.join("summary.txt")).unwrap();
+        let psnr = first_psnr(&prep, &output);
+        println!("{name}: {psnr:.2} dB, rendered {rendered:.2}; {summary}; {}", finished.stderr);
         // Three of four seeds lose at most 0.11 dB by the shifted depth, one 0.36.
-        assert!(
-            first_psnr(&prep, &project.path(name)) > rendered - 0.15,
-            "{name}: {} of {rendered}",
-            first_psnr(&prep, &project.path(name))
-        );
+        assert!(psnr > rendered - 0.15, "{name}: {psnr} of {rendered}");
         finished.stderr
     };
     let good = refined("good", &views, &references, &reference_views);
@@ -480,7 +459,13 @@ fn member_weights(field: &Path, member: u32) -> Option<Vec<u8>> {
     std::fs::read(field.join(format!("field-{member}.safetensors"))).ok()
 }
 
-fn gone_on(project: &Project, first: &Path, combine: &str, rays: &str, references: &str) -> f64 {
+fn psnr_after_finetuning(
+    project: &Project,
+    first: &Path,
+    combine: &str,
+    rays: &str,
+    references: &str,
+) -> f64 {
     let given = [("rays", rays), ("max_references", references), ("combine", combine)]
         .map(|(name, value)| format!("finetuned-field.{name}={value}"));
     let more = [
@@ -497,10 +482,8 @@ fn gone_on(project: &Project, first: &Path, combine: &str, rays: &str, reference
     ];
     let arguments = [&["eval-finetuned"], &more[..]].concat();
     project.ok(&[&["run"], &arguments[..]].concat());
-    let on = project.json("eval-finetuned", "metrics.json", &arguments)["mean"]["psnr"]
-        .as_f64()
-        .unwrap();
-    println!("{on:.2} dB, {given:?}");
+    let psnr = mean_psnr(project, &arguments, "eval-finetuned");
+    println!("{psnr:.2} dB, {given:?}");
     let field = project.artifact("finetuned-field", &arguments);
     assert_eq!(member_weights(&field, 1).is_some(), combine == "ensemble");
     assert_eq!(
@@ -508,7 +491,7 @@ fn gone_on(project: &Project, first: &Path, combine: &str, rays: &str, reference
         combine == "ensemble",
         "the initial field is the first member"
     );
-    on
+    psnr
 }
 
 /// HR references that join the training: what they show is learnt.
@@ -545,15 +528,15 @@ fn references_join_a_training() {
     let first = project.artifact("train-ss", &arguments);
     for combine in ["ensemble", "average_weights"] {
         assert!(
-            gone_on(&project, &first, combine, "100000", "6")
+            psnr_after_finetuning(&project, &first, combine, "100000", "6")
                 > mean_psnr(&project, &arguments, "eval") + 0.2
         );
         assert!(
-            gone_on(&project, &first, combine, "8000", "6")
+            psnr_after_finetuning(&project, &first, combine, "8000", "6")
                 > mean_psnr(&project, &arguments, "eval") - 0.02
         );
         assert!(
-            gone_on(&project, &first, combine, "100000", "1")
+            psnr_after_finetuning(&project, &first, combine, "100000", "1")
                 > mean_psnr(&project, &arguments, "eval") - 0.02
         );
     }
@@ -564,6 +547,7 @@ fn references_join_a_training() {
     assert!(weights("joined-field") == weights("train-ss"));
 }
 
+#[track_caller]
 fn cannot_go_on(project: &Project, scene: &Path, parameters: &str, field: &Path, words: &[&str]) {
     stage("train-ss", parameters, &[("scene", scene), ("init", field)], &project.path("no"), &[])
         .fails(3, words);
@@ -783,6 +767,7 @@ fn wrong_views_are_refused_in_a_line() {
         .fails(3, &["none of them has an image, by name and pose, in input truth"]);
 }
 
+#[track_caller]
 fn fails_to_train(
     project: &Project,
     inputs: &[(&str, &Path)],

@@ -32,6 +32,7 @@ fn goldens() -> std::path::PathBuf {
     common::root().join("stages/upsample/tests/goldens")
 }
 
+#[track_caller]
 fn fails_to_upsample(
     project: &Project,
     inputs: &[(&str, &Path)],

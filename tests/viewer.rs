@@ -174,7 +174,7 @@ fn other_spaces_are_refused() {
     assert!(!project.path("out/viewer/index.html").exists());
 }
 
-fn far(state: &Value) -> f64 {
+fn distance_from_origin(state: &Value) -> f64 {
     let centre = state["centre"].as_array().unwrap().iter();
     centre.map(|c| c.as_f64().unwrap().powi(2)).sum::<f64>().sqrt()
 }
@@ -201,14 +201,24 @@ fn people_can_look_around() {
     }
     assert!(desktop("arrow")["camera"] == -1 && desktop("arrow")["frusta"] == false);
     assert_eq!(desktop("frusta")["frusta"], true);
-    assert!(far(&desktop("wheel")) > 1.1 * far(&desktop("arrow")), "the wheel moves away");
+    assert!(
+        distance_from_origin(&desktop("wheel")) > 1.1 * distance_from_origin(&desktop("arrow")),
+        "the wheel moves away"
+    );
     for state in ["hash", "camera", "centre", "frusta"] {
         assert_eq!(desktop("reset")[state], first[state], "{state}");
     }
     let (start, finger, pinch) =
         (at("phone", "first"), at("phone", "finger"), at("phone", "pinch"));
-    assert!((far(&finger) - far(&start)).abs() < 0.1 * far(&start), "a finger orbits");
+    assert!(
+        (distance_from_origin(&finger) - distance_from_origin(&start)).abs()
+            < 0.1 * distance_from_origin(&start),
+        "a finger orbits"
+    );
     assert_ne!(finger["right"], start["right"]);
     assert_eq!(pinch["right"], finger["right"], "two fingers don't turn the view");
-    assert!(far(&pinch) < 0.8 * far(&finger), "fingers that part come nearer");
+    assert!(
+        distance_from_origin(&pinch) < 0.8 * distance_from_origin(&finger),
+        "fingers that part come nearer"
+    );
 }

@@ -4,6 +4,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use std::path::Path;
 use std::process::Command;
 
 use common::{Finished, Project, demo_train, manifest, stage, stage_command};
@@ -13,14 +14,14 @@ const PARAMETERS: &str = r#"{"rays": 60000, "n_levels": 4, "max_resolution": 64,
     "hidden_dim": 16, "march_steps": 128, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 
 /// A training with checkpoints.
-fn train(project: &Project, output: &str, more: &[&str]) -> Command {
-    let (work, scene) = (project.path("work"), project.path("scene/train"));
+fn train(project: &Project, scene: &Path, output: &str, more: &[&str]) -> Command {
+    let work = project.path("work");
     let words = [&["--work", work.to_str().unwrap()], more].concat();
-    stage_command("train-ss", PARAMETERS, &[("scene", &scene)], &project.path(output), &words)
+    stage_command("train-ss", PARAMETERS, &[("scene", scene)], &project.path(output), &words)
 }
 
-fn trained(project: &Project, output: &str, more: &[&str]) -> Finished {
-    Finished::of(train(project, output, more).output().unwrap())
+fn trained(project: &Project, scene: &Path, output: &str, more: &[&str]) -> Finished {
+    Finished::of(train(project, scene, output, more).output().unwrap())
 }
 
 /// The latest checkpoint of a training that was stopped becomes a field that is rendered; the
@@ -31,14 +32,16 @@ fn a_checkpoint_becomes_a_field() {
     let scene = demo_train(&project, 8);
     let (work, whole) = (project.path("work"), project.path("whole"));
     let work_folder = work.to_str().unwrap().to_owned();
-    trained(&project, "early", &["--from-checkpoint"])
+    trained(&project, &scene, "early", &["--from-checkpoint"])
         .fails(3, &["--work", "no complete checkpoint"]);
     assert!(!project.path("early").exists());
 
-    let stopped =
-        train(&project, "stopped", &[]).env("NERF_SR_STOP_AFTER", "30000").output().unwrap();
+    let stopped = train(&project, &scene, "stopped", &[])
+        .env("NERF_SR_STOP_AFTER", "30000")
+        .output()
+        .unwrap();
     assert_eq!(Finished::of(stopped).code, 130);
-    let made = trained(&project, "field", &["--from-checkpoint"]);
+    let made = trained(&project, &scene, "field", &["--from-checkpoint"]);
     assert_eq!(made.code, 0, "{}", made.stderr);
     let log = std::fs::read(project.path("field/training.json")).unwrap();
     let log: serde_json::Value = serde_json::from_slice(&log).unwrap();
@@ -50,7 +53,7 @@ fn a_checkpoint_becomes_a_field() {
     let rendered = stage("render-depth", r#"{"size": 8}"#, &inputs, &project.path("views"), &[]);
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
 
-    assert_eq!(trained(&project, "resumed", &[]).code, 0);
+    assert_eq!(trained(&project, &scene, "resumed", &[]).code, 0);
     let plain = stage("train-ss", PARAMETERS, &[("scene", &scene)], &whole, &[]);
     assert_eq!(plain.code, 0, "{}", plain.stderr);
     assert_eq!(manifest(&whole), manifest(&project.path("resumed")));

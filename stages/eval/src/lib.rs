@@ -2,12 +2,12 @@
 //!
 //! * `metric`: what a metric is; `metrics`: all of them. A new one is a file, and two lines in
 //!   `metrics/mod.rs`.
-//! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are given
-//!   and the build has libtorch): against HR truth.
-//! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there is, no
-//!   HR truth exists, and this alone can be known.
-//! * [`depth_error`]: where the truth has depth. [`WarpScore`]: a view's neighbour, brought over by the
-//!   rendered depths, against the view.
+//! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are
+//!   given and the build has libtorch): against HR truth.
+//! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there
+//!   is, no HR truth exists, and this alone can be known.
+//! * [`depth_error`]: where the truth has depth. [`WarpScore`]: a view's neighbour, brought over by
+//!   the rendered depths, against the view.
 //! * `derived`: the scores near references and the least gain, over all views.
 //!
 //! The crate `metrics` has the types of `metrics.json`. A module here has this name, too, so paths

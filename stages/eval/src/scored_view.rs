@@ -120,8 +120,8 @@ fn check_sizes(true_view: &View, found: &Image, expected: Option<&Image>) -> any
     Ok(())
 }
 
-/// A render at the size of an LR image. As 8 bits would, it is clamped: a kernel with negative lobes
-/// overshoots.
+/// A render at the size of an LR image. As 8 bits would, it is clamped: a kernel with negative
+/// lobes overshoots.
 fn shrunk(found: &Image, lr: &Image, filter: Filter) -> Image {
     let (from, to) = ((found.width, found.height), (lr.width, lr.height));
     let mut shrunk = Resampling::new(filter, from, to).apply(found);

@@ -2,10 +2,11 @@ use rayon::prelude::*;
 
 use crate::seen::{SeenView, Sight};
 
-/// Views see one surface where they agree to so many pixel widths,
+/// Views see one surface where they agree to so many pixel widths.
 const AGREEMENT_PIXELS: f64 = 2.0;
-/// and their normals to 45°: thin things have another side.
-const SAME_SIDE_COSINE: f64 = 0.7;
+/// They see one side of it where the cosine between their normals is larger: normals agree to 45°.
+/// Thin things have another side.
+const MERGED_SIDE_COSINE: f64 = 0.7;
 
 /// Moves what each view sees to the mean of what all views see of the same surface, and drops what
 /// more than a third of them look through: floaters, and fringes of edges.
@@ -32,7 +33,7 @@ fn shift(views: &[SeenView], view: &SeenView, at: usize) -> Option<f32> {
     for other in views {
         match other.look(point, reach) {
             Sight::Surface { distance, cosine, index }
-                if other.world_normal(index).dot(normal) > SAME_SIDE_COSINE =>
+                if other.world_normal(index).dot(normal) > MERGED_SIDE_COSINE =>
             {
                 let weight = cosine.max(0.05);
                 sum += weight * distance;

@@ -130,10 +130,10 @@ impl SeenView {
         }
     }
 
-    /// The way along the surface from before a pixel to behind it, in a row or a column. Beside it,
-    /// for how many pixels the surface goes on to both sides. `None` where it ends on both. `place`
-    /// is the pixel's place in its line and the line's length, `stride` the distance of the line's
-    /// pixels.
+    /// The way along the surface from before a pixel to behind it, in a row or a column. Also
+    /// returns for how many pixels the surface goes on to both sides. `None` where it ends on both.
+    /// `place` is the pixel's place in its line and the line's length, `stride` the distance of the
+    /// line's pixels.
     fn tangent(
         &self,
         at: usize,

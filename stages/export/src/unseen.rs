@@ -9,8 +9,9 @@ use crate::seen::{SeenView, Sight};
 /// A pixel shows what is at most so many pixel widths from its middle on the surface: about half a
 /// pixel's diagonal, seen straight. A mesh isn't known better than to a cell's width.
 const NEAR_PIXELS: f64 = 0.75;
-/// Cosine between a vertex's normal and the one that a view sees, for one side of a surface.
-const SAME_SIDE_COSINE: f64 = 0.3;
+/// A view shows a vertex's side of a surface where the cosine between the vertex's normal and the
+/// one that the view sees is larger.
+const SHOWN_SIDE_COSINE: f64 = 0.3;
 
 /// Where a surface ends at what no view shows, so many rows of triangles aren't known well.
 const UNSURE_ROWS: usize = 3;
@@ -43,6 +44,6 @@ fn shows(view: &SeenView, (position, normal): (DVec3, DVec3), reach: f32, cell: 
     let seen = view.world_normal(index);
     let off = position - view.world_point(index);
     let along = off - off.dot(seen) * seen;
-    seen.dot(normal) > SAME_SIDE_COSINE
+    seen.dot(normal) > SHOWN_SIDE_COSINE
         && along.length() <= cell.max(NEAR_PIXELS * view.footprint(index))
 }

@@ -196,6 +196,7 @@ mod tests {
         assert_eq!((check(&same[..1]), check(&[])), (Ok(()), Ok(())));
     }
 
+    #[track_caller]
     fn assert_one_warning(training: &[Camera], test: &[Camera], words: &str) {
         let found = warnings(training, test);
         assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");

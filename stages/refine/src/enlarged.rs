@@ -58,8 +58,8 @@ mod tests {
         }
     }
 
-    /// Views of a pixel with the level 0.2 and a transparent one on white. Of one the second pixel
-    /// doesn't count, and one has no image.
+    /// Three views. `whole` shows a pixel with the level 0.2 and a transparent one on white.
+    /// `masked` shows the same, but its second pixel doesn't count. `empty` has no image.
     fn folder() -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
         let image = Rgba8::new(2, 1, vec![51, 51, 51, 255, 0, 0, 0, 0]);

@@ -82,10 +82,10 @@ const DEPTH_SHIFT: f32 = 0.1;
 /// Views, spread over all, by which references are judged.
 const JUDGING_VIEWS: usize = 8;
 
-/// The references that agree with what is rendered; others are said and left out. In those,
-/// confidence is less than a share of what they see, unless it would be clearly less still were all
-/// depths others. Then depths are right, and confidence is low for another reason: seen from far
-/// aside, surfaces look otherwise.
+/// The references that agree with what is rendered; others are left out, and each is said once it
+/// is judged. In those, confidence is less than a share of what they see, unless it would be
+/// clearly less still were all depths others. Then depths are right, and confidence is low for
+/// another reason: seen from far aside, surfaces look otherwise.
 ///
 /// `confidence` is that in the references of the network's training.
 pub(crate) fn without_misleading(
@@ -98,10 +98,9 @@ pub(crate) fn without_misleading(
         return Ok(references);
     };
     let shown = |view: &View| job.shown(view).map(|(rendered, ..)| rendered);
-    let judge = Judge { views: &views.views, guidance, shown: &shown };
-    let (kept, notes) = judge.sort_out(references, confidence)?;
-    notes.iter().for_each(|note| job.context.say(note));
-    Ok(kept)
+    let say = |note: String| job.context.say(note);
+    Judge { views: &views.views, guidance, shown: &shown, say: &say }
+        .sort_out(references, confidence)
 }
 
 /// Judges references by some views.
@@ -110,30 +109,32 @@ struct Judge<'a> {
     guidance: Guidance,
     /// A view as the network takes it.
     shown: &'a dyn Fn(&View) -> Result<Rendered, Failure>,
+    /// Says what is wrong with a reference.
+    say: &'a dyn Fn(String),
 }
 
 impl Judge<'_> {
-    /// The references that aren't misleading, and what to say of each of the others.
+    /// The references that aren't misleading. Each of the others is said as soon as it is judged.
     fn sort_out(
         &self,
         references: Vec<KnownView>,
         confidence: f64,
-    ) -> anyhow::Result<(Vec<KnownView>, Vec<String>)> {
+    ) -> anyhow::Result<Vec<KnownView>> {
         let shares = self.confidence(&references, self.guidance, 1.0)?;
-        let (mut kept, mut notes) = (Vec::new(), Vec::new());
+        let mut kept = Vec::new();
         for (reference, share) in references.into_iter().zip(shares) {
             if share >= DOUBTED_BELOW * confidence || self.has_right_depth(&reference)? {
                 kept.push(reference);
                 continue;
             }
             let name = &reference.rendered.camera.name;
-            notes.push(format!(
+            (self.say)(format!(
                 "reference {name} looks otherwise than what is rendered (confidence {:.0} %) and \
                 is left out: wrong depth, a wrong pose, or something that moved?",
                 100.0 * share
             ));
         }
-        Ok((kept, notes))
+        Ok(kept)
     }
 
     /// Whether confidence in a reference is clearly lower with all depths nearer and farther.
@@ -171,6 +172,8 @@ impl Judge<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::cell::{Cell, RefCell};
+
     use pixels::Image;
     use scene::{Camera, Intrinsics};
 
@@ -224,37 +227,57 @@ mod tests {
     fn misleading_references_are_left_out() {
         let rendered = known("view", 0.0, &colours(0.0)).rendered;
         let views = vec![View::camera_only(rendered.camera.clone()); 9];
-        let asked = std::cell::Cell::new(0);
+        let asked = Cell::new(0);
         let shown = |_: &View| {
             asked.set(asked.get() + 1);
             Ok::<_, Failure>(rendered.clone())
         };
-        let judge = Judge { views: &views, guidance: Guidance::default(), shown: &shown };
+        let said = RefCell::new(Vec::new());
+        let say = |note: String| said.borrow_mut().push(note);
+        let guidance = Guidance::default();
+        let judge = Judge { views: &views, guidance, shown: &shown, say: &say };
         let right = 100.0;
         let tinted: Vec<[f32; 3]> =
             colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
-        let sorted = |confidence: f64| {
+        let sorted = |judge: &Judge<'_>, confidence: f64| {
             let references = vec![
                 known("same", right, &colours(right)),
                 known("tinted", right, &tinted),
                 known("farther", right, &colours(right / 1.1)),
                 known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
             ];
-            let (kept, notes) = judge.sort_out(references, confidence).unwrap();
+            let kept = judge.sort_out(references, confidence)?;
             let names: Vec<String> = kept.into_iter().map(|k| k.rendered.camera.name).collect();
-            (names, notes)
+            anyhow::Ok(names)
         };
-        let (kept, notes) = sorted(1.0);
-        assert_eq!(kept, ["same", "tinted"]);
+        assert_eq!(sorted(&judge, 1.0).unwrap(), ["same", "tinted"]);
         // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
-        let words = ["reference farther looks", "(confidence 59 %)", "reference other looks"];
-        let said = notes.join("\n");
-        assert!(notes.len() == 2 && words.iter().all(|words| said.contains(words)), "{said}");
+        let starts = [
+            "reference farther looks otherwise than what is rendered (confidence 59 %)",
+            "reference other looks otherwise than what is rendered",
+        ];
+        let notes = said.take();
+        assert_eq!(notes.len(), 2, "{notes:?}");
+        assert!(notes[0].starts_with(starts[0]), "{}", notes[0]);
+        assert!(notes[1].starts_with(starts[1]), "{}", notes[1]);
         // Every second of nine views is asked for: once for all, then three times for each of three
         // doubted references.
         assert_eq!(asked.get(), 5 * (1 + 3 * 3));
         // Where the network's training had less confidence, less is asked for.
-        assert_eq!(sorted(0.7).0, ["same", "tinted", "farther"]);
+        assert_eq!(sorted(&judge, 0.7).unwrap(), ["same", "tinted", "farther"]);
+        // What was said of one isn't lost where views can't be read for the next.
+        asked.set(0);
+        said.borrow_mut().clear();
+        let failing = |view: &View| {
+            if asked.get() < 5 * (1 + 2 * 3) {
+                shown(view)
+            } else {
+                Err(Failure::BadInput("no view".to_owned()))
+            }
+        };
+        assert!(sorted(&Judge { shown: &failing, ..judge }, 1.0).is_err());
+        let notes = said.take();
+        assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
     }
 
     #[test]

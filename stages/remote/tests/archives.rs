@@ -76,6 +76,7 @@ fn a_history_may_be_records_alone() {
     assert_clean(&other);
 }
 
+#[track_caller]
 fn assert_not_exported(dir: &Path, store: &Store, what: &str, code: i32, reason: &str) {
     let file = dir.join("x.tar").display().to_string();
     let (found, _, err) = said(&mut command(store.root(), &["export", what, &file]));

@@ -403,8 +403,7 @@ mod tests {
         }
     }
 
-    /// A member that sees a wall at this z-depth, and expects it twice as far; more of it where it
-    /// is farther.
+    /// Sees a wall at this z-depth. Its expected depth is twice that. Opacity grows with the depth.
     struct Wall(f32);
 
     impl RayField for Wall {

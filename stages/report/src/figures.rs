@@ -21,8 +21,8 @@ pub(crate) fn is_best(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> bool 
     best.is_some() && row.mean(figure) == best
 }
 
-/// The figures that rows have, or that would be there with more inputs: as their metrics say it, and
-/// of metrics that say nothing the numbers among their means.
+/// The figures that rows have, or that would be there with more inputs: as their metrics say it,
+/// and of metrics that say nothing the numbers among their means.
 pub(crate) fn figures(rows: &[Row<'_>]) -> Vec<Figure> {
     let mut figures: Vec<Figure> = Vec::new();
     for row in rows {

@@ -159,7 +159,8 @@ fn times(run: &RunRecord, index: usize) -> anyhow::Result<Row> {
         ancestors.iter().copied().filter(|i| is_views(i) && !in_training.contains(i)).collect();
     let refining: Vec<usize> =
         rendering.iter().copied().filter(|&i| !is_by_field(run, i)).collect();
-    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0; // of nothing it is -0
+    // 0 is added since the sum of nothing is -0.
+    let seconds = |nodes: &[usize]| nodes.iter().map(|&i| run.nodes[i].seconds).sum::<f64>() + 0.0;
     let mut row = Row::new();
     for (name, nodes) in [("train_s", &training), ("render_s", &rendering), ("refine_s", &refining)]
     {

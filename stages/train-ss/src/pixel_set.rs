@@ -87,7 +87,8 @@ mod tests {
             prop_assert_eq!(set.len(), list.len() as u64);
             prop_assert!((0..).zip(&list).all(|(n, pixel)| set.nth(n) == Some(*pixel)));
             prop_assert!(set.nth(set.len()).is_none());
-            prop_assert!((0..2100u64).all(|pixel| set.contains(pixel) == list.binary_search(&pixel).is_ok()));
+            let is_listed = |pixel: u64| list.binary_search(&pixel).is_ok();
+            prop_assert!((0..2100u64).all(|pixel| set.contains(pixel) == is_listed(pixel)));
         }
     }
 }

@@ -566,7 +566,8 @@ mod tests {
         let resolved = Params::default().resolve(&facts(Space::Box, Background::White));
         let resolved =
             Resolved { precrop_steps: 10, max_rays_per_step: 64, rays: 6400, ..resolved };
-        // 16 bundles of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with 16.
+        // 16 bundles of 4 rays a step; 64 of one ray; 3 steps of those, 3 with 4 rays and 4 with
+        // 16.
         assert_eq!(
             [
                 bundles(&resolved, 0.0, 2.0),

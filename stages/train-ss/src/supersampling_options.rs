@@ -38,8 +38,8 @@ impl SupersamplingOptions {
         (length(width, 0), length(height, 1))
     }
 
-    /// Whether HR pixels of LR photographs of such sizes are cached: of all, where the kernel of one
-    /// asks for it.
+    /// Whether HR pixels of LR photographs of such sizes are cached: of all, where the kernel of
+    /// one asks for it.
     pub(crate) fn needs_cache(&self, mut lr_sizes: impl Iterator<Item = (usize, usize)>) -> bool {
         let is_needed = |lr| HrCache::is_needed(self.filter, self.hr_size(lr), lr);
         self.supervision == Supervision::Kernel && lr_sizes.any(is_needed)

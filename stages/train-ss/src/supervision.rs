@@ -665,8 +665,8 @@ mod tests {
         assert!(block_means(&masked, [2, 2]).data.iter().all(|v| v.is_nan()));
     }
 
-    /// At a broken scale a box may be whole for a photograph of one size and not for another's: then
-    /// the pixels of both are cached, and each is compared with its own.
+    /// At a broken scale a box may be whole for a photograph of one size and not for another's:
+    /// then the pixels of both are cached, and each is compared with its own.
     #[test]
     fn sizes_share_a_cache() {
         let (_, camera) = example(Supervision::Kernel, [2.0, 2.0], None);

@@ -82,7 +82,7 @@ fn together(seen: &mut [Pixel]) -> Pixel {
     }
 }
 
-/// The mean of a number that each of some has: what a pixel shows of several rays or fields.
+/// The mean of one number over all items. Pixels take it over rays or fields.
 pub fn mean<T>(items: &[T], number: impl Fn(&T) -> f32) -> f32 {
     let share = 1.0 / items.len().max(1) as f32;
     share * items.iter().map(number).sum::<f32>()

@@ -41,6 +41,7 @@ impl Figure {
 
     /// A number of it as text, with its digits and without its unit.
     pub fn text(&self, value: f64) -> String {
-        format!("{value:.*}", self.digits)
+        // A file may ask for more than the formatter takes.
+        format!("{value:.*}", self.digits.min(f64::DIGITS as usize))
     }
 }

@@ -48,8 +48,8 @@ pub const METRICS_FILE: &str = "metrics.json";
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Metrics {
-    /// How the figures were made, in words, by metric; also what was behind the scene (`background`)
-    /// and what error maps show (`error_maps`).
+    /// How the figures were made, in words, by metric; also what was behind the scene
+    /// (`background`) and what error maps show (`error_maps`).
     pub conventions: BTreeMap<String, String>,
     /// The figures, and how they are shown, the most important first.
     pub figures: Vec<Figure>,

@@ -12,8 +12,8 @@ pub(crate) struct Perspective {
     pub(crate) filled: [usize; 4],
 }
 
-/// How far corners move, as a share.
-const MOST_CORNER_SHIFT: f64 = 0.3;
+/// How far corners move, at most, as a share of the half width and height.
+const MOST_CORNER_SHIFT_SHARE: f64 = 0.3;
 
 impl Perspective {
     /// No change.
@@ -23,8 +23,9 @@ impl Perspective {
 
     /// A random one.
     pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
-        let mut inwards =
-            |size: usize| rng.below((MOST_CORNER_SHIFT * (size / 2) as f64) as u64 + 1) as f64;
+        let mut inwards = |size: usize| {
+            rng.below((MOST_CORNER_SHIFT_SHARE * (size / 2) as f64) as u64 + 1) as f64
+        };
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {

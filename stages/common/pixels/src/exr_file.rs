@@ -133,7 +133,8 @@ fn header<'a>(
         }
     });
     let list = ChannelList::new(described.collect());
-    // With the crate's default line order 40 files of 40 differed.
+    // The crate's default line order isn't fixed: of 40 writings of one image no two files were
+    // equal (shared/facts/pipelines.md).
     let mut header = Header::new(Text::from("views"), size, list.list).with_encoding(
         Compression::ZIP16,
         BlockDescription::ScanLines,

@@ -126,3 +126,16 @@ pub fn to_u8(value: f32) -> u8 {
 pub fn psnr_of(mean_squared_error: f64) -> f64 {
     (-10.0 * mean_squared_error.log10()).min(100.0)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rgb_becomes_what_the_library_makes_of_it() {
+        let bytes = (0..5 * 3 * 3).map(|i| (i * 37 % 256) as u8).collect();
+        let image = DynamicImage::ImageRgb8(image::RgbImage::from_raw(5, 3, bytes).unwrap());
+        let expected = image.clone().into_rgba8().into_raw();
+        assert_eq!(Rgba8::from(image), Rgba8::new(5, 3, expected));
+    }
+}

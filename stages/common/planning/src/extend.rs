@@ -8,7 +8,7 @@ use crate::part::PipelineError;
 use crate::pipeline::Pipeline;
 
 /// Most files in a chain of which each extends the next.
-const DEEPEST: usize = 8;
+const MOST_CHAINED_FILES: usize = 8;
 
 /// Two pipelines that can't be one: a block of one is another in the other.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -28,8 +28,8 @@ impl Pipeline {
         let bytes = std::fs::read(path).map_err(|e| PipelineError {
             place: path.display().to_string(),
             problem: format!(
-                "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one with \
-                `nerf-sr init DIR`"
+                "{e}; run in the folder of pipeline.yaml, name it with --pipeline, or write one \
+                with `nerf-sr init DIR`"
             ),
         })?;
         Self::parse(&bytes, path)
@@ -74,9 +74,10 @@ fn extended(file: File, trail: &mut Vec<PathBuf>) -> Result<Pipeline, PipelineEr
         if trail.contains(&id) {
             return Err(fail("that file is this one or extends it; leave it out".to_owned()));
         }
-        if trail.len() == DEEPEST {
+        if trail.len() == MOST_CHAINED_FILES {
             return Err(fail(format!(
-                "more than {DEEPEST} files extend one another; extend a file nearer to the last"
+                "more than {MOST_CHAINED_FILES} files extend one another; extend a file nearer to \
+                the last"
             )));
         }
         let bytes = std::fs::read(&id).map_err(|e| fail(e.to_string()))?;

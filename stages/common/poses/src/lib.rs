@@ -208,7 +208,7 @@ const HUBER_ERROR: f64 = 0.1;
 /// Of a pixel that stops less, no place is known. It is low since edges that are still soft have to
 /// pull from both sides: their inner halves alone would make everything too large, and cameras back
 /// away.
-const LEAST_OPACITY: f32 = 0.02;
+const LEAST_PLACE_OPACITY: f32 = 0.02;
 
 /// Least squares for a small motion of the camera, linear about where it is.
 struct Equations {
@@ -238,7 +238,8 @@ impl Equations {
             .map(|(pixel, seen)| {
                 let distance = if seen.opacity > 0.5 { seen.median_depth } else { seen.depth };
                 let depth = f64::from(distance) * camera.depth_per_distance(&cast(pixel).0);
-                (seen.opacity > LEAST_OPACITY && depth.is_finite() && depth > 0.0).then_some(depth)
+                (seen.opacity > LEAST_PLACE_OPACITY && depth.is_finite() && depth > 0.0)
+                    .then_some(depth)
             })
             .collect();
         let mut sorted: Vec<f64> = depths.iter().flatten().copied().collect();

@@ -53,8 +53,12 @@ fn diagonal(matrix: DMat3) -> DVec3 {
     DVec3::new(matrix.x_axis.x, matrix.y_axis.y, matrix.z_axis.z)
 }
 
+/// The inverse of a symmetric matrix; none unless it is positive, by its leading minors
+/// (Sylvester).
 fn positive_inverse(matrix: DMat3) -> Option<DMat3> {
-    (matrix.determinant() > 0.0).then(|| matrix.inverse())
+    let [x, y] = [matrix.x_axis, matrix.y_axis];
+    let minors = [x.x, x.x * y.y - x.y * y.x, matrix.determinant()];
+    minors.iter().all(|minor| *minor > 0.0).then(|| matrix.inverse())
 }
 
 #[cfg(test)]
@@ -93,6 +97,17 @@ mod tests {
         assert!(matrix.solve([DVec3::X, DVec3::ZERO]).is_none());
         let [turn, shift] = matrix.damped(1.0).solve([8.0 * DVec3::X, DVec3::ZERO]).unwrap();
         assert!((turn - DVec3::X).length() < 1e-6 && shift == DVec3::ZERO, "{turn} {shift}");
+    }
+
+    #[test]
+    fn matrices_that_are_not_positive_have_no_solution() {
+        for diagonal in [DVec3::new(-1.0, -1.0, 1.0), DVec3::new(1.0, -1.0, -1.0), -DVec3::X] {
+            let turning = DMat3::from_diagonal(diagonal);
+            let matrix = NormalMatrix { turning, shifting: DMat3::IDENTITY, ..NormalMatrix::ZERO };
+            assert!(matrix.solve([DVec3::ONE; 2]).is_none(), "{diagonal}");
+            let matrix = NormalMatrix { turning: DMat3::IDENTITY, shifting: turning, ..matrix };
+            assert!(matrix.solve([DVec3::ONE; 2]).is_none(), "{diagonal}");
+        }
     }
 
     #[test]

@@ -23,7 +23,7 @@ const MOST_PIXELS_PER_VIEW: usize = 1024;
 /// Others that each is compared with: those that were taken from nearest by.
 const NEIGHBOURS: usize = 2;
 /// Of less than this opacity no surface is known.
-const LEAST_OPACITY: f32 = 0.5;
+const LEAST_SURFACE_OPACITY: f32 = 0.5;
 /// Two distances of one surface differ by at most this share of them.
 const SAME_DISTANCE_SHARE: f64 = 0.02;
 
@@ -71,7 +71,7 @@ fn surfaces(
         places.map(|place| cast(shot.camera, place, background)).unzip();
     let seen = pixels.iter().zip(lines).zip(field.render(&rays)?);
     Ok(seen
-        .filter(|(_, seen)| seen.opacity > LEAST_OPACITY && seen.median_depth.is_finite())
+        .filter(|(_, seen)| seen.opacity > LEAST_SURFACE_OPACITY && seen.median_depth.is_finite())
         .map(|((pixel, line), seen)| {
             let colour = [0, 1, 2].map(|c| pixel.colour[c] * shot.exposure[c]);
             Place { at: line.at(f64::from(seen.median_depth)), colour }
@@ -107,7 +107,7 @@ fn errors(
         let is_same =
             (f64::from(seen.median_depth) - distance).abs() <= SAME_DISTANCE_SHARE * distance;
         let colour = shot.photograph.colour_at([x as f32, y as f32]);
-        if seen.opacity > LEAST_OPACITY && is_same && colour.iter().all(|v| v.is_finite()) {
+        if seen.opacity > LEAST_SURFACE_OPACITY && is_same && colour.iter().all(|v| v.is_finite()) {
             let error = |c: usize| huber(f64::from(colour[c] * shot.exposure[c] - place.colour[c]));
             found.extend([0, 1, 2].map(error));
         }

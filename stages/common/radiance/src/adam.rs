@@ -30,8 +30,8 @@ impl AdamStep {
     }
 }
 
-/// Which blocks of 16 numbers a step has touched: a byte each, 0 or 1, since a bit would have to be
-/// read before it is set.
+/// Which blocks of 16 numbers a step has touched: a byte each, since a bit would have to be read
+/// before it is set.
 pub(crate) type Touched = [u8];
 
 /// Blocks whose marks are looked at together.
@@ -60,7 +60,7 @@ kernel! {
             let mut count = 0;
             for (block, mark) in (start..).zip(marks) {
                 list[count] = block;
-                count += usize::from(std::mem::take(mark));
+                count += usize::from(std::mem::take(mark) != 0);
             }
             for at in 0..count {
                 // Blocks lie far apart in memory, and there is little to do for each.
@@ -91,7 +91,10 @@ kernel! {
 
 #[cfg(test)]
 mod tests {
+    use counter_rng::uniform;
+
     use super::*;
+    use crate::simd::by_every_family;
 
     #[test]
     fn equals_adam_in_f64_where_touched() {
@@ -122,5 +125,42 @@ mod tests {
             assert!((f64::from(*w) - e[0]).abs() < 1e-6, "{i}");
         }
         assert_eq!(w[3], 0.3);
+    }
+
+    /// Numbers of many blocks, few of them touched, after a step in pieces of so many blocks.
+    fn after_step(in_pieces_of: usize) -> [Vec<f32>; 4] {
+        let blocks = 9001;
+        let [mut w, mut m, mut v, mut g] = [0, 1, 2, 3].map(|purpose| -> Vec<f32> {
+            (0..(blocks * LANES) as u64).map(|i| uniform(7, purpose, i)).collect()
+        });
+        let mut touched: Vec<u8> =
+            (0..blocks as u64).map(|block| u8::from(uniform(8, 0, block) < 0.1)).collect();
+        for (block, numbers) in g.chunks_mut(LANES).enumerate() {
+            if touched[block] == 0 {
+                numbers.fill(0.0);
+            }
+        }
+        let (step, len) = (AdamStep::new(3, 0.01, 0.0), in_pieces_of * LANES);
+        for (i, touched) in touched.chunks_mut(in_pieces_of).enumerate() {
+            let here = i * len..(i * len + touched.len() * LANES);
+            let [w, g, m, v] = [&mut w, &mut g, &mut m, &mut v].map(|n| &mut n[here.clone()]);
+            adam(&step, touched, w, g, m, v);
+        }
+        assert!(touched.iter().all(|mark| *mark == 0));
+        [w, g, m, v]
+    }
+
+    #[test]
+    fn pieces_and_families_give_equal_bits_and_leave_what_is_untouched() {
+        let whole = after_step(1 << 20);
+        for (block, numbers) in whole[0].chunks(LANES).enumerate() {
+            let begin = uniform(7, 0, (block * LANES) as u64);
+            assert_eq!(numbers[0] != begin, uniform(8, 0, block as u64) < 0.1, "block {block}");
+        }
+        by_every_family(|family| {
+            for pieces in [1, 255, 4096] {
+                assert!(after_step(pieces) == whole, "{family:?}, pieces of {pieces}");
+            }
+        });
     }
 }

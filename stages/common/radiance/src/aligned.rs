@@ -1,16 +1,18 @@
 use std::fmt;
 use std::ops::{Deref, DerefMut};
 
+use crate::spec::{BRICK, FEATURES};
+
 /// Bytes of a brick: two cache lines.
-const ALIGNMENT: usize = 128;
+const ALIGNMENT: usize = BRICK * FEATURES * size_of::<f32>();
 /// Numbers by which the first one is moved at most.
 const MOVED: usize = ALIGNMENT / size_of::<f32>() - 1;
 
 /// Numbers that begin at a whole brick, so that a vector lies in one cache line and a brick in two.
 /// The allocator's own arrays begin 16 bytes later, where vectors lie in two and bricks in three.
 ///
-/// The system is asked for large pages: samples read and write tables of many MiB at random, and the
-/// processor remembers few addresses of pages.
+/// The system is asked for large pages: samples read and write tables of many MiB at random, and
+/// the processor remembers few addresses of pages.
 #[derive(Default)]
 pub(crate) struct Aligned {
     memory: Vec<f32>,

@@ -132,10 +132,12 @@ fn outer_tile<L: Lanes, const TI: usize, const TJ: usize>(
     for (k, acc) in acc.iter().enumerate() {
         let to = &mut gradient[(i + k) * outputs + j..][..TJ];
         for (to, acc) in to.chunks_mut(4).zip(acc.chunks(4)) {
-            let mut sums = [0.0; 4];
-            let four = std::array::from_fn(|l| acc.get(l).copied().unwrap_or(L::splat(0.0)));
+            let (mut four, mut sums) = ([L::splat(0.0); 4], [0.0; 4]);
+            four[..acc.len()].copy_from_slice(acc);
             L::sums(four).store(&mut sums);
-            to.iter_mut().zip(sums).for_each(|(to, sum)| *to += sum);
+            for (to, sum) in to.iter_mut().zip(sums) {
+                *to += sum;
+            }
         }
     }
 }

@@ -25,7 +25,7 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 
 /// Steps of a training between updates of the occupancy.
 const EVERY: u64 = 32;
-/// An update looks at one occupied cell in so many, and at one empty cell in so many, a multiple.
+/// An update looks at one occupied cell in so many, and at one empty cell in so many.
 const OCCUPIED_TURNS: usize = 4;
 const EMPTY_TURNS: usize = 16;
 /// Until this step empty cells are looked at as often as occupied ones.
@@ -156,7 +156,9 @@ impl Occupancy {
         if step == 0 || !step.is_multiple_of(EVERY) {
             return Vec::new();
         }
-        // No other cell has its turn; each plane begins with another one.
+        // Whoever has an empty cell's turn has an occupied one's, too: only those are gone through.
+        const { assert!(EMPTY_TURNS.is_multiple_of(OCCUPIED_TURNS)) };
+        const { assert!(GRID.is_multiple_of(OCCUPIED_TURNS)) };
         let turn = (step / EVERY) as usize;
         let planes = (0..GRID).into_par_iter().flat_map_iter(|z| {
             let first = (turn + GRID - z) % OCCUPIED_TURNS;
@@ -372,8 +374,8 @@ kernel! {
                 let mut exit = f32::INFINITY;
                 if let RayMap::Straight { .. } = ray.map {
                     for i in 0..3 {
-                        let face = if ray.direction[i] > 0.0 { low[i] + size } else { low[i] } as f32 / GRID as f32;
-                        let until = (face - ray.origin[i]) * inverse[i];
+                        let face = low[i] + if ray.direction[i] > 0.0 { size } else { 0 };
+                        let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
                         if ray.direction[i] != 0.0 && until < exit {
                             exit = until;
                         }
@@ -485,6 +487,17 @@ mod tests {
         assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);
+    }
+
+    #[test]
+    fn cells_to_update_are_those_whose_turn_it_is() {
+        let mut occupancy = Occupancy::full();
+        occupancy.set(|cell| if cell / 5 % 7 == 0 { Cell::Thin } else { Cell::Empty });
+        for step in [EVERY, 3 * EVERY, WARM_UP, WARM_UP + EVERY, WARM_UP + 7 * EVERY] {
+            let expected = (0..CELLS).filter(|&cell| occupancy.is_looked_at(cell, step));
+            let found = occupancy.cells_to_update(step);
+            assert!(found.into_iter().map(|cell| cell as usize).eq(expected), "step {step}");
+        }
     }
 
     #[test]

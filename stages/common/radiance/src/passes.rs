@@ -1,5 +1,5 @@
-use crate::chunk::CHUNK_RAYS;
-use crate::chunk::{Chunk, FeatureGradients, Roulette};
+use crate::aligned::Aligned;
+use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
 use crate::occupancy::Strides;
 use crate::ray::{Ray, clip};
@@ -11,7 +11,7 @@ use crate::shading::{NetworkGradients, RayGradients};
 #[derive(Debug)]
 pub struct Passes {
     chunk: Chunk,
-    transposed: Vec<f32>,
+    transposed: Aligned,
     network: Vec<f32>,
     into: FeatureGradients,
     touched: Vec<u8>,
@@ -20,7 +20,7 @@ pub struct Passes {
 impl Passes {
     /// Buffers for a field.
     pub fn new(field: &Field) -> Self {
-        let mut transposed = vec![0.0; field.network.len()];
+        let mut transposed = Aligned::zeros(field.network.len());
         field.layers.all().iter().for_each(|l| l.transpose(&field.network, &mut transposed));
         let blocks = field.levels.iter().map(crate::grid::Level::blocks).max().unwrap_or(0);
         Self {

@@ -47,7 +47,8 @@ pub struct NormalizedRay {
 #[derive(Clone, Copy, Debug)]
 pub enum RayMap {
     /// Position origin + t·direction, distance start + t·scale / (1 - t·perspective): a perspective
-    /// map keeps lines straight and moves along them as a Möbius map does; a box has `perspective` 0.
+    /// map keeps lines straight and moves along them as a Möbius map does; in a box `perspective`
+    /// is 0.
     Straight {
         /// Distance where t is 0.
         start: f32,

@@ -104,8 +104,8 @@ kernel! {
                 sum.weight += w;
                 sum.distance = w.mul_add(ray.distance(samples.marched.t[i]), sum.distance);
             }
-            let inputs = outputs[VIEW_FEATURE..].iter().copied().chain(spherical_harmonics(ray.view));
-            for (row, value) in inputs.enumerate() {
+            let features = outputs[VIEW_FEATURE..].iter().copied();
+            for (row, value) in features.chain(spherical_harmonics(ray.view)).enumerate() {
                 input[row * n + column] = value;
             }
         }

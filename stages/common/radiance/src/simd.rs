@@ -77,7 +77,9 @@ pub fn set_family(family: Family) {
 /// Runs a test by every family that this machine has, and says which it lacks.
 #[cfg(test)]
 pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
-    let best = Family::current();
+    // Tests run beside each other, and the family is that of the process.
+    static ALONE_HERE: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    let _alone = ALONE_HERE.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     for family in [Family::Avx512, Family::Avx2, Family::Portable] {
         if family.is_supported() {
             set_family(family);
@@ -86,7 +88,7 @@ pub(crate) fn by_every_family(mut test: impl FnMut(Family)) {
             eprintln!("skipped: this machine has no {family:?}");
         }
     }
-    set_family(best);
+    [Family::Portable, Family::Avx2, Family::Avx512].into_iter().for_each(set_family);
 }
 
 /// Four `f32`: the features of a vertex.
@@ -187,7 +189,8 @@ impl Lanes for Portable {
 pub(crate) mod x86 {
     //! `unsafe` here pays with a known vector width: left to the optimiser, the accumulators of a
     //! matrix tile spill. All of it is sound because these types are only used inside functions
-    //! compiled for their features (see `kernel!`). A closure doesn't inherit them, so there are none.
+    //! compiled for their features (see `kernel!`). No closure here: it wouldn't inherit them, and
+    //! its intrinsics would be calls.
 
     use std::arch::x86_64::*;
 

@@ -104,15 +104,15 @@ fn drawn_view(
 const SHARDS: usize = 8;
 /// Steps over which the rate rises.
 const WARM_UP_STEPS: u64 = 50;
-/// Squares with less contrast than this are drawn anew, up to so many times: flat ones teach
-/// nothing.
+/// Squares with less contrast than this are drawn anew: flat ones teach nothing.
 const LEAST_CONTRAST: f32 = 0.08;
+/// A square is drawn anew at most so many times.
 const MOST_REDRAWS: usize = 8;
 /// A reference-based network gets no reference once in so many times, so that it can do without.
 const NO_REFERENCE_EVERY: u64 = 8;
-/// Views that squares are drawn from at a time where there are references, and steps until they are
-/// drawn anew.
+/// Views that squares are drawn from at a time where there are references.
 const POOL_VIEWS: u64 = 32;
+/// Steps until those views are drawn anew.
 const POOL_STEPS: u64 = 200;
 /// Purposes of draws.
 const SQUARES: u64 = 301;

@@ -64,9 +64,9 @@ pub struct ConditionedView {
     pub uses: Vec<Use>,
 }
 
-/// A mean difference that halves the confidence, twice; and how far, in pixels, a reference may
-/// jump between neighbours before it does.
-const HALVING_DIFFERENCE: f32 = 0.1;
+/// The mean difference around a pixel that quarters the confidence.
+const QUARTERING_DIFFERENCE: f32 = 0.1;
+/// The jump between neighbours that halves the confidence, in pixels of the reference.
 const HALVING_JUMP: f32 = 1.0;
 
 impl ReferenceFeatures {
@@ -139,7 +139,7 @@ fn warp(
         for x in 0..width {
             let mut own = warped[y * width + x];
             if own.confidence > 0.0 {
-                let apart = mean_difference(&sums, x, y) / HALVING_DIFFERENCE;
+                let apart = mean_difference(&sums, x, y) / QUARTERING_DIFFERENCE;
                 let jumped = neighbours.jumped(x, y);
                 own.confidence *=
                     (1.0 + apart * apart).powi(-2) / (1.0 + jumped / (HALVING_JUMP * HALVING_JUMP));
@@ -355,7 +355,7 @@ mod tests {
         assert_eq!(judged(&view, &wall(500, |_| 2.0), Guidance::default()).0, 0.0);
     }
 
-    fn off(depth: f32, alignment: bool) -> f64 {
+    fn error_at_depth(depth: f32, alignment: bool) -> f64 {
         let guidance = Guidance { alignment, ..Guidance::default() };
         judged(&wall(0, |_| depth), &wall(24, |_| depth), guidance).2
     }
@@ -365,10 +365,11 @@ mod tests {
     #[test]
     fn alignment_moves_what_is_shown_to_where_it_fits() {
         for depth in [1.9, 2.1] {
-            let (moved, was) = (off(depth, true), off(depth, false));
+            let (moved, was) = (error_at_depth(depth, true), error_at_depth(depth, false));
             assert!(moved < 0.7 * was, "depth {depth}: {moved} off where it was {was}");
         }
-        assert!(off(2.0, true) < 0.01, "{}", off(2.0, true));
+        let right = error_at_depth(2.0, true);
+        assert!(right < 0.01, "{right}");
     }
 
     fn seen(view: &KnownView, reference: &KnownView, occlusion: bool) -> usize {

@@ -24,10 +24,11 @@ pub struct Visibility {
     pub detail: f32,
 }
 
-/// Two depths of one surface differ by at most this share of them,
+/// Two depths are of one surface where they differ by at most this share.
 const SAME_DEPTH_SHARE: f64 = 0.02;
-/// or what one view sees at the other's depth it sees in the same pixel, at most so many pixels
-/// away: of a far wall views from nearly one place tell depth badly, and it matters as little.
+/// They are of one surface, too, where the first view sees the second's point at most so many
+/// pixels from its own. Views from nearly one place tell the depth of a far wall badly, and it
+/// matters as little.
 const SAME_PLACE_PIXELS: f64 = 0.5;
 
 impl Surface<'_> {

@@ -1,5 +1,5 @@
-//! Against PyTorch: `tests/goldens/mlp.safetensors` is made by `scripts/goldens/torch_field.py` (`make
-//! goldens`).
+//! Against PyTorch: `tests/goldens/mlp.safetensors` is made by `scripts/goldens/torch_field.py`
+//! (`make goldens`).
 
 use counter_rng::uniform;
 use radiance::MlpArchitecture;

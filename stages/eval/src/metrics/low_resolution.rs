@@ -6,8 +6,8 @@ use crate::scored_view::{ScoredScene, ScoredView};
 use super::psnr::masked_psnr;
 use super::ssim::ssim;
 
-/// PSNR and SSIM of a render shrunk to LR, by the kernel that made the LR images or is taken to have
-/// made them, against the view's LR image.
+/// PSNR and SSIM of a render shrunk to LR, by the kernel that made the LR images or is taken to
+/// have made them, against the view's LR image.
 pub(crate) struct LowResolutionMetric;
 
 impl Metric for LowResolutionMetric {

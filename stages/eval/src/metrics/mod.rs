@@ -1,5 +1,5 @@
-//! What views are scored by: a file for each metric. A new one is a file, and here its `mod` and its
-//! place in the list.
+//! What views are scored by: a file for each metric. A new one is a file, and here its `mod` and
+//! its place in the list.
 
 mod depth;
 mod low_resolution;

@@ -5,7 +5,7 @@ use planning::{Origin, Plan, Request, State};
 
 use crate::session::Session;
 
-/// As what a plan is drawn.
+/// How a plan is drawn.
 // Its values are without texts of their own: clap would give every verb's help its long form.
 #[derive(Clone, Copy, clap::ValueEnum)]
 pub(crate) enum GraphFormat {
