@@ -50,14 +50,25 @@ def newer(name: str, renames: dict[str, str]) -> str:
     return next((new for new, old in renames.items() if old == name), name)
 
 
+def printed(command: list) -> str:
+    return subprocess.run(command, check=True, text=True, stdout=subprocess.PIPE).stdout
+
+
+def has_json(runner: pathlib.Path) -> bool:
+    """Whether a runner has `status --json`: builds before 5fe62be, such as those before the glossary, have words alone."""
+    return "--json" in printed([runner, "status", "--help"])
+
+
 def artifacts(tree: pathlib.Path, folder: pathlib.Path, words: list[str], has_old_names: bool) -> dict[str, pathlib.Path]:
     """The artifacts of a run, by stage and point; with today's names."""
     words = [older(word) for word in words] if has_old_names else words
     runner = [tree / "target/release/nerf-sr", "--pipeline", tree / "pipeline.yaml", "--store", folder / "store"]
     subprocess.run([*runner, "run", "--out", folder / "out", *words], check=True, stdout=subprocess.DEVNULL)
-    status = subprocess.run([*runner, "status", *words], check=True, text=True, stdout=subprocess.PIPE).stdout
+    if has_json(runner[0]):
+        made = [node for node in json.loads(printed([*runner, "status", "--json", *words]))["nodes"] if node["state"] == "cached"]
+        return {f"{node['stage']} [{node['point']}]".removesuffix(" []"): pathlib.Path(node["folder"]) for node in made}
     found = {}
-    for line in status.splitlines():
+    for line in printed([*runner, "status", *words]).splitlines():
         label, cached, rest = line.partition(" cached ")
         if cached:
             stage, _, point = label.strip().partition(" ")

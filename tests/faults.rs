@@ -4,8 +4,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::process::Stdio;
-use std::time::Duration;
+use std::io::{BufRead as _, BufReader, Read as _};
 
 use common::{
     Finished, Project, checkpoints, demo_train, kill_again_and_again, last_checkpoint, manifest,
@@ -43,15 +42,11 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let inputs = [("scene", train.as_path())];
     let (output, work) = (project.path("out"), project.path("work"));
     let more = ["--work", work.to_str().unwrap()];
-    let child = stage_command("train-ss", PARAMS, &inputs, &output, &more)
-        .stderr(Stdio::piped())
-        .spawn()
+    let stopped = stage_command("train-ss", PARAMS, &inputs, &output, &more)
+        .env("NERF_SR_STOP_AFTER", "20000")
+        .output()
         .unwrap();
-    // Its folder is made just before the first step.
-    wait_until(|| work.join("member-0").is_dir());
-    std::thread::sleep(Duration::from_millis(100));
-    signal(&child, "-TERM");
-    let finished = Finished::of(child.wait_with_output().unwrap());
+    let finished = Finished::of(stopped);
     assert_eq!(finished.code, 130, "{}", finished.stderr);
     assert!(
         finished.stderr.contains("interrupted; run again to go on from here"),
@@ -69,33 +64,41 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     assert_eq!(manifest(&output), manifest(&whole));
 }
 
+/// Starts a run and kills it when something has happened.
+fn kill_once(project: &Project, mut happened: impl FnMut() -> bool) {
+    let mut child = project.spawn(&["run"]);
+    wait_until(|| happened() || child.try_wait().unwrap().is_some());
+    signal(&child, "-KILL");
+    let finished = Finished::of(child.wait_with_output().unwrap());
+    assert_eq!(finished.code, -1, "the kill came too late: {}", finished.stderr);
+}
+
+/// Starts a run and interrupts it when it has said something; all that it said.
+fn interrupt_once_said(project: &Project, words: &str) -> String {
+    let mut child = project.spawn(&["run"]);
+    let mut stderr = BufReader::new(child.stderr.take().unwrap());
+    let mut said = String::new();
+    while !said.contains(words) {
+        assert_ne!(stderr.read_line(&mut said).unwrap(), 0, "it ended without {words:?}: {said}");
+    }
+    signal(&child, "-INT");
+    stderr.read_to_string(&mut said).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{said}");
+    said
+}
+
 #[test]
 fn a_runner_killed_or_interrupted_goes_on() {
     let project = Project::tiny();
     project.replace("rays: 60000", "rays: 1500000");
-    let spawn =
-        || project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    for (name, milliseconds) in [("-KILL", 150), ("-KILL", 900), ("-INT", 1200)] {
-        let child = spawn();
-        std::thread::sleep(Duration::from_millis(milliseconds));
-        // However slow the machine is just now, the interruption comes while something is being
-        // trained.
-        wait_until(|| {
-            name != "-INT" || last_checkpoint(&project.path(".nerf-sr/partial")).is_some()
-        });
-        signal(&child, name);
-        let finished = Finished::of(child.wait_with_output().unwrap());
-        if name == "-INT" {
-            assert_eq!(finished.code, 130, "{}", finished.stderr);
-            assert!(finished.stderr.contains("interrupted"), "{}", finished.stderr);
-            let status = project.ok(&["status"]);
-            assert!(
-                status.contains("has a checkpoint to go on from"),
-                "{status}{}",
-                finished.stderr
-            );
-        }
-    }
+    // Killed as soon as a stage is begun, then while a field is being trained.
+    let partial = project.path(".nerf-sr/partial");
+    kill_once(&project, || partial.read_dir().is_ok_and(|mut entries| entries.next().is_some()));
+    kill_once(&project, || last_checkpoint(&partial).is_some());
+    let said = interrupt_once_said(&project, "going on from step");
+    assert!(said.contains("interrupted"), "{said}");
+    let status = project.ok(&["status"]);
+    assert!(status.contains("has a checkpoint to go on from"), "{status}{said}");
     let last = project.run(&["run"]);
     assert_eq!(last.code, 0, "{}", last.stderr);
     assert!(last.stderr.contains("going on from step"), "{}", last.stderr);

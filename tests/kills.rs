@@ -12,6 +12,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use common::{Finished, Project, wait_until};
+use serde_json::Value;
 
 const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
 const STAGES: [&str; 5] = ["demo-scene", "prep", "train-ss", "render-depth", "eval"];
@@ -44,16 +45,11 @@ fn arguments<'a>(verb: &'a str, point: &'a [String; 2]) -> Vec<&'a str> {
     vec![verb, &point[0], &point[1]]
 }
 
-fn cached_stage(line: &str) -> Option<(String, String)> {
-    let mut words = line.split_whitespace();
-    let (stage, state, hash) = (words.next()?, words.next()?, words.next()?);
-    (state == "cached").then(|| (stage.to_owned(), hash.to_owned()))
-}
-
 /// The finished stages of a point with their artifacts.
 fn finished(project: &Project, point: &[String; 2]) -> BTreeMap<String, String> {
-    let status = project.ok(&arguments("status", point));
-    status.lines().filter_map(cached_stage).collect()
+    let word = |node: &Value, key: &str| node[key].as_str().map(str::to_owned);
+    let nodes = project.nodes(&point.each_ref().map(String::as_str));
+    nodes.iter().filter_map(|node| Some((word(node, "stage")?, word(node, "output")?))).collect()
 }
 
 /// The processes that a process has started.

@@ -9,6 +9,7 @@ use std::process::{Child, Stdio};
 use common::{Finished, Project};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
+use scene::{View, Views};
 
 #[test]
 fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
@@ -138,7 +139,11 @@ fn graph_status_log_gc_and_verify() {
     assert!(project.ok(&["graph"]).contains("train-ss (cached)  ← scene = prep/train"));
     assert!(project.ok(&["graph", "--format", "dot"]).contains("-> n"));
     assert!(project.ok(&["status"]).lines().all(|l| l.contains("cached")));
-    assert!(project.ok(&["log", "train-ss"]).contains("train-ss:"));
+    let log = project.ok(&["log", "train-ss"]);
+    let summary =
+        std::fs::read_to_string(project.artifact("train-ss", &[]).join("summary.txt")).unwrap();
+    let result = format!("\nresult: {}", summary.trim_end());
+    assert!(log.contains("\nmemory: about ") && log.contains(&result), "{log}");
     assert!(project.ok(&["verify"]).contains("5 artifacts, 0 damaged"));
     // What another kernel left is garbage, what the pipeline comes to is not.
     project.ok(&["run", "-p", "kernel=box"]);
@@ -221,80 +226,60 @@ fn two_runners_at_once_make_everything_once() {
     assert_eq!(ran, 5);
 }
 
-/// Options that change what flows between stages, each through the whole pipeline to a plausible
-/// score.
+/// Options that change what flows between stages, with the PSNR that some of them were measured to
+/// come to.
+const OPTIONS: [(Option<f64>, &str); 11] = [
+    (Some(22.63), "background=alpha"),
+    (Some(23.55), "background=black kernel=bicubic"),
+    (Some(21.81), "kernel=average supersample_warmup=0.2"),
+    (Some(21.83), "supersample=3 depth=expected ray_distance=true"),
+    (Some(25.00), "lr_width=20 scale=1.5 prep.hr_references=2 test_views=2"),
+    (Some(26.16), "lr_width=24 scale=1 supersample=1"),
+    (None, "supervision=kernel"),
+    (None, "lr_width=32 scale=1.5 supersample=1.5 supervision=kernel"),
+    (None, "lr_width=16 scale=3 supersample=3 kernel=bicubic supervision=kernel"),
+    (None, "lr_width=17 scale=2.7 supersample=2.7 supervision=kernel"),
+    (
+        None,
+        "lr_width=17 scale=2.7 supersample=2.7 kernel=box render-depth.samples_per_axis=1 \
+        ema_decay=0",
+    ),
+];
+
+/// Mean PSNR of the rendered views, from the images themselves.
+fn psnr_by_hand(project: &Project, options: &[&str]) -> f64 {
+    let rendered = project.artifact("render-depth", options);
+    let truth = project.artifact("prep", options).join("truth");
+    let list: Views =
+        serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
+    let of_view = |view: &View| {
+        let file = rendered.join(format!("images/{}.exr", view.camera.name));
+        let found = list.read_over(&file).unwrap();
+        let expected = list.read_over(&truth.join(view.image.as_ref().unwrap())).unwrap();
+        assert_eq!(found.data.len(), expected.data.len());
+        let pairs = found.data.iter().zip(&expected.data);
+        let errors = pairs.map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2));
+        pixels::psnr_of(errors.sum::<f64>() / found.data.len() as f64)
+    };
+    list.views.iter().map(of_view).sum::<f64>() / list.views.len() as f64
+}
+
+/// Each option through the whole pipeline to the score that its images have.
 #[test]
 fn every_option_goes_through() {
     let project = Project::tiny();
     project.replace("rays: 60000", "rays: 400000");
-    for options in [
-        &["-p", "background=alpha"][..],
-        &["-p", "background=black", "-p", "kernel=bicubic"],
-        &["-p", "kernel=average", "-p", "supersample_warmup=0.2"],
-        &["-p", "supersample=3", "-p", "depth=expected", "-p", "ray_distance=true"],
-        &[
-            "-p",
-            "lr_width=20",
-            "-p",
-            "scale=1.5",
-            "-p",
-            "prep.hr_references=2",
-            "-p",
-            "test_views=2",
-        ],
-        &["-p", "lr_width=24", "-p", "scale=1", "-p", "supersample=1"],
-        &["-p", "supervision=kernel"],
-        &[
-            "-p",
-            "lr_width=32",
-            "-p",
-            "scale=1.5",
-            "-p",
-            "supersample=1.5",
-            "-p",
-            "supervision=kernel",
-        ],
-        &[
-            "-p",
-            "lr_width=16",
-            "-p",
-            "scale=3",
-            "-p",
-            "supersample=3",
-            "-p",
-            "kernel=bicubic",
-            "-p",
-            "supervision=kernel",
-        ],
-        &[
-            "-p",
-            "lr_width=17",
-            "-p",
-            "scale=2.7",
-            "-p",
-            "supersample=2.7",
-            "-p",
-            "supervision=kernel",
-        ],
-        &[
-            "-p",
-            "lr_width=17",
-            "-p",
-            "scale=2.7",
-            "-p",
-            "supersample=2.7",
-            "-p",
-            "kernel=box",
-            "-p",
-            "render-depth.samples_per_axis=1",
-            "-p",
-            "ema_decay=0",
-        ],
-    ] {
-        let run = project.ok(&[&["run"], options].concat());
-        let psnr: f64 =
-            run.split("PSNR ").nth(1).unwrap().split(' ').next().unwrap().parse().unwrap();
-        assert!((17.0..40.0).contains(&psnr), "{options:?}: {run}");
+    for (measured, settings) in OPTIONS {
+        let options: Vec<&str> = settings.split(' ').flat_map(|setting| ["-p", setting]).collect();
+        let run = project.ok(&[&["run"], &options[..]].concat());
+        let metrics = project.json("eval", "metrics.json", &options);
+        let psnr = metrics["mean"]["psnr"].as_f64().unwrap();
+        println!("{settings}: {psnr:.2} dB");
+        assert!(run.contains(&format!("eval: PSNR {psnr:.2} dB")), "{settings}: {run}");
+        let by_hand = psnr_by_hand(&project, &options);
+        assert!((psnr - by_hand).abs() < 1e-3, "{settings}: {psnr} dB, by hand {by_hand}");
+        let plausible = measured.map_or(17.0..40.0, |measured| measured - 1.0..measured + 1.0);
+        assert!(plausible.contains(&psnr), "{settings}: {psnr} dB, not in {plausible:?}");
         assert!(run.contains("depth error"), "{run}");
     }
 }

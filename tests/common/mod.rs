@@ -228,22 +228,22 @@ impl Project {
         finished.stdout
     }
 
+    /// What `status` knows of each node, as the runner tells programs.
+    #[track_caller]
+    pub fn nodes(&self, arguments: &[&str]) -> Vec<serde_json::Value> {
+        let status = self.ok(&[&["status", "--json"], arguments].concat());
+        let report: serde_json::Value = serde_json::from_str(&status).unwrap();
+        report["nodes"].as_array().unwrap().clone()
+    }
+
     /// Identity of the artifact that a stage has now, in the order of the sweep's points.
     #[track_caller]
     pub fn output_of(&self, stage: &str, arguments: &[&str]) -> Vec<String> {
-        let status = self.ok(&[&["status"], arguments].concat());
-        let lines = status.lines().filter(|l| l.split_whitespace().next() == Some(stage));
-        lines
-            .map(|l| {
-                l.split("cached")
-                    .nth(1)
-                    .unwrap_or_else(|| panic!("{l}"))
-                    .split_whitespace()
-                    .next()
-                    .unwrap()
-                    .to_owned()
-            })
-            .collect()
+        let nodes = self.nodes(arguments);
+        let outputs = nodes.iter().filter(|node| node["stage"] == stage).map(|node| {
+            node["output"].as_str().unwrap_or_else(|| panic!("it isn't cached: {node}")).to_owned()
+        });
+        outputs.collect()
     }
 
     /// Folder of the artifact that a stage has now, the first of a sweep's.
