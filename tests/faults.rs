@@ -4,8 +4,6 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
-use std::io::{BufRead as _, BufReader, Read as _};
-
 use common::{
     Finished, Project, checkpoints, demo_train, kill_again_and_again, last_checkpoint, manifest,
     signal, stage, stage_command, wait_until,
@@ -64,39 +62,26 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     assert_eq!(manifest(&output), manifest(&whole));
 }
 
-/// Starts a run and kills it when something has happened.
-fn kill_once(project: &Project, mut happened: impl FnMut() -> bool) {
+/// Starts a run, and signals it when something has happened.
+fn signal_once(project: &Project, name: &str, mut happened: impl FnMut() -> bool) -> Finished {
     let mut child = project.spawn(&["run"]);
     wait_until(|| happened() || child.try_wait().unwrap().is_some());
-    signal(&child, "-KILL");
-    let finished = Finished::of(child.wait_with_output().unwrap());
-    assert_eq!(finished.code, -1, "the kill came too late: {}", finished.stderr);
-}
-
-/// Starts a run and interrupts it when it has said something; all that it said.
-fn interrupt_once_said(project: &Project, words: &str) -> String {
-    let mut child = project.spawn(&["run"]);
-    let mut stderr = BufReader::new(child.stderr.take().unwrap());
-    let mut said = String::new();
-    while !said.contains(words) {
-        assert_ne!(stderr.read_line(&mut said).unwrap(), 0, "it ended without {words:?}: {said}");
-    }
-    signal(&child, "-INT");
-    stderr.read_to_string(&mut said).unwrap();
-    assert_eq!(child.wait().unwrap().code(), Some(130), "{said}");
-    said
+    signal(&child, name);
+    Finished::of(child.wait_with_output().unwrap())
 }
 
 #[test]
 fn a_runner_killed_or_interrupted_goes_on() {
     let project = Project::tiny();
     project.replace("rays: 60000", "rays: 1500000");
-    // Killed as soon as a stage is begun, then while a field is being trained.
+    // Killed as soon as a stage has begun, interrupted while a field is being trained.
     let partial = project.path(".nerf-sr/partial");
-    kill_once(&project, || partial.read_dir().is_ok_and(|mut entries| entries.next().is_some()));
-    kill_once(&project, || last_checkpoint(&partial).is_some());
-    let said = interrupt_once_said(&project, "going on from step");
-    assert!(said.contains("interrupted"), "{said}");
+    let has_begun = || partial.read_dir().is_ok_and(|mut entries| entries.next().is_some());
+    let killed = signal_once(&project, "-KILL", has_begun);
+    assert_eq!(killed.code, -1, "the kill came too late: {}", killed.stderr);
+    let interrupted = signal_once(&project, "-INT", || last_checkpoint(&partial).is_some());
+    let said = interrupted.stderr;
+    assert!(interrupted.code == 130 && said.contains("interrupted"), "{said}");
     let status = project.ok(&["status"]);
     assert!(status.contains("has a checkpoint to go on from"), "{status}{said}");
     let last = project.run(&["run"]);
