@@ -226,21 +226,20 @@ fn two_runners_at_once_make_everything_once() {
     assert_eq!(ran, 5);
 }
 
-/// Options that change what flows between stages, with the PSNR that some of them were measured to
-/// come to.
-const OPTIONS: [(Option<f64>, &str); 11] = [
-    (Some(22.63), "background=alpha"),
-    (Some(23.55), "background=black kernel=bicubic"),
-    (Some(21.81), "kernel=average supersample_warmup=0.2"),
-    (Some(21.83), "supersample=3 depth=expected ray_distance=true"),
-    (Some(25.00), "lr_width=20 scale=1.5 prep.hr_references=2 test_views=2"),
-    (Some(26.16), "lr_width=24 scale=1 supersample=1"),
-    (None, "supervision=kernel"),
-    (None, "lr_width=32 scale=1.5 supersample=1.5 supervision=kernel"),
-    (None, "lr_width=16 scale=3 supersample=3 kernel=bicubic supervision=kernel"),
-    (None, "lr_width=17 scale=2.7 supersample=2.7 supervision=kernel"),
+/// Options that change what flows between stages, and the PSNR that each was measured to come to.
+const OPTIONS: [(f64, &str); 11] = [
+    (22.63, "background=alpha"),
+    (23.55, "background=black kernel=bicubic"),
+    (21.81, "kernel=average supersample_warmup=0.2"),
+    (21.83, "supersample=3 depth=expected ray_distance=true"),
+    (25.00, "lr_width=20 scale=1.5 prep.hr_references=2 test_views=2"),
+    (26.16, "lr_width=24 scale=1 supersample=1"),
+    (21.78, "supervision=kernel"),
+    (22.64, "lr_width=32 scale=1.5 supersample=1.5 supervision=kernel"),
+    (20.77, "lr_width=16 scale=3 supersample=3 kernel=bicubic supervision=kernel"),
+    (21.60, "lr_width=17 scale=2.7 supersample=2.7 supervision=kernel"),
     (
-        None,
+        21.29,
         "lr_width=17 scale=2.7 supersample=2.7 kernel=box render-depth.samples_per_axis=1 \
         ema_decay=0",
     ),
@@ -274,12 +273,11 @@ fn every_option_goes_through() {
         let run = project.ok(&[&["run"], &options[..]].concat());
         let metrics = project.json("eval", "metrics.json", &options);
         let psnr = metrics["mean"]["psnr"].as_f64().unwrap();
-        println!("{settings}: {psnr:.2} dB");
         assert!(run.contains(&format!("eval: PSNR {psnr:.2} dB")), "{settings}: {run}");
         let by_hand = psnr_by_hand(&project, &options);
         assert!((psnr - by_hand).abs() < 1e-3, "{settings}: {psnr} dB, by hand {by_hand}");
-        let plausible = measured.map_or(17.0..40.0, |measured| measured - 1.0..measured + 1.0);
-        assert!(plausible.contains(&psnr), "{settings}: {psnr} dB, not in {plausible:?}");
+        // A change of the engine may move it by a little.
+        assert!((psnr - measured).abs() < 1.0, "{settings}: {psnr} dB, measured {measured}");
         assert!(run.contains("depth error"), "{run}");
     }
 }
