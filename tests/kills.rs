@@ -11,7 +11,7 @@ use std::os::unix::process::CommandExt as _;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{Finished, Project, wait_until};
+use common::{Finished, Project, is_running, wait_until};
 use serde_json::Value;
 
 const SIGNALS: [&str; 4] = ["-KILL", "-INT", "-TERM", "-HUP"];
@@ -70,9 +70,9 @@ fn send(signal: &str, process: &str) {
 }
 
 /// Sends a signal to the runner, its stages, both, or the process group; says to whom.
-fn strike(random: &mut Random, runner: &Child) -> String {
+fn strike(random: &mut Random, runner: &Child, stages: &[String]) -> String {
     let signal = SIGNALS[random.below(4) as usize];
-    let (pid, stages) = (runner.id(), children(runner.id()));
+    let pid = runner.id();
     let whom = ["runner", "stage", "both", "group"][random.below(4) as usize];
     if whom == "stage" || whom == "both" {
         stages.iter().for_each(|stage| send(signal, stage));
@@ -115,6 +115,7 @@ fn kills_at_random_moments_lose_nothing() {
     assert!(expected.iter().all(|stages| stages.len() == STAGES.len()));
 
     let mut project = Project::fast();
+    let mut cut_short = 0;
     for round in 0..kills {
         let seed = random.below(POINTS);
         let before = finished(&project, &point(seed));
@@ -129,14 +130,16 @@ fn kills_at_random_moments_lose_nothing() {
         let collect_first = random.below(2) == 0;
         let collect = |project: &Project| project.spawn(&["gc", "--keep-days", "0"]);
         let mut collector = collect_first.then(|| collect(&project));
+        // This is fuzzing: no moment of a run is waited for, so that any may be met.
         std::thread::sleep(moment);
         collector = collector.or_else(|| Some(collect(&project)));
-        let what = strike(&mut random, &runner);
+        // Asked before, since a runner that is killed has no children any more.
+        let stages = children(runner.id());
+        let what = strike(&mut random, &runner, &stages);
         let place = format!("round {round}: seed {seed}, {what} after {moment:?}");
         println!("{place}");
-        // Stages may live on for a moment, to write their checkpoints.
-        let pids = children(runner.id());
         let run = ended(runner, &place);
+        cut_short += u64::from(run.code != 0);
         let gc = ended(collector.unwrap(), &place);
         assert_eq!(gc.code, 0, "{place}: {}{}", gc.stdout, gc.stderr);
         assert!(
@@ -144,9 +147,8 @@ fn kills_at_random_moments_lose_nothing() {
             "{place}: {}",
             run.stderr
         );
-        wait_until(|| {
-            pids.iter().all(|pid| !std::path::Path::new(&format!("/proc/{pid}")).exists())
-        });
+        // Stages may live on for a moment, to write their checkpoints.
+        wait_until(|| !stages.iter().any(|stage| is_running(stage)));
         assert!(project.ok(&["verify"]).contains(", 0 damaged"), "{place}");
         for (stage, hash) in finished(&project, &point(seed)) {
             assert_eq!(hash, expected[seed as usize][&stage], "{place}: {stage}");
@@ -162,6 +164,9 @@ fn kills_at_random_moments_lose_nothing() {
             );
         }
     }
+    // Of a few kills each may have come too late.
+    println!("{cut_short} of {kills} runs were cut short");
+    assert!(cut_short > 0 || kills < 20, "no kill met a run");
     for seed in 0..POINTS {
         // With garbage collection beside, and no kill, a run ends well.
         let runner = project.spawn(&arguments("run", &point(seed)));

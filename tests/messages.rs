@@ -8,8 +8,8 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::process::{Command, Stdio};
 
 use common::{
-    Finished, Project, bin, call_of, demo_train, last_checkpoint, signal, stage_command, verbs,
-    wait_until,
+    Finished, Project, bin, call_of, demo_train, is_running, last_checkpoint, signal,
+    stage_command, verbs, wait_until,
 };
 
 /// A pipeline of two stages that are one shell script; `run` is what it does, with `$out` its
@@ -415,18 +415,30 @@ fn a_stage_is_stopped_where_a_test_wants_it_and_goes_on() {
     assert_eq!(project.output_of("train-ss", &[]), undisturbed.output_of("train-ss", &[]));
 }
 
+/// Leaves a process running that holds the stage's pipes open, and a mark if it ends by itself.
+const LEAVES_ONE: &str = "(sleep 1000; touch slept) & echo $! > left";
+
+/// What a stage has left was ended: the runner didn't wait for it.
+#[track_caller]
+fn assert_left_is_ended(project: &Project) {
+    let left = std::fs::read_to_string(project.path("left")).unwrap();
+    wait_until(|| !is_running(left.trim()));
+    assert!(!project.path("slept").exists(), "it ended by itself");
+}
+
 #[test]
 fn what_a_stage_leaves_running_does_not_hold_up_the_runner() {
-    let project = talking("touch started; sleep 1000");
-    let child =
-        project.command(&["run"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let project = talking(&format!("{LEAVES_ONE}; touch started; wait"));
+    let child = project.spawn(&["run"]);
     wait_until(|| project.path("started").exists());
     signal(&child, "-INT");
     let finished = Finished::of(child.wait_with_output().unwrap());
     assert_eq!(finished.code, 130, "{}", finished.stderr);
+    assert_left_is_ended(&project);
     // Nor does what a stage starts beside itself and forgets.
-    let project = talking(&format!("sleep 1000 & {WELL}"));
+    let project = talking(&format!("{LEAVES_ONE}; {WELL}"));
     project.ok(&["run"]);
+    assert_left_is_ended(&project);
 }
 
 fn run_in_a_group(project: &Project, more: &[(&str, &str)]) -> Finished {

@@ -74,6 +74,7 @@ fn a_run_with_nothing_to_do_starts_nothing_and_reads_nothing() {
     let before = started(&project);
     assert!(before > STAGES.len(), "all were started");
     let files = contents(&project);
+    assert!(files.len() >= 5, "each artifact has a file: {files:?}");
     files.iter().for_each(|file| set_unread(file));
     let probe = project.path("pipeline.yaml");
     set_unread(&probe);

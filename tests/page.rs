@@ -60,6 +60,7 @@ fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
 #[track_caller]
 fn says(look: &Value, result: &str, metrics: &Value) {
     for (view, figures) in shown(metrics) {
+        assert!(!figures.is_empty(), "{view} has no figure");
         let found = &look["numbers"][&view][result];
         for (label, number) in figures {
             assert_eq!(found[&label], json!(number), "{view}, {result}, {label}: {}", look["size"]);

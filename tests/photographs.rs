@@ -27,7 +27,9 @@ fn numbers(v: &Value) -> Vec<f64> {
 
 /// The largest difference between the numbers of two views' cameras.
 fn difference(a: &Value, b: &Value) -> f64 {
-    numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+    let (a, b) = (numbers(a), numbers(b));
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
 fn views(folder: &Path) -> Vec<Value> {
@@ -71,7 +73,9 @@ fn every_form_gives_the_same_cameras_and_images() {
         let first = views(&scenes[0].join(subtree));
         assert_eq!(first.len(), if subtree == "train" { 17 } else { 3 });
         for scene in &scenes[1..] {
-            for (a, b) in first.iter().zip(views(&scene.join(subtree))) {
+            let others = views(&scene.join(subtree));
+            assert_eq!(others.len(), first.len(), "{subtree}");
+            for (a, b) in first.iter().zip(others) {
                 assert_eq!(a["camera"]["name"], b["camera"]["name"]);
                 assert!(difference(a, &b) < 1e-6, "{subtree}: {a} {b}");
             }
@@ -109,7 +113,7 @@ fn a_model_that_pycolmap_wrote_gives_the_same_cameras() {
         scene
     });
     let [ours, theirs] = scenes.map(|scene| views(&scene.join("train")));
-    assert_eq!(ours.len(), 17);
+    assert_eq!([ours.len(), theirs.len()], [17, 17]);
     for (a, b) in ours.iter().zip(&theirs) {
         assert_eq!(a["camera"]["name"], b["camera"]["name"]);
         assert!(difference(a, b) < 1e-6, "{a} {b}");

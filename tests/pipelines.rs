@@ -28,14 +28,17 @@ fn every_verb_finds_a_target_of_its_own_file() {
         (&["plan", "paper-refine"], &["train-paper"]),
         (&["plan", "registered"], &["register ", "registered-views"]),
         (&["plan", "report", "refined", "video"], &["report", "eval-refined", "path-views"]),
-        (&["why", "train-refine", "refined"], &["train-refine: "]),
-        (&["why", "video", "video"], &["path-views"]),
+        (&["why", "train-refine", "refined"], &["train-refine: waits for ", "downscaled-views"]),
+        (
+            &["why", "video", "video"],
+            &["video: shows path-views; a run writes it anew", "\n  path-views: waits for "],
+        ),
         (&["status", "refined"], &["downscaled-views"]),
         (&["graph", "video"], &["camera-path"]),
         (&["plan", "viewer"], &["train-ss", "viewer"]),
         (&["log", "camera-path", "video"], &["has not run yet"]),
         (&["gc", "refined", "--dry-run"], &["would stay"]),
-        (&["describe", "train-refine"], &["train-refine"]),
+        (&["describe", "train-refine"], &["Usage: train-refine ", "\nParameters: "]),
     ] {
         let said = project.ok(arguments);
         assert!(words.iter().all(|word| said.contains(word)), "{arguments:?}: {said}");

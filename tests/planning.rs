@@ -19,8 +19,8 @@ fn install(from: &Path, to: &Path) {
     );
 }
 
-/// A stage as a script: it leaves a mark when it is started, waits for `go` where that is asked
-/// for, describes itself, or makes its output.
+/// A stage as a script: it leaves a mark when it is started, describes itself as soon as no file
+/// `wait` is there, or makes its output.
 const SCRIPT: &str = r#"#!/bin/sh
 cd "$(dirname "$0")"
 echo "$1" >> started

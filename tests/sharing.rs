@@ -256,7 +256,8 @@ fn any_file_name_may_lie_in_a_data_folder() {
             data.join("train").join(std::ffi::OsStr::from_bytes(name)),
         )
         .unwrap();
-        assert!(project.ok(&[&["plan", "prep"][..], &from].concat()).contains("prep"));
+        // A folder's key is of all its files.
+        assert!(project.ok(&[&["plan", "prep"][..], &from].concat()).contains("will run"));
         project.ok(&[&["run", "prep"][..], &from].concat());
         assert_eq!(project.output_of("prep", &from), scene);
     }

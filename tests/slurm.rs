@@ -10,12 +10,13 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
-use common::{Finished, Project, root, wait_until};
+use common::{Finished, Project, happens, root, wait_until};
 use counter_rng::CounterRng;
 
 /// A stage in plain Python. It goes so many steps, each from the one before, and leaves a
 /// checkpoint when it is asked to end, or where it `keeps` them at every step. While a file is
-/// there that `hold` names, it waits at the step that stands in it.
+/// there that `hold` names, it waits at the step that stands in it, and has said so in `held`. A
+/// `pause` makes each step last, so that kills at random moments find it at work.
 const STEP: &str = r#"#!/usr/bin/env python3
 import hashlib, json, os, pathlib, signal, sys, time
 here = pathlib.Path(__file__).parent
@@ -51,6 +52,8 @@ for name, folder in sorted(given["input"]):
     state = hashlib.sha256((state + pathlib.Path(folder, "text").read_text()).encode()).hexdigest()
 if checkpoint.exists(): done, state = json.loads(checkpoint.read_text())
 while done < params["steps"]:
+    if is_held():
+        with open(here / "held", "a") as held: print(done, file=held)
     while is_held() and not asked: time.sleep(0.05)
     if asked:
         keep()
@@ -183,13 +186,8 @@ impl Cluster {
     /// Waits until the queue is empty.
     #[track_caller]
     fn drain(&self) {
-        wait_until(|| self.slurm("squeue", &["-h"]).is_empty());
-        assert_eq!(
-            self.slurm("squeue", &["-h"]),
-            "",
-            "{}",
-            self.slurm("scontrol", &["show", "job"])
-        );
+        let is_empty = happens(|| self.slurm("squeue", &["-h"]).is_empty());
+        assert!(is_empty, "{}", self.slurm("scontrol", &["show", "job"]));
     }
 
     /// Slurm's word on a job: `COMPLETED 0:0`.
@@ -227,13 +225,19 @@ fn jobs(said: &str) -> BTreeMap<String, String> {
         .collect()
 }
 
+fn lines(project: &Project, file: &str) -> Vec<String> {
+    let text = std::fs::read_to_string(project.path(file)).unwrap_or_default();
+    text.lines().map(str::to_owned).collect()
+}
+
 /// How often stages ran.
 fn ran(project: &Project) -> Vec<String> {
-    std::fs::read_to_string(project.path("ran"))
-        .unwrap_or_default()
-        .lines()
-        .map(str::to_owned)
-        .collect()
+    lines(project, "ran")
+}
+
+/// The steps at which stages began to wait.
+fn held(project: &Project) -> Vec<String> {
+    lines(project, "held")
 }
 
 /// The objects that a stage's nodes have now.
@@ -340,7 +344,6 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
             .contains(&format!("job {} running", jobs["last"]))
     };
     wait_until(running);
-    assert!(running());
     let second = cluster.ok(&project, &[&["run"][..], &held].concat());
     assert!(second.contains("0 jobs submitted, 1 queued before"), "{second}");
     // What the job needs stays, though the plan without arguments doesn't name it.
@@ -403,17 +406,17 @@ fn a_job_whose_time_is_up_goes_on_from_its_checkpoint() {
     let log = || cluster.ok(&shared, &["log", "first"]);
     let state = || cluster.state(&job);
     for round in 1..=5 {
-        wait_until(|| ran(&shared).len() == round);
-        assert_eq!(ran(&shared).len(), round, "{} {}", state(), log());
+        // Asked to end any earlier, it would stop at another step, or before it knows how to.
+        let is_held = happens(|| held(&shared).len() == round);
+        assert!(is_held, "{:?} {} {}", held(&shared), state(), log());
         if round > 1 {
-            std::thread::sleep(Duration::from_millis(300));
             cluster.slurm("scancel", &["--batch", "--signal=USR1", &job]);
         }
-        wait_until(|| {
+        let is_queued = happens(|| {
             log().matches("goes on from the checkpoint later").count() == round
                 && state().starts_with("PENDING")
         });
-        assert!(state().starts_with("PENDING"), "{} {}", state(), log());
+        assert!(is_queued, "{} {}", state(), log());
         shared.write("hold", &(10 * (round + 1)).to_string());
         // Slurm waits two minutes with what is queued again. At once it would take the old
         // credential for the new one's.
@@ -469,17 +472,16 @@ fn kills_at_random_moments_lose_nothing() {
         shared.write("hold", &(5 * (kill + 1)).to_string());
         // A job that Slurm hasn't yet seen end counts as outstanding: the last kill's may have to
         // be submitted once more.
-        let mut killed = false;
-        wait_until(|| {
+        let killed = happens(|| {
             cluster.submit(&shared, &sweep);
+            // This is fuzzing: no moment is waited for, so that any may be met.
             std::thread::sleep(Duration::from_millis(draws.below(500)));
             let running = processes(&shared);
             let chosen = running.get(draws.below(running.len().max(1) as u64) as usize);
             // It may end by itself before the signal comes.
-            killed = chosen.is_some_and(|process| {
+            chosen.is_some_and(|process| {
                 Command::new("kill").args(["-KILL", process]).status().unwrap().success()
-            });
-            killed
+            })
         });
         assert!(killed, "seed {seed}, kill {kill}");
     }

@@ -46,7 +46,8 @@ fn a_checkpoint_becomes_a_field() {
     let log = std::fs::read(project.path("field/training.json")).unwrap();
     let log: serde_json::Value = serde_json::from_slice(&log).unwrap();
     let rays = log["rays"].as_u64().unwrap();
-    assert!((30_000..60_000).contains(&rays), "{rays} rays");
+    // The step that came to the count was the last; one has at most `max_rays_per_step`.
+    assert!((30_000..30_000 + 2_048).contains(&rays), "{rays} rays");
     let cameras = project.path("scene/cameras");
     let inputs = [("field", project.path("field")), ("cameras", cameras)];
     let inputs = inputs.each_ref().map(|(name, folder)| (*name, folder.as_path()));

@@ -10,7 +10,7 @@ pub mod surfaces;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 /// The repository.
 pub fn root() -> PathBuf {
@@ -318,7 +318,7 @@ impl Finished {
         }
     }
 
-    /// Expects an exit code and, as the last line on stderr, one that has all the words.
+    /// Expects an exit code and, on stderr, a line that has all the words.
     #[track_caller]
     pub fn fails(&self, code: i32, words: &[&str]) {
         assert_eq!(self.code, code, "{}\n{}", self.stdout, self.stderr);
@@ -398,19 +398,41 @@ pub fn checkpoints(work: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Waits for what comes sooner or later, however slow the machine is just now.
-pub fn wait_until(mut happened: impl FnMut() -> bool) {
-    for _ in 0..2400 {
-        if happened() {
-            return;
+/// What comes at all comes within this time, however slow the machine is just now. Slurm alone
+/// takes a minute before it ends a job whose time is up.
+const PATIENCE: Duration = Duration::from_secs(300);
+
+/// Waits for what comes sooner or later, and fails where it doesn't.
+#[track_caller]
+pub fn wait_until(happened: impl FnMut() -> bool) {
+    assert!(happens(happened), "what the test waits for hasn't happened in {PATIENCE:?}");
+}
+
+/// Waits likewise; whether it has come, for who can say more of it.
+pub fn happens(mut happened: impl FnMut() -> bool) -> bool {
+    let begun = Instant::now();
+    while !happened() {
+        if begun.elapsed() > PATIENCE {
+            return false;
         }
         std::thread::sleep(Duration::from_millis(25));
     }
+    true
+}
+
+/// Whether a process hasn't ended. One that nobody has waited for yet is still listed.
+pub fn is_running(process: &str) -> bool {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+    // The state stands behind the name, which is in brackets and may hold anything.
+    stat.rsplit_once(") ").is_some_and(|(_, rest)| !rest.starts_with(['Z', 'X']))
 }
 
 /// Kills a stage so many milliseconds after its start, and then each time so long after another
 /// checkpoint was written. How often there was one to go on from; the output may be there, if the
 /// stage was faster.
+///
+/// Which moment a kill meets is left to chance: any may come. Tests that need a certain step set
+/// `NERF_SR_STOP_AFTER`.
 pub fn kill_again_and_again(
     name: &str,
     params: &str,

@@ -26,9 +26,30 @@ seed("colmap", "text-cameras", b"\x041 SIMPLE_RADIAL 4 3 5 2 1.5 0.1\n")
 seed("colmap", "text-images", b"\x051 1 0 0 0 0 0 1 1 a.png\n1 1 1\n2 1 0 0 0 0 0 2 1 b.png\n\n")
 seed("colmap", "text-points", b"\x061 0 0 5 9 9 9 0.5 1 0\n")
 
-header = "{'descr': '<f8', 'fortran_order': False, 'shape': (2, 17), }".ljust(117) + "\n"
+
+def npy(numbers: list, kind: str = "<f8", order: str = "False", shape: str = "(2, 17)", version: int = 1) -> bytes:
+    header = f"{{'descr': '{kind}', 'fortran_order': {order}, 'shape': {shape}, }}".ljust(117) + "\n"
+    length = struct.pack("<H" if version == 1 else "<I", len(header))
+    data = struct.pack(f"{kind[0]}{len(numbers)}{'d' if kind[2] == '8' else 'f'}", *numbers)
+    return b"\x93NUMPY" + bytes([version, 0]) + length + header.encode() + data
+
+
+# Every branch of the reader, and shapes at the edges of what a count can be.
 row = [0, 1, 0, 0, 3, -1, 0, 0, 0, 4, 0, 0, 1, 4, 5, 1, 9]
-seed("llff", "two", b"\x93NUMPY\x01\x00" + struct.pack("<H", 118) + header.encode() + struct.pack("<34d", *row, *row))
+seed("llff", "two", npy(row + row))
+for version in (2, 3):
+    seed("llff", f"version-{version}", npy(row + row, version=version))
+for name, kind in {"single": "<f4", "big-single": ">f4", "big": ">f8", "native": "=f8", "integers": "<i8"}.items():
+    seed("llff", name, npy(row + row, kind))
+seed("llff", "by-columns", npy([value for pair in zip(row, row) for value in pair], order="True"))
+seed("llff", "python-2", npy(row + row, shape="(2L, 17L)"))
+seed("llff", "double-quotes", npy(row + row).replace(b"'", b'"'))
+seed("llff", "nan", npy(row + [float("nan")] + row[1:]))
+for name, shape in {"one": (1, 17), "none": (0, 17), "most": ((2**64 - 1) // 17, 17), "overflow": (2**60, 17), "no-columns": (2**64 - 1, 0)}.items():
+    seed("llff", f"shape-{name}", npy(row + row, shape=str(shape)))
+seed("llff", "one-dimension", npy(row + row, shape="(34,)"))
+seed("llff", "beyond", npy(row + row, version=2).replace(struct.pack("<I", 118), struct.pack("<I", 2**32 - 1), 1))
+seed("llff", "cut-short", npy(row + row)[:-1])
 
 pose = "[[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]"
 frame = f'{{"file_path": "images/a.png", "transform_matrix": {pose}, "fl_x": 5, "k1": 0.1, "mask_path": "images/b.png"}}'

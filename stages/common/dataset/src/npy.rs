@@ -1,5 +1,9 @@
 //! A matrix as NumPy saves one, in versions 1 to 3 of its format.
 
+/// Bytes of the longest header. That of a matrix has a hundred, and NumPy reads no longer ones
+/// unless it is told to.
+const LONGEST_HEADER: usize = 10_000;
+
 /// Numbers of a two-dimensional array, row by row.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Matrix {
@@ -11,10 +15,15 @@ pub(crate) struct Matrix {
 /// Reads a whole file; the reason is for people.
 pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
     let (header, data) = parts(bytes).ok_or("it doesn't begin as one")?;
+    if header.len() > LONGEST_HEADER {
+        return Err(format!("its header has {} bytes", header.len()));
+    }
     let kind = entry(header, "descr")
         .and_then(quoted)
         .ok_or("its header has no descr that is a string")?;
-    let order = entry(header, "fortran_order").ok_or("its header has no fortran_order")?;
+    let is_by_columns = entry(header, "fortran_order")
+        .and_then(truth)
+        .ok_or("its header has no fortran_order that is True or False")?;
     let shape = entry(header, "shape")
         .and_then(lengths)
         .ok_or("its header has no shape of whole numbers")?;
@@ -28,7 +37,7 @@ pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
         _ => return Err(format!("it holds {kind:?}")),
     };
     let stored = stored.ok_or("it is cut short")?;
-    let numbers = if order.starts_with("True") {
+    let numbers = if is_by_columns {
         let at = |i: usize| stored[i % columns * rows + i / columns];
         (0..count).map(at).collect()
     } else {
@@ -60,6 +69,15 @@ fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
 fn quoted(text: &str) -> Option<&str> {
     let quote = text.chars().next().filter(|c| matches!(c, '\'' | '"'))?;
     Some(text[1..].split_once(quote)?.0)
+}
+
+/// The truth value that a text begins with, before the next entry.
+fn truth(text: &str) -> Option<bool> {
+    match text.split([',', '}']).next()?.trim_end() {
+        "True" => Some(true),
+        "False" => Some(false),
+        _ => None,
+    }
 }
 
 /// The lengths in the brackets that a text begins with. Python 2 wrote `20L`.
@@ -141,5 +159,84 @@ mod tests {
         for end in 0..whole.len() {
             assert!(read_matrix(&whole[..end]).is_err(), "{end} of {} bytes", whole.len());
         }
+    }
+
+    /// A file of version 2 whose header claims to have so many bytes.
+    fn claiming(length: u32, header: &str, data: &[u8]) -> Vec<u8> {
+        [&b"\x93NUMPY\x02\0"[..], &length.to_le_bytes(), header.as_bytes(), data].concat()
+    }
+
+    #[track_caller]
+    fn assert_refused(bytes: &[u8], words: &str) {
+        let reason = read_matrix(bytes).unwrap_err();
+        assert!(reason.contains(words), "{reason}");
+    }
+
+    #[test]
+    fn headers_that_cannot_be_are_refused_in_words() {
+        let (good, data) = (header("'<f8'", "(2, 3)"), [0; 48]);
+        for version in [0, 4, 255] {
+            assert_refused(&file(version, &good, &data), "it doesn't begin as one");
+        }
+        // One that claims to reach beyond the file: by a byte, and as far as can be.
+        let all = (good.len() + data.len()) as u32;
+        assert_refused(&claiming(all + 1, &good, &data), "it doesn't begin as one");
+        assert_refused(&claiming(u32::MAX, &good, &data), "it doesn't begin as one");
+        // One without length, and one that reaches into the data, which aren't text.
+        assert_refused(&claiming(0, &good, &data), "no descr");
+        let numbers = [0xff; 48];
+        let mut reaching = file(1, &good, &numbers);
+        reaching[8] += 1;
+        assert_refused(&reaching, "it doesn't begin as one");
+        for order in ["", "Truth", "1", "'True'", "true", "None"] {
+            let odd = file(1, &padded_header("<f8", order), &data);
+            assert_refused(&odd, "no fortran_order that is True or False");
+        }
+        for (length, is_read) in [(LONGEST_HEADER, true), (LONGEST_HEADER + 1, false)] {
+            let padded = good.clone() + &" ".repeat(length - good.len());
+            assert_eq!(read_matrix(&file(2, &padded, &data)).is_ok(), is_read, "{length}");
+        }
+    }
+
+    /// Rows, columns and how many numbers there are, read of six.
+    fn sizes(order: &str, shape: &str) -> Option<[usize; 3]> {
+        let header = format!("{{'descr': '<f8', 'fortran_order': {order}, 'shape': {shape}}}");
+        let matrix = read_matrix(&file(1, &header, &[0; 48])).ok()?;
+        Some([matrix.rows, matrix.columns, matrix.numbers.len()])
+    }
+
+    /// What a shape claims is held against what is there before anything is allocated.
+    #[test]
+    fn a_matrix_has_the_numbers_that_its_shape_claims() {
+        let most = usize::MAX;
+        for order in ["False", "True"] {
+            for (shape, expected) in [
+                ("(6, 1)".to_owned(), Some([6, 1, 6])),
+                ("(1, 6)".to_owned(), Some([1, 6, 6])),
+                // What lies behind isn't looked at.
+                ("(2, 1)".to_owned(), Some([2, 1, 2])),
+                ("(7, 1)".to_owned(), None),
+                // Of no rows or no columns there is nothing, whatever the other is.
+                ("(0, 17)".to_owned(), Some([0, 17, 0])),
+                (format!("({most}, 0)"), Some([most, 0, 0])),
+                (format!("(0, {most})"), Some([0, most, 0])),
+                // The most that a count can be; more than that; and a length that is none.
+                (format!("({}, 17)", most / 17), None),
+                (format!("({}, 17)", most / 17 + 1), None),
+                (format!("({most}0, 17)"), None),
+            ] {
+                assert_eq!(sizes(order, &shape), expected, "{order} {shape}");
+            }
+        }
+    }
+
+    /// Which numbers make sense is for who knows what they mean: `llff` refuses NaN.
+    #[test]
+    fn every_number_is_read_as_it_is() {
+        let odd = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, -0.0, 5e-324, f64::MAX];
+        let data: Vec<u8> = odd.iter().flat_map(|v| v.to_le_bytes()).collect();
+        let read = read_matrix(&file(1, &header("'<f8'", "(2, 3)"), &data)).unwrap();
+        let bits = |numbers: &[f64]| numbers.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert_eq!(bits(&read.numbers), bits(&odd));
     }
 }

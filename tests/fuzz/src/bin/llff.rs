@@ -1,4 +1,4 @@
-//! `poses_bounds.npy`.
+//! `poses_bounds.npy`: NumPy's format, and what LLFF keeps in it.
 #![no_main]
 
 use std::sync::LazyLock;
