@@ -274,14 +274,20 @@ fn passes(rows: &mut Rows) {
     }
 }
 
-/// A whole training with its warm-up, then rendering, at one and all threads and several sizes.
-fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
-    let input = GivenInput::open("scene", &scene.join("train"))?;
-    let views = Views::read(&input)?;
-    let run = |params: &Params, rows: &mut Rows, name: &str| -> anyhow::Result<Field> {
-        let params = params.resolve(&SceneFacts::of(&views, true));
+/// A scene to train on.
+struct Scene {
+    input: GivenInput,
+    views: Views,
+}
+
+impl Scene {
+    /// Trains a field from its start to its end, and adds the speed to the rows. `name` ends the
+    /// rows' names.
+    fn train(&self, rows: &mut Rows, params: &Params, name: &str) -> anyhow::Result<Field> {
+        let Self { input, views } = self;
+        let params = params.resolve(&SceneFacts::of(views, true));
         let mut supervision =
-            train_ss::supervision(&input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
+            train_ss::supervision(input, &params, None, &std::env::temp_dir(), false, &|_| ())?;
         let ResolvedField::Grid { architecture, regularisers, given } = &params.field else {
             anyhow::bail!("a grid is measured here");
         };
@@ -297,7 +303,15 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         rows.add(format!("train_rays_per_s{name}"), speed, "rays/s");
         rows.add(format!("train_samples_per_ray{name}"), samples as f64 / done, "samples");
         Ok(trainer.finish())
-    };
+    }
+}
+
+/// Whole trainings with their warm-up, at one and all threads, and what the first one's field
+/// renders.
+fn training(rows: &mut Rows, folder: &Path, rays: u64) -> anyhow::Result<()> {
+    let input = GivenInput::open("scene", &folder.join("train"))?;
+    let views = Views::read(&input)?;
+    let scene = Scene { input, views };
     // Rays drawn evenly over all pixels, so that the figure compares with others'; then as
     // trainings really go.
     let grid = |rays, pixel_importance| {
@@ -305,23 +319,28 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
             FieldParams::Grid(GridParams { rays, pixel_importance, ..GridParams::default() });
         Params { field, ..Params::default() }
     };
-    let field = run(&grid(rays, Some(1.0)), rows, "")?;
-    run(&grid(rays, None), rows, "_by_detail")?;
+    let field = scene.train(rows, &grid(rays, Some(1.0)), "")?;
+    scene.train(rows, &grid(rays, None), "_by_detail")?;
     let short = grid(rays / 6, Some(1.0));
-    run(&short, rows, "_first_sixth")?;
-    one_core(|| run(&short, rows, "_first_sixth_one_core"))?;
+    scene.train(rows, &short, "_first_sixth")?;
+    one_core(|| scene.train(rows, &short, "_first_sixth_one_core"))?;
     for scale in [1.0, 4.0] {
         let scaled = Params { supersample: scale, ..short.clone() };
-        run(&scaled, rows, &format!("_first_sixth_x{scale}"))?;
+        scene.train(rows, &scaled, &format!("_first_sixth_x{scale}"))?;
     }
 
     #[cfg(feature = "torch")]
-    mlp(rows, &input, &views)?;
+    mlp(rows, &scene.input, &scene.views)?;
 
-    let truth = Views::read(&GivenInput::open("cameras", &scene.join("cameras"))?)?;
+    rendering(rows, folder, &field)
+}
+
+/// Renders ten of a scene's views, at one and all threads and several sizes.
+fn rendering(rows: &mut Rows, folder: &Path, field: &Field) -> anyhow::Result<()> {
+    let truth = Views::read(&GivenInput::open("cameras", &folder.join("cameras"))?)?;
     let cameras: Vec<Camera> = truth.views.iter().take(10).map(|v| v.camera.clone()).collect();
     let own = cameras[0].intrinsics.width;
-    let mut render = |name: String, width: u32, one: bool| {
+    let mut render = |name: &str, width: u32, one: bool| {
         let all: Vec<Vec<Ray>> = cameras
             .iter()
             .map(|c| camera_rays(&c.resized(width, c.intrinsics.height * width / own)))
@@ -335,10 +354,10 @@ fn training(rows: &mut Rows, scene: &Path, rays: u64) -> anyhow::Result<()> {
         let seconds = if one { one_core(go) } else { go().min(go()) };
         rows.add(name, count as f64 / seconds, "rays/s");
     };
-    render("render_rays_per_s".into(), own, false);
-    render("render_rays_per_s_one_core".into(), own, true);
-    render("render_rays_per_s_half_size".into(), own / 2, false);
-    render("render_rays_per_s_twice_the_size".into(), own * 2, false);
+    render("render_rays_per_s", own, false);
+    render("render_rays_per_s_one_core", own, true);
+    render("render_rays_per_s_half_size", own / 2, false);
+    render("render_rays_per_s_twice_the_size", own * 2, false);
     rows.sgemm("after_rendering");
     Ok(())
 }

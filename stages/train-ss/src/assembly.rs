@@ -8,12 +8,14 @@ use scene::Camera;
 
 use crate::exposure::Exposures;
 use crate::hr_cache::{HrCache, KernelOperator};
+use crate::learnt::Learnt;
 use crate::moving_cameras::MovingCameras;
 use crate::packed::{PackedPhotograph, PixelMemory};
 use crate::photographs::Photographs;
 use crate::pixel_sampler::{Focus, Numbered, PixelSampler, detailed};
 use crate::pixel_set::PixelSet;
 use crate::reference_blocks::block_means;
+use crate::sub_pixel_rays::SubPixelRays;
 use crate::supersampling_options::SupersamplingOptions;
 use crate::supervision::{Supersampling, TrainingView};
 
@@ -51,19 +53,19 @@ impl Supersampling {
                 order,
                 options.seed,
             ),
-            exposures: options.exposure.then(|| Exposures::new(views.len())),
-            moving: options
-                .pose_refinement
-                .then(|| MovingCameras::new(assembly.cameras, assembly.pyramids)),
+            learnt: Learnt {
+                cache: assembly.cache,
+                exposures: options.exposure.then(|| Exposures::new(views.len())),
+                moving: options
+                    .pose_refinement
+                    .then(|| MovingCameras::new(assembly.cameras, assembly.pyramids)),
+            },
             views,
             lr_views: assembly.lr_views,
             background,
-            full: assembly.full,
-            side: assembly.full,
-            supersample_warmup: options.supersample_warmup,
+            sub_pixel_rays: SubPixelRays::new(assembly.full, options.supersample_warmup),
             supervision: options.supervision,
             seed: options.seed,
-            cache: assembly.cache,
             memory: assembly.memory,
         })
     }

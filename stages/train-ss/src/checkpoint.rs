@@ -119,7 +119,7 @@ impl Checkpoints {
         let own = [curve_name(step), kept_name(step)];
         artifact::write_json(&folder.join(&own[0]), curve)?;
         let mut file = std::fs::File::create(folder.join(&own[1]))?;
-        supervision.write(&mut file)?;
+        supervision.learnt.write(&mut file)?;
         trainer.write_checkpoint(&temporary)?;
         std::fs::rename(&temporary, &name)?;
         for entry in std::fs::read_dir(folder)? {
@@ -168,7 +168,7 @@ fn restored(
         return trainer.resume(checkpoint).then_some(curve);
     };
     let mut kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
-    let is_whole = kept.metadata().ok()?.len() == supervision.written_len() as u64;
+    let is_whole = kept.metadata().ok()?.len() == supervision.learnt.written_len() as u64;
     // A trainer that can't resume is as it was.
     (is_whole && trainer.resume(checkpoint) && supervision.restore(&mut kept).is_ok())
         .then_some(curve)

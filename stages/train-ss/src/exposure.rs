@@ -13,15 +13,15 @@ pub(crate) struct Exposures {
 }
 
 /// What a view's sums keep at each of its pixels.
-const KEEP: f64 = 0.998;
+const KEPT_SHARE: f64 = 0.998;
 /// Photographs are as bright as rendered, says so many white pixels.
 const PRIOR: f64 = 1.0;
 /// Share of the training before which the field knows too little to say anything of exposures. Much
 /// later it has made up floaters before the cameras that explain them: with 0.1, 0.3 factors are
 /// found half, not at all.
-const BEGIN: f64 = 0.02;
+const BEGIN_SHARE: f64 = 0.02;
 /// Bytes of a view's sums.
-const BYTES: usize = 6 * 8;
+const BYTES_PER_VIEW: usize = 6 * 8;
 
 impl Exposures {
     pub(crate) fn new(views: usize) -> Self {
@@ -43,14 +43,14 @@ impl Exposures {
         for ((sums, y), c) in self.sums[view].iter_mut().zip(photographed).zip(rendered) {
             if y.is_finite() && c.is_finite() {
                 let (y, c) = (f64::from(y), f64::from(c));
-                *sums = [KEEP.mul_add(sums[0], y * c), KEEP.mul_add(sums[1], c * c)];
+                *sums = [KEPT_SHARE.mul_add(sums[0], y * c), KEPT_SHARE.mul_add(sums[1], c * c)];
             }
         }
     }
 
     /// Finds the factors anew, with such a share of the training done.
     pub(crate) fn settle(&mut self, done: f64) {
-        if done < BEGIN {
+        if done < BEGIN_SHARE {
             return;
         }
         for c in 0..3 {
@@ -70,7 +70,7 @@ impl Exposures {
 
     /// Length of that.
     pub(crate) fn len(&self) -> usize {
-        self.sums.len() * BYTES
+        self.sums.len() * BYTES_PER_VIEW
     }
 
     /// Restores what [`Exposures::bytes`] gave.

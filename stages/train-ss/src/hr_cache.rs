@@ -18,6 +18,17 @@ pub(crate) struct HrCache {
     views: Vec<CachedView>,
 }
 
+/// A pixel of an LR photograph.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct LrPixel {
+    /// Which view's photograph.
+    pub(crate) view: usize,
+    /// Column.
+    pub(crate) x: usize,
+    /// Row.
+    pub(crate) y: usize,
+}
+
 #[derive(Debug)]
 struct CachedView {
     width: usize,
@@ -65,7 +76,7 @@ fn first(at: usize, side: usize, hr: usize, lr: usize) -> usize {
 }
 
 /// LR pixels on each side of one whose residuals count.
-const NEAR: usize = 2 * HrCache::REACH + 1;
+const LR_PIXELS_NEAR: usize = 2 * HrCache::REACH + 1;
 
 impl HrCache {
     /// How far, in LR pixels, the kernels reach to either side of a block.
@@ -95,18 +106,18 @@ impl HrCache {
     }
 
     /// First column and row of the HR pixels rendered for an LR pixel: those around its centre.
-    fn block(&self, view: usize, x: usize, y: usize) -> [usize; 2] {
-        let view = &self.views[view];
+    fn block(&self, pixel: LrPixel) -> [usize; 2] {
+        let view = &self.views[pixel.view];
         [
-            first(x, self.side[0], view.width, view.kernel.operator.x.outputs()),
-            first(y, self.side[1], view.height, view.kernel.operator.y.outputs()),
+            first(pixel.x, self.side[0], view.width, view.kernel.operator.x.outputs()),
+            first(pixel.y, self.side[1], view.height, view.kernel.operator.y.outputs()),
         ]
     }
 
     /// Where that block begins and how large an HR pixel is, in LR pixels.
-    pub(crate) fn block_in_pixels(&self, view: usize, x: usize, y: usize) -> ([f64; 2], [f64; 2]) {
-        let [i, j] = self.block(view, x, y);
-        let view = &self.views[view];
+    pub(crate) fn block_in_pixels(&self, pixel: LrPixel) -> ([f64; 2], [f64; 2]) {
+        let [i, j] = self.block(pixel);
+        let view = &self.views[pixel.view];
         let apart = [
             view.kernel.operator.x.outputs() as f64 / view.width as f64,
             view.kernel.operator.y.outputs() as f64 / view.height as f64,
@@ -120,21 +131,21 @@ impl HrCache {
     /// pixel itself. `judge` gets a channel, a prediction and its target, and gives the residual.
     pub(crate) fn back_project(
         &self,
-        view: usize,
-        [x, y]: [usize; 2],
+        pixel: LrPixel,
         colours: &[[f32; 3]],
         targets: &PackedPhotograph,
         judge: impl Fn(usize, f32, f32) -> f32,
         back_projected: &mut [[f32; 3]],
     ) -> [f32; 3] {
-        let block = Block { at: self.block(view, x, y), columns: self.side[0], colours };
+        let block = Block { at: self.block(pixel), columns: self.side[0], colours };
+        let LrPixel { view, x, y } = pixel;
         let view = &self.views[view];
         let (operator, inverse) = (&view.kernel.operator, &view.kernel.inverse);
         let (xs, ys) = (near(x, operator.x.outputs()), near(y, operator.y.outputs()));
         // What the kernel makes of it, and then the residuals.
         let mut residuals = view.projected(&block, xs.clone(), ys.clone());
         for (qy, row) in ys.clone().zip(&mut residuals) {
-            let mut target = [[0.0; 4]; NEAR];
+            let mut target = [[0.0; 4]; LR_PIXELS_NEAR];
             targets.row(
                 qy * targets.width() + xs.start..qy * targets.width() + xs.end,
                 &mut target[..xs.len()],
@@ -145,7 +156,7 @@ impl HrCache {
         }
         let [left, top] = block.at;
         for (b, back_projected) in back_projected.chunks_exact_mut(block.columns).enumerate() {
-            let mut narrow = [[0.0f32; 3]; NEAR];
+            let mut narrow = [[0.0f32; 3]; LR_PIXELS_NEAR];
             for (qy, row) in ys.clone().zip(&residuals) {
                 let w = inverse.y.weight(qy, top + b);
                 narrow
@@ -166,9 +177,9 @@ impl HrCache {
     }
 
     /// Remembers the fresh sub-pixel rays of an LR pixel.
-    pub(crate) fn remember(&mut self, view: usize, x: usize, y: usize, colours: &[[f32; 3]]) {
-        let [left, top] = self.block(view, x, y);
-        let view = &mut self.views[view];
+    pub(crate) fn remember(&mut self, pixel: LrPixel, colours: &[[f32; 3]]) {
+        let [left, top] = self.block(pixel);
+        let view = &mut self.views[pixel.view];
         for (row, colours) in (top..).zip(colours.chunks_exact(self.side[0])) {
             ROWS.with_borrow_mut(|rows| {
                 rows.read.clear();
@@ -211,18 +222,18 @@ struct Block<'a> {
 }
 
 impl CachedView {
-    /// What the kernel makes of it at some LR columns and rows, at most [`NEAR`] of each, with a
+    /// What the kernel makes of it at some LR columns and rows, at most [`LR_PIXELS_NEAR`] of each, with a
     /// block as freshly rendered.
     fn projected(
         &self,
         block: &Block<'_>,
         xs: Range<usize>,
         ys: Range<usize>,
-    ) -> [[[f32; 3]; NEAR]; NEAR] {
+    ) -> [[[f32; 3]; LR_PIXELS_NEAR]; LR_PIXELS_NEAR] {
         let (across, down) = (&self.kernel.operator.x, &self.kernel.operator.y);
         let (columns, lines) = (footprint(across, xs.clone()), footprint(down, ys.clone()));
         let [left, top] = block.at;
-        let mut projected = [[[0.0f32; 3]; NEAR]; NEAR];
+        let mut projected = [[[0.0f32; 3]; LR_PIXELS_NEAR]; LR_PIXELS_NEAR];
         ROWS.with_borrow_mut(|rows| {
             for line in lines {
                 let start = line * self.width;
@@ -239,7 +250,7 @@ impl CachedView {
                 {
                     rows.levels[left - columns.start..][..fresh.len()].copy_from_slice(fresh);
                 }
-                let mut narrow = [[0.0f32; 3]; NEAR];
+                let mut narrow = [[0.0f32; 3]; LR_PIXELS_NEAR];
                 for (qx, sum) in xs.clone().zip(&mut narrow) {
                     let (first, weights) = across.run(qx);
                     for (level, w) in rows.levels[first - columns.start..].iter().zip(weights) {
@@ -302,8 +313,9 @@ mod tests {
             PackedPhotograph::new(&pattern(6, 4).into(), &mut PixelMemory::unlimited()).unwrap();
         let colours = [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9], [0.2, 0.1, 0.0]];
         let mut back_projected = [[9.0; 3]; 4];
+        let pixel = LrPixel { view: 0, x: 2, y: 1 };
         let own =
-            cache.back_project(0, [2, 1], &colours, &targets, |_, p, t| p - t, &mut back_projected);
+            cache.back_project(pixel, &colours, &targets, |_, p, t| p - t, &mut back_projected);
         for c in 0..3 {
             let mean = colours.iter().map(|colour| colour[c]).sum::<f32>() / 4.0;
             assert!((own[c] - (mean - targets.pixel(8)[c])).abs() < 1e-6);
@@ -339,7 +351,8 @@ mod tests {
             let cache = cache(side, &image, kernel.clone());
             for y in 0..lr.1 {
                 for x in 0..lr.0 {
-                    let [i, j] = cache.block(0, x, y);
+                    let pixel = LrPixel { view: 0, x, y };
+                    let [i, j] = cache.block(pixel);
                     let mut hybrid = image.clone();
                     let fresh: Vec<[f32; 3]> = (0..side[0] * side[1])
                         .map(|k| [0.2 + 0.1 * k as f32 / side[0] as f32, 0.5, 0.7])
@@ -354,8 +367,7 @@ mod tests {
                     let expected = inverse.adjoint(&residual);
                     let mut back_projected = vec![[9.0; 3]; fresh.len()];
                     let own = cache.back_project(
-                        0,
-                        [x, y],
+                        pixel,
                         &fresh,
                         &packed,
                         |_, p, t| p - t,
@@ -388,7 +400,7 @@ mod tests {
     fn remembers_what_it_is_told() {
         let kernel = Arc::new(KernelOperator::new(Filter::Box, (8, 6), (4, 3)));
         let mut first = cache([2, 2], &pattern(8, 6), kernel.clone());
-        first.remember(0, 3, 1, &[[1.0, 0.0, 0.2]; 4]);
+        first.remember(LrPixel { view: 0, x: 3, y: 1 }, &[[1.0, 0.0, 0.2]; 4]);
         let kept = written(&first);
         assert_eq!(first.len(), kept.len());
         assert_eq!(kept[3 * (2 * 8 + 6)..][..6], [255, 0, 51, 255, 0, 51]);
@@ -408,7 +420,8 @@ mod tests {
             let kernel = Arc::new(KernelOperator::new(Filter::Lanczos, (hr, hr), (lr, lr)));
             let cache = cache([side, side], &pattern(hr, hr), kernel);
             let mut seen = vec![false; hr];
-            (0..lr).for_each(|x| seen[cache.block(0, x, 0)[0]..][..side].fill(true));
+            let start = |x: usize| cache.block(LrPixel { view: 0, x, y: 0 })[0];
+            (0..lr).for_each(|x| seen[start(x)..][..side].fill(true));
             assert!(seen.iter().all(|s| *s), "{lr} {hr}");
         }
     }

@@ -11,12 +11,14 @@
 //!   file.
 //! * `pixel_sampler`: which pixel a bundle trains on; `residual`: how their
 //!   colours are judged.
+//! * `sub_pixel_rays`: how many rays are cast through a pixel.
 //! * `hr_cache`: the field's HR pixels as last rendered, by which the kernel is known without
 //!   casting its whole footprint.
 //! * `member`: one training; `field_trainer`: whatever it trains, our grid or the paper's networks.
 //! * `exposure`: how bright each photograph is, where that is asked for.
 //! * `moving_cameras`: where photographs were taken from, where that is asked for; `pose_choice`:
 //!   whether it was better to ask.
+//! * `learnt`: HR pixels, exposures and poses that a training has come to know.
 //! * `checkpoint`: what makes a killed run end in the same bytes.
 
 mod assembly;
@@ -25,6 +27,7 @@ mod exposure;
 mod field_trainer;
 mod hr_cache;
 mod init_field;
+mod learnt;
 mod member;
 mod memory;
 mod moving_cameras;
@@ -39,6 +42,7 @@ mod references;
 mod residual;
 mod resolve;
 mod setup;
+mod sub_pixel_rays;
 mod supersampling_options;
 mod supervision;
 mod training_log;
@@ -55,7 +59,7 @@ use init_field::InitField;
 use member::{Member, TrainingData};
 pub use params::{Combine, FieldParams, GridParams, MlpParams, Params, RateSchedule};
 pub use pixel_sampler::Order;
-pub use resolve::{Resolved, ResolvedField, ResolvedRegularisers, SceneFacts};
+pub use resolve::{ParamsError, Resolved, ResolvedField, ResolvedRegularisers, SceneFacts};
 use setup::open_background;
 pub use setup::supervision;
 pub use supervision::{Supersampling, Supervision};
@@ -118,7 +122,7 @@ impl Stage for TrainSs {
     }
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
-        params.check().map_err(Failure::Usage)?;
+        params.check().map_err(|e| Failure::Usage(e.to_string()))?;
         let input = context.input("scene")?;
         let references = context.optional_input("references");
         let views = Views::read(input)?;

@@ -7,11 +7,12 @@ use radiance::{FieldFile, FieldModel};
 use scene::{Bounds, Views};
 use stage::{Context, Progress};
 
-use crate::checkpoint::{Checkpoints, read_latest};
+use crate::checkpoint::{Checkpoints, Curve, read_latest};
 use crate::field_trainer::{Collapsed, FieldTrainer, average, start};
 use crate::params::Combine;
 use crate::resolve::Resolved;
 use crate::setup::supervision;
+use crate::supervision::Supersampling;
 use crate::training_log::TrainingLog;
 
 /// What a training learns from, and where it says how far it is.
@@ -21,6 +22,14 @@ pub(crate) struct TrainingData<'a> {
     pub(crate) references: Option<&'a GivenInput>,
     pub(crate) views: &'a Views,
     pub(crate) progress: &'a Progress,
+}
+
+/// A training that has begun.
+struct Training {
+    trainer: Box<dyn FieldTrainer>,
+    supervision: Supersampling,
+    checkpoints: Checkpoints,
+    curve: Curve,
 }
 
 /// A field that is trained alone, with its checkpoints in a folder of its own.
@@ -162,15 +171,26 @@ impl<'a> Member<'a> {
         work: Option<&Path>,
         data: &TrainingData<'_>,
     ) -> anyhow::Result<TrainingLog> {
-        let (context, TrainingData { input, views, progress, .. }) = (self.context, *data);
+        let mut training = self.begin(params, work, data)?;
+        self.take_steps(&mut training, params.rays, data.progress)?;
+        self.end(training, data.views.bounds)
+    }
+
+    /// Begins a training, or goes on from its last checkpoint in `work`.
+    fn begin(
+        &self,
+        params: &Resolved,
+        work: Option<&Path>,
+        data: &TrainingData<'_>,
+    ) -> anyhow::Result<Training> {
+        let TrainingData { input, references, views, .. } = *data;
         let folder = work.unwrap_or_else(|| self.output.parent().unwrap_or(Path::new(".")));
         if let Some(work) = work {
             std::fs::create_dir_all(work)
                 .with_context(|| format!("cannot make {}", work.display()))?;
         }
-        let say = |text: String| context.say(text);
-        let mut supervision =
-            supervision(input, params, data.references, folder, work.is_some(), &say)?;
+        let say = |text: String| self.context.say(text);
+        let mut supervision = supervision(input, params, references, folder, work.is_some(), &say)?;
         let (total, bundle) = (params.rays, supervision.full_side().iter().product::<usize>());
         if total < bundle as u64 {
             let message = format!(
@@ -179,22 +199,33 @@ impl<'a> Member<'a> {
             return Err(Failure::Usage(message).into());
         }
         let mut trainer = self.start(params, views.bounds)?;
-        let mut checkpoints = Checkpoints::new(work);
-        let mut curve =
-            checkpoints.resume(&mut *trainer, &mut supervision, |text| context.say(text));
+        let checkpoints = Checkpoints::new(work);
+        let curve =
+            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text));
+        Ok(Training { trainer, supervision, checkpoints, curve })
+    }
+
+    /// Takes steps until `total` rays are cast, with checkpoints and progress.
+    fn take_steps(
+        &self,
+        training: &mut Training,
+        total: u64,
+        progress: &Progress,
+    ) -> anyhow::Result<()> {
+        let Training { trainer, supervision, checkpoints, curve } = training;
         loop {
-            if context.interrupted() {
+            if self.context.interrupted() {
                 checkpoints
-                    .write(&*trainer, &supervision, &curve)
+                    .write(&**trainer, supervision, curve)
                     .context("cannot write the checkpoint")?;
                 return Err(Failure::Interrupted.into());
             }
-            let Some(report) = trainer.step(&mut supervision)? else { break };
+            let Some(report) = trainer.step(supervision)? else { return Ok(()) };
             if let Some(fault) = supervision.fault() {
                 anyhow::bail!("the file that keeps pixels can't be read or written: {fault}");
             }
             if report.skipped {
-                context.say(format!(
+                self.context.say(format!(
                     "step {}: something wasn't finite; the step was thrown away and the rate \
                     halved",
                     trainer.steps()
@@ -205,17 +236,22 @@ impl<'a> Member<'a> {
             curve.add(&report, rays, total);
             progress.set(self.before + rays, &curve.note());
             checkpoints
-                .write_when_due(&*trainer, &supervision, &curve)
+                .write_when_due(&**trainer, supervision, curve)
                 .context("cannot write the checkpoint")?;
         }
+    }
+
+    /// Ends a training: writes its weights, and keeps them and its log for a later run.
+    fn end(&self, training: Training, bounds: Bounds) -> anyhow::Result<TrainingLog> {
+        let Training { trainer, supervision, curve, .. } = training;
         let moved = supervision.moved(|| trainer.field())?;
-        moved.iter().for_each(|moved| context.say(format!("cameras have {moved}")));
+        moved.iter().for_each(|moved| self.context.say(format!("cameras have {moved}")));
         let mut log = curve.finish(trainer.steps(), trainer.rays_done());
         log.exposures = supervision.exposures().to_vec();
         log.poses =
             supervision.refined_cameras().iter().map(|camera| camera.camera_to_world).collect();
         log.warnings = moved.filter(Moved::is_far).iter().map(far_warning).collect();
-        self.write_weights(trainer, views.bounds)?;
+        self.write_weights(trainer, bounds)?;
         if let Some(work) = &self.work {
             std::fs::copy(&self.output, work.join(DONE_WEIGHTS))
                 .context("cannot keep the field")?;
@@ -229,7 +265,7 @@ impl<'a> Member<'a> {
         start(params, from, bounds, &self.context.device)
     }
 
-    /// Ends a training: writes its weights, combined with those it went on from.
+    /// Writes the weights of a training, combined with those it went on from.
     fn write_weights(&self, trainer: Box<dyn FieldTrainer>, bounds: Bounds) -> anyhow::Result<()> {
         trainer.finish(&self.output)?;
         if let Some((from, Combine::AverageWeights)) = &self.from {

@@ -22,20 +22,20 @@ pub(crate) struct MemoryNeed {
     pub(crate) reading: u64,
 }
 
-/// The most pixels that are kept in memory, so that a stage with many photographs leaves place for
-/// other programs.
-const MOST_PIXELS: u64 = 4_000_000_000;
-/// The program, without libtorch and with it.
-const PROGRAM: u64 = if cfg!(feature = "torch") { 150_000_000 } else { 30_000_000 };
+/// Bytes of pixels that are kept in memory at most, so that a stage with many photographs leaves
+/// place for other programs.
+const MOST_PIXEL_BYTES: u64 = 4_000_000_000;
+/// Bytes of the program, with libtorch and without it.
+const PROGRAM_BYTES: u64 = if cfg!(feature = "torch") { 150_000_000 } else { 30_000_000 };
 /// Numbers a parameter of the grid: it, its gradient, two moments, an average.
-const NUMBERS: u64 = 5;
+const NUMBERS_PER_PARAMETER: u64 = 5;
 /// Numbers a parameter that a checkpoint copies: all but the gradient.
-const COPIED: u64 = 4;
+const COPIED_PER_PARAMETER: u64 = 4;
 /// Bytes a pixel of a photograph in floats, RGBA.
-const IN_FLOATS: u64 = 16;
+const BYTES_PER_FLOAT_PIXEL: u64 = 16;
 /// Bytes a pixel of its pyramid in floats, RGB: 1 + 1/4 + 1/16 + …, and of the photograph that is
 /// compared at the end.
-const OF_POSES: u64 = 16 + 12;
+const BYTES_PER_PYRAMID_PIXEL: u64 = 16 + 12;
 
 impl MemoryNeed {
     /// Of a training with such a field on such views. `references` are HR; `has_checkpoints` says
@@ -62,9 +62,9 @@ impl MemoryNeed {
             // As floats twice, or as floats, enlarged along one axis and both, and in 8 bits.
             let enlarging =
                 if is_cached { 12 * (hr.0 * size.1) as u64 + (12 + 3) * cached } else { 0 };
-            need.reading = need.reading.max((IN_FLOATS + 12) * pixels + enlarging);
+            need.reading = need.reading.max((BYTES_PER_FLOAT_PIXEL + 12) * pixels + enlarging);
             if options.pose_refinement {
-                need.poses += OF_POSES * pixels;
+                need.poses += BYTES_PER_PYRAMID_PIXEL * pixels;
             }
         }
         need
@@ -72,7 +72,7 @@ impl MemoryNeed {
 
     /// What it needs with all pixels in a file.
     fn least(&self) -> u64 {
-        PROGRAM + self.poses + self.field.max(self.reading)
+        PROGRAM_BYTES + self.poses + self.field.max(self.reading)
     }
 
     /// Where pixels go when so much memory is free: into memory as far as there is place, and then
@@ -86,7 +86,7 @@ impl MemoryNeed {
                 "the training needs {least} of memory, and {free} are free; {MEMORY_REMEDY}"
             ))
         })?;
-        Ok(PixelMemory::new(MOST_PIXELS.min(left), folder))
+        Ok(PixelMemory::new(MOST_PIXEL_BYTES.min(left), folder))
     }
 
     /// What it comes to, for people, where so many bytes of pixels may be in memory.
@@ -120,8 +120,8 @@ fn image_size(view: &View) -> (usize, usize) {
 fn field(params: &Resolved, has_checkpoints: bool) -> u64 {
     match &params.field {
         ResolvedField::Grid { architecture, .. } => {
-            let numbers = if has_checkpoints { NUMBERS + COPIED } else { NUMBERS };
-            4 * numbers * architecture.grid_len() as u64
+            let copied = if has_checkpoints { COPIED_PER_PARAMETER } else { 0 };
+            4 * (NUMBERS_PER_PARAMETER + copied) * architecture.grid_len() as u64
         }
         // At least: what libtorch takes for a step doesn't show in the networks' size.
         ResolvedField::Mlp { .. } => 500_000_000,
@@ -181,7 +181,10 @@ mod tests {
                 (many.pixels, many.field, many.reading),
                 (4 * few.pixels, few.field, few.reading)
             );
-            assert_eq!((few.poses, need(10, filter, true).poses), (0, 10 * 3_000_000 * OF_POSES));
+            assert_eq!(
+                (few.poses, need(10, filter, true).poses),
+                (0, 10 * 3_000_000 * BYTES_PER_PYRAMID_PIXEL)
+            );
         }
     }
 
@@ -195,9 +198,9 @@ mod tests {
             poses: 0,
             reading: 100_000_000,
         };
-        let least = PROGRAM + 300_000_000;
+        let least = PROGRAM_BYTES + 300_000_000;
         let budget = |free| need.plan(free, PathBuf::new()).map(|memory| memory.left());
-        assert_eq!(budget(None).unwrap(), MOST_PIXELS);
+        assert_eq!(budget(None).unwrap(), MOST_PIXEL_BYTES);
         assert_eq!(budget(Some(least + 77)).unwrap(), 77);
         let said = budget(Some(least - 1_000_000)).unwrap_err().to_string();
         let [needed, free] = [least, least - 1_000_000].map(sized);
@@ -205,9 +208,9 @@ mod tests {
             said,
             format!("the training needs {needed} of memory, and {free} are free; {MEMORY_REMEDY}")
         );
-        let total = sized(least + MOST_PIXELS);
+        let total = sized(least + MOST_PIXEL_BYTES);
         assert_eq!(
-            need.in_words(MOST_PIXELS),
+            need.in_words(MOST_PIXEL_BYTES),
             format!(
                 "memory: about {total}, of it 300.0 MB for the field and 4.0 GB for pixels; 1.0 \
                 GB of pixels go into a file"
@@ -215,7 +218,7 @@ mod tests {
         );
         let total = sized(least + 2_000_000);
         assert_eq!(
-            MemoryNeed { pixels: 2_000_000, ..need }.in_words(MOST_PIXELS),
+            MemoryNeed { pixels: 2_000_000, ..need }.in_words(MOST_PIXEL_BYTES),
             format!("memory: about {total}, of it 300.0 MB for the field and 2.0 MB for pixels")
         );
     }

@@ -17,20 +17,20 @@ pub(crate) struct MovingCameras {
 const ROUNDS: u32 = 24;
 /// Shares of the training at the first and after the last round. It begins early, before the field
 /// has explained photographs that don't fit by floaters, and ends before weights are averaged.
-const FIRST: f64 = 0.02;
-const LAST: f64 = 0.7;
+const FIRST_ROUND_SHARE: f64 = 0.02;
+const LAST_ROUND_SHARE: f64 = 0.7;
 /// Share at which photographs are compared at their own size; before it at smaller ones, since a
 /// field that isn't sharp yet pulls from afar.
-const OWN_SIZE: f64 = 0.4;
+const OWN_SIZE_SHARE: f64 = 0.4;
 /// Renderings of a camera in a round.
-const RENDERINGS: u32 = 3;
+const RENDERINGS_PER_ROUND: u32 = 3;
 /// Halvings of the photographs' size to begin with.
-const SMALLER: u32 = 3;
+const FIRST_HALVINGS: u32 = 3;
 
 impl MovingCameras {
     /// An RGB photograph, NaN where nothing is known, at all sizes that it is compared at.
     pub(crate) fn pyramid(photograph: &Image) -> Pyramid {
-        Pyramid::new(photograph, SMALLER)
+        Pyramid::new(photograph, FIRST_HALVINGS)
     }
 
     /// Cameras, and their photographs.
@@ -45,8 +45,9 @@ impl MovingCameras {
 
     /// Whether it is time for a round, with such a share of the training done.
     pub(crate) fn are_due(&self, done: f64) -> bool {
+        let range = LAST_ROUND_SHARE - FIRST_ROUND_SHARE;
         self.rounds < ROUNDS
-            && done >= FIRST + (LAST - FIRST) * f64::from(self.rounds) / f64::from(ROUNDS)
+            && done >= FIRST_ROUND_SHARE + range * f64::from(self.rounds) / f64::from(ROUNDS)
     }
 
     /// Moves every camera; `exposure` has what the field's colours are to a photograph's.
@@ -58,8 +59,9 @@ impl MovingCameras {
         exposure: impl Fn(usize) -> [f32; 3],
     ) -> Result<(), RenderError> {
         for (i, (camera, photograph)) in self.now.iter_mut().zip(&self.photographs).enumerate() {
-            let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE);
-            let options = Options { renderings: RENDERINGS, background, exposure: exposure(i) };
+            let smaller = f64::from(photograph.smaller()) * (1.0 - done / OWN_SIZE_SHARE);
+            let options =
+                Options { renderings: RENDERINGS_PER_ROUND, background, exposure: exposure(i) };
             *camera =
                 refine(field, camera, photograph, smaller.max(0.0).ceil() as u32, &options)?.camera;
         }

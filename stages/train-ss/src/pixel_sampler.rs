@@ -41,7 +41,7 @@ pub(crate) struct Numbered {
 const PIXEL: u64 = 100;
 
 /// Draws until one is of a pixel that counts; after so many the last is taken, and has no residual.
-const REDRAWS: usize = 64;
+const MOST_DRAWS: usize = 64;
 
 impl PixelSampler {
     /// Of views whose pixels have so many numbers together.
@@ -75,7 +75,7 @@ impl PixelSampler {
             }
             _ => {
                 let mut place = self.place(self.focus.draw(self.numbers, &mut rng));
-                for _ in 1..REDRAWS {
+                for _ in 1..MOST_DRAWS {
                     if counts(place.0, place.1) {
                         break;
                     }
@@ -130,7 +130,7 @@ pub(crate) struct Focus {
 }
 
 /// Range of a channel over 3×3 pixels below which they are flat.
-const FLAT: f32 = 8.0 / 255.0;
+const FLAT_RANGE: f32 = 8.0 / 255.0;
 
 impl Focus {
     /// Detailed pixels are drawn `importance` times as often as flat ones.
@@ -182,7 +182,7 @@ pub(crate) fn detailed(image: &Image) -> Vec<bool> {
                     let columns = near(x, width).map(|i| i * channels + c);
                     let (low, high) = columns
                         .fold((f32::MAX, f32::MIN), |(l, h), at| (l.min(low[at]), h.max(high[at])));
-                    high - low > FLAT
+                    high - low > FLAT_RANGE
                 });
             }
         },

@@ -11,7 +11,7 @@ pub(crate) struct PixelSet {
 }
 
 /// Words of a block.
-const BLOCK: usize = 8;
+const WORDS_PER_BLOCK: usize = 8;
 
 impl PixelSet {
     /// How many pixels are in it.
@@ -30,7 +30,7 @@ impl PixelSet {
         }
         let block = self.before.partition_point(|&before| before <= n) - 1;
         let mut left = n - self.before[block];
-        for (at, word) in self.words.iter().enumerate().skip(block * BLOCK) {
+        for (at, word) in self.words.iter().enumerate().skip(block * WORDS_PER_BLOCK) {
             let here = u64::from(word.count_ones());
             if left < here {
                 let rest = (0..left).fold(*word, |word, _| word & (word - 1));
@@ -48,7 +48,7 @@ impl Extend<bool> for PixelSet {
         for is_in in pixels {
             let bit = self.length % 64;
             if bit == 0 {
-                if self.words.len().is_multiple_of(BLOCK) {
+                if self.words.len().is_multiple_of(WORDS_PER_BLOCK) {
                     self.before.push(self.count);
                 }
                 self.words.push(0);

@@ -7,10 +7,10 @@ use crate::photographs::{NO_PLACE, Photographs};
 
 /// A reference that was shrunk is its own LR photograph, up to rounding, or shows something else
 /// where it differs by more than this, in dB.
-const ALIKE: f64 = 25.0;
+const LEAST_ALIKENESS: f64 = 25.0;
 
 /// Alpha of an LR pixel that is made of opaque ones alone, up to rounding.
-const OPAQUE: f32 = 1.0 - 1e-4;
+const LEAST_OPAQUE_ALPHA: f32 = 1.0 - 1e-4;
 
 /// References as they should join a training: of one with an LR photograph of its own the exposure
 /// is that photograph's, and it is left out where it shows something else. What was done is said.
@@ -49,13 +49,13 @@ pub(crate) fn checked(
             packed = PackedPhotograph::new(&photograph, memory).context(NO_PLACE)?;
         }
         let alike = alikeness(&shrunk, &own);
-        if alike < ALIKE {
+        if alike < LEAST_ALIKENESS {
             say(format!(
                 "reference {name} looks otherwise than its own LR photograph ({alike:.1} dB) and \
                 is left out: another view, or something that moved?"
             ));
         }
-        if alike >= ALIKE {
+        if alike >= LEAST_ALIKENESS {
             views.push(view);
             images.push(packed);
         }
@@ -84,8 +84,9 @@ fn compared(reference: &Image, own: &Image, kernel: Kernel) -> [Image; 2] {
     if is_transparent(reference) {
         // That kernel averages straight colours, those of what is transparent, too: only alpha is
         // known there.
-        let hidden: Vec<usize> =
-            (0..own.width * own.height).filter(|i| own.data[4 * i + 3] < OPAQUE).collect();
+        let hidden: Vec<usize> = (0..own.width * own.height)
+            .filter(|i| own.data[4 * i + 3] < LEAST_OPAQUE_ALPHA)
+            .collect();
         pair.iter_mut()
             .for_each(|image| hidden.iter().for_each(|i| image.data[4 * i..4 * i + 3].fill(0.0)));
     }

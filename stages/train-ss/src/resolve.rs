@@ -8,7 +8,8 @@ use serde_json::{Value, json};
 
 use crate::params::{Combine, FieldParams, GridParams, MlpParams, Params};
 use crate::pixel_sampler::Order;
-use crate::supervision::{Supervision, warmup_stages};
+use crate::sub_pixel_rays::warmup_stages;
+use crate::supervision::Supervision;
 
 /// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
 const EPOCHS: u64 = 20;
@@ -148,15 +149,28 @@ pub struct ResolvedRegularisers {
     pub floater_loss: f64,
 }
 
+/// Parameters that can't be meant together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ParamsError {
+    /// The coarsest level of a grid has more cells than the finest.
+    #[error("parameter base_resolution: {base} is above max_resolution = {max}")]
+    BaseAboveMax {
+        /// Cells along an axis of the coarsest level.
+        base: u32,
+        /// Cells along an axis of the finest level.
+        max: u32,
+    },
+}
+
 impl Params {
     /// Fails on parameters that can't be meant together.
-    pub fn check(&self) -> Result<(), String> {
-        match &self.field {
+    pub fn check(&self) -> Result<(), ParamsError> {
+        match self.field {
             FieldParams::Grid(GridParams {
-                base_resolution, max_resolution: Some(max), ..
-            }) if max < base_resolution => Err(format!(
-                "parameter base_resolution: {base_resolution} is above max_resolution = {max}"
-            )),
+                base_resolution: base,
+                max_resolution: Some(max),
+                ..
+            }) if max < base => Err(ParamsError::BaseAboveMax { base, max }),
             _ => Ok(()),
         }
     }
@@ -554,6 +568,21 @@ mod tests {
                 assert!(recorded.contains_key(name), "{name} isn't recorded");
             }
         }
+    }
+
+    fn with_resolutions(base_resolution: u32, max_resolution: Option<u32>) -> Params {
+        let grid = GridParams { base_resolution, max_resolution, ..GridParams::default() };
+        Params { field: FieldParams::Grid(grid), ..Params::default() }
+    }
+
+    #[test]
+    fn the_coarsest_level_is_no_finer_than_the_finest() {
+        assert_eq!(with_resolutions(64, Some(64)).check(), Ok(()));
+        assert_eq!(with_resolutions(64, None).check(), Ok(()));
+        let problem = with_resolutions(64, Some(32)).check().unwrap_err();
+        assert_eq!(problem, ParamsError::BaseAboveMax { base: 64, max: 32 });
+        let words = "parameter base_resolution: 64 is above max_resolution = 32";
+        assert_eq!(problem.to_string(), words);
     }
 
     fn bundles(resolved: &Resolved, supersample_warmup: f64, supersample: f64) -> u64 {

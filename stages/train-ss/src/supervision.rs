@@ -7,13 +7,14 @@ use scene::{Background, Camera, CameraRays};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::exposure::Exposures;
-use crate::hr_cache::HrCache;
+use crate::hr_cache::{HrCache, LrPixel};
+use crate::learnt::Learnt;
 use crate::moving_cameras::MovingCameras;
 use crate::packed::{PackedPhotograph, PixelMemory};
 use crate::pixel_sampler::PixelSampler;
 use crate::reference_blocks::block_start;
 use crate::residual::{Target, is_clipped};
+use crate::sub_pixel_rays::SubPixelRays;
 
 /// How rays are compared with the LR pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
@@ -45,15 +46,11 @@ pub struct Supersampling {
     pub(crate) lr_views: usize,
     pub(crate) sampler: PixelSampler,
     pub(crate) background: Background,
-    /// Sub-pixel rays along x and y, when all are cast and now.
-    pub(crate) full: [usize; 2],
-    pub(crate) side: [usize; 2],
-    pub(crate) supersample_warmup: f64,
+    pub(crate) sub_pixel_rays: SubPixelRays,
     pub(crate) supervision: Supervision,
     pub(crate) seed: u64,
-    pub(crate) cache: Option<HrCache>,
-    pub(crate) exposures: Option<Exposures>,
-    pub(crate) moving: Option<MovingCameras>,
+    /// What it has come to know in the training.
+    pub(crate) learnt: Learnt,
     pub(crate) memory: PixelMemory,
 }
 
@@ -72,43 +69,18 @@ const BACKGROUND: u64 = 101;
 impl Supersampling {
     /// Sub-pixel rays of an LR pixel along x and y, once all are cast.
     pub fn full_side(&self) -> [usize; 2] {
-        self.full
+        self.sub_pixel_rays.full
     }
 
     /// The cache, where the kernel is what counts for a view by now.
     fn kernel(&self, view: usize) -> Option<&HrCache> {
-        self.cache.as_ref().filter(|_| self.side == self.full && view < self.lr_views)
+        let counts = self.sub_pixel_rays.are_all_cast() && view < self.lr_views;
+        self.learnt.cache.as_ref().filter(|_| counts)
     }
 
-    /// Writes what it has come to know in the training, for a checkpoint: HR pixels as last
-    /// rendered, what exposures follow from, and poses.
-    pub(crate) fn write(&self, to: &mut impl io::Write) -> io::Result<()> {
-        self.cache.iter().try_for_each(|cache| cache.write(to))?;
-        self.exposures.iter().try_for_each(|exposures| to.write_all(&exposures.bytes()))?;
-        self.moving.iter().try_for_each(|moving| to.write_all(&moving.bytes()))
-    }
-
-    /// Bytes that [`Supersampling::write`] writes.
-    pub(crate) fn written_len(&self) -> usize {
-        let exposures = self.exposures.as_ref().map_or(0, Exposures::len);
-        self.cache.as_ref().map_or(0, HrCache::len)
-            + exposures
-            + self.moving.as_ref().map_or(0, MovingCameras::len)
-    }
-
-    /// Restores what was written.
+    /// Restores what [`Learnt::write`] wrote.
     pub(crate) fn restore(&mut self, from: &mut impl io::Read) -> io::Result<()> {
-        self.cache.iter_mut().try_for_each(|cache| cache.restore(from))?;
-        if let Some(exposures) = &mut self.exposures {
-            let mut bytes = vec![0; exposures.len()];
-            from.read_exact(&mut bytes)?;
-            exposures.restore(&bytes);
-        }
-        if let Some(moving) = &mut self.moving {
-            let mut bytes = vec![0; moving.len()];
-            from.read_exact(&mut bytes)?;
-            moving.restore(&bytes);
-        }
+        self.learnt.restore(from)?;
         self.place_views();
         Ok(())
     }
@@ -125,10 +97,11 @@ impl Supersampling {
         done: f64,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<()> {
-        let Some(moving) = self.moving.as_mut().filter(|moving| moving.are_due(done)) else {
+        let Learnt { moving, exposures, .. } = &mut self.learnt;
+        let Some(moving) = moving.as_mut().filter(|moving| moving.are_due(done)) else {
             return Ok(());
         };
-        let exposures = self.exposures.as_ref();
+        let exposures = exposures.as_ref();
         let exposure = |view: usize| exposures.map_or([1.0; 3], |e| e.of(view).map(f32::recip));
         moving
             .step(&*field()?, done, self.background.shown(), exposure)
@@ -139,7 +112,7 @@ impl Supersampling {
 
     /// Has rays cast from where cameras have moved to.
     fn place_views(&mut self) {
-        let cameras = self.moving.iter().flat_map(MovingCameras::cameras);
+        let cameras = self.learnt.moving.iter().flat_map(MovingCameras::cameras);
         self.views.iter_mut().zip(cameras).for_each(|(view, camera)| view.rays = camera.rays());
     }
 
@@ -149,7 +122,7 @@ impl Supersampling {
         &self,
         field: impl FnOnce() -> anyhow::Result<Box<dyn RayField + 'a>>,
     ) -> anyhow::Result<Option<Moved>> {
-        let Some(moving) = &self.moving else { return Ok(None) };
+        let Some(moving) = &self.learnt.moving else { return Ok(None) };
         let moved = moving
             .moved(&*field()?, self.lr_views, self.background.shown())
             .map_err(fields::rendering_failure)?;
@@ -158,13 +131,14 @@ impl Supersampling {
 
     /// Where the photographs were taken from, where that was asked for.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
+        self.learnt.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was
     /// asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
-        self.exposures.as_ref().map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
+        let exposures = self.learnt.exposures.as_ref();
+        exposures.map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
     }
 
     /// The view and pixel that a bundle trains on.
@@ -189,25 +163,14 @@ fn mean(colours: &[[f32; 3]], c: usize) -> f32 {
     colours.iter().map(|colour| colour[c]).sum::<f32>() / colours.len() as f32
 }
 
-/// How often the sub-pixel rays along a side double before all are cast: as many stages has the
-/// warm-up.
-pub(crate) fn warmup_stages(side: u64) -> u32 {
-    side.next_power_of_two().trailing_zeros()
-}
-
 impl radiance::Supervisor for Supersampling {
     fn set_progress(&mut self, done: f64) {
-        self.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
-        self.side = self.full;
-        if done < self.supersample_warmup {
-            let stages = warmup_stages(self.full[0].max(self.full[1]) as u64);
-            let now = 1 << (done / self.supersample_warmup * f64::from(stages)) as u32;
-            self.side = self.full.map(|n| n.min(now));
-        }
+        self.learnt.exposures.iter_mut().for_each(|exposures| exposures.settle(done));
+        self.sub_pixel_rays.set_progress(done);
     }
 
     fn rays_per_bundle(&self) -> usize {
-        self.side[0] * self.side[1]
+        self.sub_pixel_rays.count()
     }
 
     fn sample_rays(&self, bundle: u64, rays: &mut [Ray]) {
@@ -215,20 +178,19 @@ impl radiance::Supervisor for Supersampling {
         let view = &self.views[index];
         let background = self.behind(bundle);
         let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
+        let SubPixelRays { full, now, .. } = self.sub_pixel_rays;
         // Where the sub-pixel rays begin, and how far apart they are, in pixels of its camera.
         let (start, apart) = match (self.kernel(index), &view.hr) {
-            (Some(cache), _) => cache.block_in_pixels(index, x, y),
+            (Some(cache), _) => cache.block_in_pixels(LrPixel { view: index, x, y }),
             (None, Some(hr)) => {
-                let start = [
-                    block_start(x, self.full[0], hr.width()),
-                    block_start(y, self.full[1], hr.height()),
-                ];
-                (start.map(|s| s as f64), [0, 1].map(|i| self.full[i] as f64 / self.side[i] as f64))
+                let start =
+                    [block_start(x, full[0], hr.width()), block_start(y, full[1], hr.height())];
+                (start.map(|s| s as f64), [0, 1].map(|i| full[i] as f64 / now[i] as f64))
             }
-            (None, None) => ([x as f64, y as f64], self.side.map(|n| 1.0 / n as f64)),
+            (None, None) => ([x as f64, y as f64], now.map(|n| 1.0 / n as f64)),
         };
         for (k, ray) in rays.iter_mut().enumerate() {
-            let (a, b) = (k % self.side[0], k / self.side[0]);
+            let (a, b) = (k % now[0], k / now[0]);
             let place =
                 [start[0] + (a as f64 + 0.5) * apart[0], start[1] + (b as f64 + 0.5) * apart[1]];
             *ray = Ray::new(&view.rays.ray(place[0], place[1]), background);
@@ -243,10 +205,8 @@ impl radiance::Supervisor for Supersampling {
     ) -> f64 {
         let (index, pixel) = self.pixel(bundle);
         let view = &self.views[index];
-        let back = self
-            .exposures
-            .as_ref()
-            .map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
+        let exposures = self.learnt.exposures.as_ref();
+        let back = exposures.map_or([1.0; 3], |exposures| exposures.of(index).map(f32::recip));
         let target = Target {
             back,
             behind: self.behind(bundle),
@@ -257,34 +217,38 @@ impl radiance::Supervisor for Supersampling {
         if let Some(cache) = self.kernel(index) {
             let judge =
                 |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
-            let own = cache.back_project(index, [x, y], colours, &view.image, judge, gradients);
+            let pixel = LrPixel { view: index, x, y };
+            let own = cache.back_project(pixel, colours, &view.image, judge, gradients);
             return target.of_back_projected(own, gradients);
         }
-        if let Some(hr) = view.hr.as_ref().filter(|_| self.side == self.full) {
-            let left = block_start(x, self.full[0], hr.width());
-            let top = block_start(y, self.full[1], hr.height());
+        if let Some(hr) = view.hr.as_ref().filter(|_| self.sub_pixel_rays.are_all_cast()) {
+            let [columns, rows] = self.sub_pixel_rays.full;
+            let left = block_start(x, columns, hr.width());
+            let top = block_start(y, rows, hr.height());
             let samples = (0..colours.len())
-                .map(|k| hr.pixel((top + k / self.full[0]) * hr.width() + left + k % self.full[0]));
+                .map(|k| hr.pixel((top + k / columns) * hr.width() + left + k % columns));
             return target.of_each(colours, samples, gradients);
         }
         target.of_mean(colours, view.image.pixel(pixel), gradients)
     }
 
     fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
-        if self.cache.is_none() && self.exposures.is_none() {
+        let Learnt { cache, exposures, .. } = &self.learnt;
+        if cache.is_none() && exposures.is_none() {
             return;
         }
         let (index, pixel) = self.pixel(bundle);
         let image = &self.views[index].image;
-        if let Some(exposures) = &mut self.exposures {
+        if let Some(exposures) = &mut self.learnt.exposures {
             let sample = image.pixel(pixel);
             let photographed =
                 [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
             exposures.learn(index, photographed, [0, 1, 2].map(|c| mean(colours, c)));
         }
-        let is_cached = self.side == self.full && index < self.lr_views;
-        if let Some(cache) = self.cache.as_mut().filter(|_| is_cached) {
-            cache.remember(index, pixel % image.width(), pixel / image.width(), colours);
+        let is_cached = self.sub_pixel_rays.are_all_cast() && index < self.lr_views;
+        if let Some(cache) = self.learnt.cache.as_mut().filter(|_| is_cached) {
+            let (x, y) = (pixel % image.width(), pixel / image.width());
+            cache.remember(LrPixel { view: index, x, y }, colours);
         }
     }
 }
@@ -497,23 +461,6 @@ mod tests {
         assert!(gradients.as_flattened().iter().all(|g| *g < 0.0));
     }
 
-    fn rays_at(scale: f64, done: f64) -> usize {
-        let (mut supersampling, _) = example(Supervision::Kernel, [scale; 2], None);
-        supersampling.supersample_warmup = 0.3;
-        supersampling.set_progress(done);
-        supersampling.rays_per_bundle()
-    }
-
-    /// 1, 2, 4 … sub-pixel rays a side, each for an equal part of the warm-up, and then all.
-    #[test]
-    fn sub_pixel_rays_double_until_all_are_cast() {
-        for (scale, expected) in
-            [(1.0, [1, 1, 1]), (2.0, [1, 1, 4]), (3.0, [1, 4, 9]), (4.0, [1, 4, 16])]
-        {
-            assert_eq!([0.0, 0.2, 0.3].map(|done| rays_at(scale, done)), expected, "{scale}");
-        }
-    }
-
     fn drawn(supersampling: &Supersampling, range: std::ops::Range<u64>) -> Vec<usize> {
         range.map(|g| supersampling.pixel(g).1).collect()
     }
@@ -629,7 +576,7 @@ mod tests {
             }
             assert!(seen.iter().all(|s| *s), "{kind:?}");
             // With fewer sub-pixel rays they meet the block's mean together.
-            joined.supersample_warmup = 0.5;
+            joined.sub_pixel_rays.warmup = 0.5;
             joined.set_progress(0.0);
             let bundle = (0..).find(|&bundle| joined.pixel(bundle) == (1, 4)).unwrap();
             joined.sample_rays(bundle, &mut rays[..1]);
@@ -685,7 +632,7 @@ mod tests {
             assert!(joined.loss_and_gradient(bundle, &colours, &mut gradients).is_finite());
             joined.remember(bundle, &colours);
         }
-        assert_eq!(joined.written_len(), 3 * (2 * 2 + 5 * 3));
+        assert_eq!(joined.learnt.written_len(), 3 * (2 * 2 + 5 * 3));
     }
 
     #[test]

@@ -3,11 +3,10 @@
 
 use crate::aligned::Aligned;
 use crate::field::Field;
-use crate::mlp::After;
 use crate::occupancy::{March, Strides};
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
-use crate::shading::{NetworkGradients, RayGradients, Shading, dot};
+use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
 
@@ -127,8 +126,8 @@ impl Back {
         gather(&self.rounds, &self.chosen, &samples.rows.features, first.inputs, features, m);
         let hidden = self.hidden.fit(first.outputs * m);
         gather(&self.rounds, &self.chosen, &samples.rows.hidden, first.outputs, hidden, m);
-        network.back(second, hidden, After::Gate(hidden), m, a, b);
-        network.back(first, features, After::Linear, m, b, a);
+        network.back(second, LayerInput::Hidden(hidden), m, a, b);
+        network.back(first, LayerInput::First(features), m, b, a);
 
         into.positions.extend(self.chosen.iter().map(|&i| samples.marched.positions[i as usize]));
         into.levels.resize_with(field.levels.len(), Vec::new);

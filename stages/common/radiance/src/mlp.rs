@@ -15,6 +15,15 @@ fn put<L: Lanes>(value: L, to: &mut [f32], at: usize) {
     value.store((&mut to[at..at + LANES]).try_into().expect("a row has whole vectors"));
 }
 
+/// Weights of one layer, or the same transposed.
+#[derive(Clone, Copy)]
+pub(crate) struct Matrix<'a> {
+    /// Input by input.
+    weights: &'a [f32],
+    inputs: usize,
+    outputs: usize,
+}
+
 /// What happens to a sum before it is stored.
 #[derive(Clone, Copy)]
 pub(crate) enum After<'a> {
@@ -26,18 +35,26 @@ pub(crate) enum After<'a> {
     Gate(&'a [f32]),
 }
 
-/// TO outputs of TV vectors of samples, all in registers. The sum over inputs has one order,
-/// whatever the tile.
+/// A product of weights and activations.
+#[derive(Clone, Copy)]
+struct Product<'a> {
+    matrix: Matrix<'a>,
+    /// A row of `n` samples for each input.
+    x: &'a [f32],
+    n: usize,
+    after: After<'a>,
+}
+
+/// TO outputs from `j` on of TV vectors of samples from `s` on, all in registers. The sum over
+/// inputs has one order, whatever the tile.
 #[inline(always)]
 fn tile<L: Lanes, const TO: usize, const TV: usize>(
-    w: &[f32],
-    x: &[f32],
+    product: &Product<'_>,
     y: &mut [f32],
-    (inputs, outputs, n): (usize, usize, usize),
     s: usize,
     j: usize,
-    after: After<'_>,
 ) {
+    let Product { matrix: Matrix { weights: w, inputs, outputs }, x, n, after } = *product;
     let mut acc = [[L::splat(0.0); TV]; TO];
     for i in 0..inputs {
         let xs: [L; TV] = std::array::from_fn(|v| row(x, i * n + s + v * LANES));
@@ -65,43 +82,40 @@ fn tile<L: Lanes, const TO: usize, const TV: usize>(
 
 #[inline(always)]
 fn all_outputs<L: Lanes, const TO: usize, const TV: usize>(
-    w: &[f32],
-    x: &[f32],
+    product: &Product<'_>,
     y: &mut [f32],
-    shape: (usize, usize, usize),
     s: usize,
-    after: After<'_>,
 ) {
-    let outputs = shape.1;
+    let outputs = product.matrix.outputs;
     let mut j = 0;
     while j + TO <= outputs {
-        tile::<L, TO, TV>(w, x, y, shape, s, j, after);
+        tile::<L, TO, TV>(product, y, s, j);
         j += TO;
     }
     while j < outputs {
-        tile::<L, 1, TV>(w, x, y, shape, s, j, after);
+        tile::<L, 1, TV>(product, y, s, j);
         j += 1;
     }
 }
 
 kernel! {
-    /// y = after(wᵀ·x): `inputs` rows of `n` samples to `outputs` rows. With the transposed weights
-    /// it is the backward pass.
-    pub(crate) fn multiply<L>(w: &[f32], x: &[f32], y: &mut [f32], inputs: usize, outputs: usize,
-        n: usize, after: After<'_>) {
-        let shape = (inputs, outputs, n);
+    /// y = after(wᵀ·x): a row of `n` samples for each input to one for each output. With the
+    /// transposed weights it is the backward pass.
+    pub(crate) fn multiply<L>(matrix: Matrix<'_>, x: &[f32], y: &mut [f32], n: usize,
+        after: After<'_>) {
+        let product = Product { matrix, x, n, after };
         let mut s = 0;
         if L::WIDE {
             while s + 2 * LANES <= n {
-                all_outputs::<L, 8, 2>(w, x, y, shape, s, after);
+                all_outputs::<L, 8, 2>(&product, y, s);
                 s += 2 * LANES;
             }
             if s < n {
-                all_outputs::<L, 16, 1>(w, x, y, shape, s, after);
+                all_outputs::<L, 16, 1>(&product, y, s);
             }
         } else {
             while s < n {
-                all_outputs::<L, 4, 1>(w, x, y, shape, s, after);
+                all_outputs::<L, 4, 1>(&product, y, s);
                 s += LANES;
             }
         }
@@ -198,6 +212,18 @@ impl Layer {
         self.offset..self.offset + self.inputs * self.outputs
     }
 
+    /// Its weights, out of those of all layers.
+    #[inline]
+    pub(crate) fn matrix(self, weights: &[f32]) -> Matrix<'_> {
+        Matrix { weights: &weights[self.range()], inputs: self.inputs, outputs: self.outputs }
+    }
+
+    /// Its weights transposed, out of those of all layers that [`Layer::transpose`] wrote.
+    #[inline]
+    pub(crate) fn transposed_matrix(self, transposed: &[f32]) -> Matrix<'_> {
+        Matrix { weights: &transposed[self.range()], inputs: self.outputs, outputs: self.inputs }
+    }
+
     /// The layer's weights, output by output.
     pub(crate) fn transpose(self, weights: &[f32], to: &mut [f32]) {
         let (w, t) = (&weights[self.range()], &mut to[self.range()]);
@@ -265,9 +291,10 @@ mod tests {
         for (inputs, outputs, n) in SHAPES {
             let (w, x, gate) =
                 (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(3, outputs * n));
+            let matrix = Matrix { weights: &w, inputs, outputs };
             let mut y = vec![0.0; outputs * n];
             for after in [After::Linear, After::Relu, After::Gate(&gate)] {
-                multiply(&w, &x, &mut y, inputs, outputs, n, after);
+                multiply(matrix, &x, &mut y, n, after);
                 for j in 0..outputs {
                     for s in 0..n {
                         let sum: f64 = (0..inputs)
@@ -307,7 +334,7 @@ mod tests {
             let (w, x, dy) =
                 (numbers(1, inputs * outputs), numbers(2, inputs * n), numbers(4, outputs * n));
             let mut y = vec![0.0; outputs * n];
-            multiply(&w, &x, &mut y, inputs, outputs, n, After::Relu);
+            multiply(Matrix { weights: &w, inputs, outputs }, &x, &mut y, n, After::Relu);
             let mut sums = vec![0.0; inputs * outputs];
             add_outer(&x, &dy, &mut sums, inputs, outputs, n);
             bits.extend(y.iter().chain(&sums).map(|v| v.to_bits()));

@@ -24,14 +24,14 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 }
 
 /// Steps of a training between updates of the occupancy.
-const EVERY: u64 = 32;
+const STEPS_PER_UPDATE: u64 = 32;
 /// An update looks at one occupied cell in so many, and at one empty cell in so many.
 const OCCUPIED_TURNS: usize = 4;
 const EMPTY_TURNS: usize = 16;
 /// Until this step empty cells are looked at as often as occupied ones.
-const WARM_UP: u64 = 512;
+const WARM_UP_STEPS: u64 = 512;
 /// Share of a density that is left when its cell is looked at again.
-const DECAY: f32 = 0.7;
+const KEPT_SHARE: f32 = 0.7;
 
 /// Which cell along each axis of `side` a number means.
 #[inline(always)]
@@ -153,13 +153,13 @@ impl Occupancy {
 
     /// Cells to look at, at a step of a training: none at most of them.
     pub fn cells_to_update(&self, step: u64) -> Vec<u32> {
-        if step == 0 || !step.is_multiple_of(EVERY) {
+        if step == 0 || !step.is_multiple_of(STEPS_PER_UPDATE) {
             return Vec::new();
         }
         // Whoever has an empty cell's turn has an occupied one's, too: only those are gone through.
         const { assert!(EMPTY_TURNS.is_multiple_of(OCCUPIED_TURNS)) };
         const { assert!(GRID.is_multiple_of(OCCUPIED_TURNS)) };
-        let turn = (step / EVERY) as usize;
+        let turn = (step / STEPS_PER_UPDATE) as usize;
         let planes = (0..GRID).into_par_iter().flat_map_iter(|z| {
             let first = (turn + GRID - z) % OCCUPIED_TURNS;
             (z * GRID * GRID + first..(z + 1) * GRID * GRID).step_by(OCCUPIED_TURNS)
@@ -169,11 +169,14 @@ impl Occupancy {
 
     /// Whether to look at a cell at a step that looks at some.
     fn is_looked_at(&self, cell: usize, step: u64) -> bool {
-        let turn = (step / EVERY) as usize;
+        let turn = (step / STEPS_PER_UPDATE) as usize;
         let allowed = self.allowed.as_ref().is_none_or(|allowed| allowed[cell]);
         let [.., z] = corner(cell, GRID);
-        let turns =
-            if step <= WARM_UP || self.is_occupied(cell) { OCCUPIED_TURNS } else { EMPTY_TURNS };
+        let turns = if step <= WARM_UP_STEPS || self.is_occupied(cell) {
+            OCCUPIED_TURNS
+        } else {
+            EMPTY_TURNS
+        };
         let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
         allowed && wanted
     }
@@ -192,7 +195,7 @@ impl Occupancy {
         }
         for (&cell, &found) in cells.iter().zip(densities) {
             let density = &mut self.density[cell as usize];
-            *density = (*density * DECAY).max(found);
+            *density = (*density * KEPT_SHARE).max(found);
         }
         let mean = self.mean_density();
         // A hundredth of a step's light is worth a sample; while all is semi-transparent, only what
@@ -322,6 +325,43 @@ impl Marched {
     }
 }
 
+/// A cube of empty cells: a cell, a brick or a block.
+#[derive(Clone, Copy)]
+struct EmptyCube {
+    /// Its first cell along each axis.
+    low: [usize; 3],
+    /// Cells along each axis.
+    side: usize,
+}
+
+impl EmptyCube {
+    /// The t at which a ray leaves the cube, or, where the ray is bent, one at which it is still
+    /// inside. At t = `at` the ray is at `position`; `inverse` is 1 over its direction.
+    #[inline(always)]
+    fn exit(&self, ray: &NormalizedRay, inverse: &[f32; 3], at: f32, position: &[f32; 3]) -> f32 {
+        let Self { low, side } = *self;
+        let mut exit = f32::INFINITY;
+        if let RayMap::Straight { .. } = ray.map {
+            for i in 0..3 {
+                let face = low[i] + if ray.direction[i] > 0.0 { side } else { 0 };
+                let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
+                if ray.direction[i] != 0.0 && until < exit {
+                    exit = until;
+                }
+            }
+        } else {
+            // No sooner than the nearest face can be reached.
+            for i in 0..3 {
+                let (below, above) =
+                    (low[i] as f32 / GRID as f32, (low[i] + side) as f32 / GRID as f32);
+                exit = exit.min((position[i] - below).min(above - position[i]));
+            }
+            exit = (1.0 / FASTEST).mul_add(exit, at);
+        }
+        exit
+    }
+}
+
 kernel! {
     /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies
     /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; by
@@ -350,12 +390,12 @@ kernel! {
                 let (block_word, brick_bit) = place(brick, BLOCKS);
                 let (brick_word, cell_bit) = place(cell, BRICKS);
                 let bricks = occupancy.blocks[block_word];
-                let (low, size) = if bricks == 0 {
-                    (brick.map(|b| b / SIDE * (SIDE * SIDE)), SIDE * SIDE)
+                let empty = if bricks == 0 {
+                    EmptyCube { low: brick.map(|b| b / SIDE * (SIDE * SIDE)), side: SIDE * SIDE }
                 } else if bricks >> brick_bit & 1 == 0 {
-                    (brick.map(|b| b * SIDE), SIDE)
+                    EmptyCube { low: brick.map(|b| b * SIDE), side: SIDE }
                 } else if occupancy.bricks[brick_word] >> cell_bit & 1 == 0 {
-                    (cell, 1)
+                    EmptyCube { low: cell, side: 1 }
                 } else {
                     if (occupancy.dense[brick_word] >> cell_bit & 1) | always == 1 {
                         samples.push(at, 1.0, p);
@@ -370,25 +410,8 @@ kernel! {
                     k += 1;
                     continue;
                 };
-                // Where the ray leaves this empty cell or block; at least one step on.
-                let mut exit = f32::INFINITY;
-                if let RayMap::Straight { .. } = ray.map {
-                    for i in 0..3 {
-                        let face = low[i] + if ray.direction[i] > 0.0 { size } else { 0 };
-                        let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
-                        if ray.direction[i] != 0.0 && until < exit {
-                            exit = until;
-                        }
-                    }
-                } else {
-                    // No sooner than the nearest face can be reached.
-                    for i in 0..3 {
-                        let (below, above) = (low[i] as f32 / GRID as f32,
-                            (low[i] + size) as f32 / GRID as f32);
-                        exit = exit.min((p[i] - below).min(above - p[i]));
-                    }
-                    exit = (1.0 / FASTEST).mul_add(exit, at);
-                }
+                // Where the ray leaves what is empty; at least one step on.
+                let exit = empty.exit(ray, &inverse, at, &p);
                 let onwards = (exit - ray.enter).mul_add(per_step, -offset).ceil();
                 // `as` saturates: an exit that is NaN or infinite moves on by one step.
                 k = (k + 1).max(if onwards.is_finite() { onwards as u32 } else { 0 });
@@ -404,17 +427,29 @@ mod tests {
     use super::*;
     use counter_rng::CounterRng;
 
+    /// What step k of a ray gives, without leaps: a sample's t and its length.
     fn sample(occupancy: &Occupancy, ray: &NormalizedRay, step: f32, k: u32) -> Option<(f32, f32)> {
-        let t = (k as f32 + 0.3).mul_add(step, 0.0);
-        let c = [0, 1, 2].map(|i| {
-            (ray.direction[i].mul_add(t, ray.origin[i]) * 128.0).max(0.0).min(127.0) as usize
-        });
-        let middle = (k as f32 + 0.3 + 0.5).mul_add(step, 0.0);
+        let t = (k as f32 + 0.3).mul_add(step, ray.enter);
+        let middle = (k as f32 + 0.3 + 0.5).mul_add(step, ray.enter);
+        let c = cell_of(ray.position(t));
         match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
             Cell::Dense if t < ray.leave => Some((t, 1.0)),
             Cell::Thin if k.is_multiple_of(2) && middle < ray.leave => Some((middle, 2.0)),
             _ => None,
         }
+    }
+
+    /// All samples of a ray without leaps, and those found by marching in parts, as the renderer
+    /// does.
+    fn both(occupancy: &Occupancy, ray: NormalizedRay, step: f32) -> [Vec<(f32, f32)>; 2] {
+        let (mut next, mut found) = ([0], Marched::default());
+        let strides = Strides::ByCell;
+        let march_on = March { occupancy, rays: &[ray], offsets: &[0.3], step, strides };
+        while next[0] != DONE {
+            march(&march_on, 5, &[0], &mut next, &mut found);
+        }
+        let expected = (0..2000).filter_map(|k| sample(occupancy, &ray, step, k)).collect();
+        [expected, found.t.into_iter().zip(found.lengths).collect()]
     }
 
     #[test]
@@ -440,31 +475,53 @@ mod tests {
                 })
                 .fold(f32::INFINITY, f32::min);
             let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
-            // In parts, as the renderer does.
-            let (mut next, mut found) = ([0], Marched::default());
-            while next[0] != DONE {
-                march(
-                    &March {
-                        occupancy: &occupancy,
-                        rays: &[ray],
-                        offsets: &[0.3],
-                        step,
-                        strides: Strides::ByCell,
-                    },
-                    5,
-                    &[0],
-                    &mut next,
-                    &mut found,
-                );
-            }
-            let found: Vec<(f32, f32)> = found.t.into_iter().zip(found.lengths).collect();
-            let expected: Vec<(f32, f32)> =
-                (0..2000).filter_map(|k| sample(&occupancy, &ray, step, k)).collect();
+            let [expected, found] = both(&occupancy, ray, step);
             // Rounding at a face may move one sample in a thousand across it.
             let missing = expected.iter().filter(|t| !found.contains(t)).count();
             assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());
             assert!(found.iter().all(|t| expected.contains(t)));
         }
+    }
+
+    /// Bent rays leap over empty cells, bricks and blocks of all sizes, and lose no sample.
+    #[test]
+    fn bent_rays_lose_no_sample() {
+        let mut occupancy = Occupancy::full();
+        let middle = |cell: usize| corner(cell, GRID).map(|c| (c as f32 + 0.5) / GRID as f32);
+        let mut rng = CounterRng::new(3, 0, 0);
+        let balls: Vec<[f32; 4]> = (0..40).map(|_| [(); 4].map(|()| rng.uniform())).collect();
+        let is_inside = |p: [f32; 3], [x, y, z, size]: [f32; 4]| {
+            let away = (p[0] - x).powi(2) + (p[1] - y).powi(2) + (p[2] - z).powi(2);
+            away < (0.06 * size).powi(2)
+        };
+        occupancy.set(|cell| match balls.iter().position(|&b| is_inside(middle(cell), b)) {
+            None => Cell::Empty,
+            Some(ball) if ball % 3 == 0 => Cell::Thin,
+            Some(_) => Cell::Dense,
+        });
+        let bounds = scene::Bounds {
+            min: [-1.0; 3],
+            max: [1.0; 3],
+            near: 0.01,
+            far: 500.0,
+            space: scene::Space::Contraction,
+        };
+        let step = 3.0f32.sqrt() / 512.0;
+        let mut samples = 0;
+        for seed in 0..600 {
+            let mut rng = CounterRng::new(4, 0, seed);
+            let mut draw = || 2.0 * rng.uniform() - 1.0;
+            let wide = [0.5, 1.5, 8.0][seed as usize % 3];
+            let origin = [wide * draw(), wide * draw(), wide * draw()];
+            let d = [draw(), draw(), draw()];
+            let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
+            let direction = d.map(|x| x / length);
+            let ray = crate::ray::Ray { origin, direction, background: [0.0; 3] };
+            let [expected, found] = both(&occupancy, crate::ray::clip(&bounds, &ray), step);
+            samples += expected.len();
+            assert!(expected == found, "{ray:?}: {} and {}", expected.len(), found.len());
+        }
+        assert!(samples > 5_000, "{samples} samples");
     }
 
     /// What goes on stays in the cells that were occupied and their neighbours, whatever density is
@@ -482,8 +539,8 @@ mod tests {
         occupancy.limit_to(mask);
         assert_eq!(occupancy.cells().count(), 26 + 8);
         let all: Vec<u32> = (0..CELLS as u32).collect();
-        let updates =
-            (1..=OCCUPIED_TURNS as u64).map(|turn| occupancy.cells_to_update(turn * EVERY).len());
+        let updates = (1..=OCCUPIED_TURNS as u64)
+            .map(|turn| occupancy.cells_to_update(turn * STEPS_PER_UPDATE).len());
         assert_eq!(updates.sum::<usize>(), 26 + 8, "each once a round of turns");
         occupancy.update(&all, &vec![1e3; CELLS], 0.003);
         assert_eq!(occupancy.cells().count(), 26 + 8);
@@ -493,7 +550,13 @@ mod tests {
     fn cells_to_update_are_those_whose_turn_it_is() {
         let mut occupancy = Occupancy::full();
         occupancy.set(|cell| if cell / 5 % 7 == 0 { Cell::Thin } else { Cell::Empty });
-        for step in [EVERY, 3 * EVERY, WARM_UP, WARM_UP + EVERY, WARM_UP + 7 * EVERY] {
+        for step in [
+            STEPS_PER_UPDATE,
+            3 * STEPS_PER_UPDATE,
+            WARM_UP_STEPS,
+            WARM_UP_STEPS + STEPS_PER_UPDATE,
+            WARM_UP_STEPS + 7 * STEPS_PER_UPDATE,
+        ] {
             let expected = (0..CELLS).filter(|&cell| occupancy.is_looked_at(cell, step));
             let found = occupancy.cells_to_update(step);
             assert!(found.into_iter().map(|cell| cell as usize).eq(expected), "step {step}");

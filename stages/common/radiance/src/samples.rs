@@ -73,25 +73,9 @@ impl DensityRows {
             encode(level, &field.grid[level.range()], &self.positions[..3 * n], rows, n);
         }
         let hidden = &mut self.hidden[round.range(first.outputs)];
-        multiply(
-            &field.network[first.range()],
-            features,
-            hidden,
-            first.inputs,
-            first.outputs,
-            n,
-            After::Relu,
-        );
+        multiply(first.matrix(&field.network), features, hidden, n, After::Relu);
         let outputs = &mut self.outputs[round.range(second.outputs)];
-        multiply(
-            &field.network[second.range()],
-            hidden,
-            outputs,
-            second.inputs,
-            second.outputs,
-            n,
-            After::Linear,
-        );
+        multiply(second.matrix(&field.network), hidden, outputs, n, After::Linear);
     }
 
     /// Outputs of the network at `n` positions (three rows): a row each.
@@ -173,13 +157,24 @@ impl Samples {
         counted: &mut Counted,
         sums: &mut [RaySum],
     ) {
+        let round = self.take_samples(rays, counted.sample.len());
+        self.rows.run(field, round);
+        self.weigh(round, rays.step, sums);
+        self.list_counted(counted);
+        self.rounds.push(round);
+        let (next, depth) = (&self.next, &self.depth);
+        self.active.retain(|&r| next[r as usize] != DONE && depth[r as usize] < DARK);
+    }
+
+    /// Takes the next samples of every active ray, and puts their positions into the network's
+    /// rows. So far `counted` samples count.
+    fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
         let most = ROUNDS[self.rounds.len().min(ROUNDS.len() - 1)];
         let start = self.marched.t.len();
         self.marched.starts.clear();
         march(rays, most, &self.active, &mut self.next, &mut self.marched);
         let count = self.marched.t.len() - start;
-        let round = Round { start, n: count.next_multiple_of(LANES), first: counted.sample.len() };
-        let n = round.n;
+        let n = count.next_multiple_of(LANES);
         self.count += count;
         self.marched.t.resize(start + n, 0.0);
         self.marched.lengths.resize(start + n, 0.0);
@@ -190,14 +185,20 @@ impl Samples {
                 *value = p[axis];
             }
         }
-        self.rows.run(field, round);
+        Round { start, n, first: counted }
+    }
+
+    /// Finds each sample's optical depth, transmittance and weight from the network's outputs, and
+    /// where a ray's light is halved. A sample stands for `step` times its length, in cube sides.
+    fn weigh(&mut self, round: Round, step: f32, sums: &mut [RaySum]) {
+        let Round { start, n, .. } = round;
         for buffer in [&mut self.tau, &mut self.before, &mut self.transmittance, &mut self.weight] {
             buffer.fit(start + n);
         }
         let whole = start..start + n;
         let tau = &mut self.tau[whole.clone()];
         if n > 0 {
-            optical_depths(&self.rows.outputs[DENSITY_OUTPUTS * start..][..n], rays.step, tau);
+            optical_depths(&self.rows.outputs[DENSITY_OUTPUTS * start..][..n], step, tau);
             tau.iter_mut()
                 .zip(&self.marched.lengths[start..])
                 .for_each(|(tau, length)| *tau *= length);
@@ -214,8 +215,13 @@ impl Samples {
             }
             self.depth[r as usize] = depth;
         }
-        before[count..].fill(0.0);
+        // What fills the round up.
+        before[self.marched.starts[self.active.len()] - start..].fill(0.0);
         weights(before, tau, &mut self.transmittance[whole.clone()], &mut self.weight[whole]);
+    }
+
+    /// Lists those of the last round's samples that count.
+    fn list_counted(&self, counted: &mut Counted) {
         for (&r, range) in self.active.iter().zip(self.marched.starts.windows(2)) {
             for i in range[0]..range[1] {
                 if self.transmittance[i] > FAINT && self.weight[i] > FAINT {
@@ -224,9 +230,6 @@ impl Samples {
                 }
             }
         }
-        self.rounds.push(round);
-        let (next, depth) = (&self.next, &self.depth);
-        self.active.retain(|&r| next[r as usize] != DONE && depth[r as usize] < DARK);
     }
 
     /// Derivative of a sample's optical depth by its raw density.

@@ -54,28 +54,34 @@ pub(crate) struct NetworkGradients<'a> {
     pub(crate) sums: &'a mut [f32],
 }
 
+/// What a layer got on the way forward: rows of n.
+#[derive(Clone, Copy)]
+pub(crate) enum LayerInput<'a> {
+    /// What the network got.
+    First(&'a [f32]),
+    /// What the layer before gave, through its ReLU.
+    Hidden(&'a [f32]),
+}
+
 impl NetworkGradients<'_> {
-    /// Goes back through a layer from `dy`, whose input was `x`, to `dx`: rows of n.
+    /// Goes back through a layer from `dy`, the gradient by its outputs, to `dx`, the gradient by
+    /// its input before any ReLU: rows of n. Adds the gradient by its weights.
     pub(crate) fn back(
         &mut self,
         layer: Layer,
-        x: &[f32],
-        after: After<'_>,
+        input: LayerInput<'_>,
         n: usize,
         dy: &[f32],
         dx: &mut [f32],
     ) {
+        let (x, after) = match input {
+            LayerInput::First(x) => (x, After::Linear),
+            LayerInput::Hidden(x) => (x, After::Gate(x)),
+        };
         let dy = &dy[..layer.outputs * n];
         add_outer(x, dy, &mut self.sums[layer.range()], layer.inputs, layer.outputs, n);
-        multiply(
-            &self.transposed[layer.range()],
-            dy,
-            &mut dx[..layer.inputs * n],
-            layer.outputs,
-            layer.inputs,
-            n,
-            after,
-        );
+        let dx = &mut dx[..layer.inputs * n];
+        multiply(layer.transposed_matrix(self.transposed), dy, dx, n, after);
     }
 }
 
@@ -113,9 +119,10 @@ kernel! {
 }
 
 kernel! {
-    /// Adds each ray's part to its samples' raw colours: `colour` has three rows of m, `added`
-    /// three of n.
-    fn raw_colours<L>(counted: &Counted, added: &[f32], n: usize, colour: &mut [f32], m: usize) {
+    /// Adds each ray's part to its samples' raw colours: `colour` has three rows, a column a sample
+    /// that counts; `added` has three rows of n.
+    fn raw_colours<L>(counted: &Counted, added: &[f32], n: usize, colour: &mut [f32]) {
+        let m = counted.sample.len();
         for (column, &r) in counted.rays.iter().enumerate() {
             let added = [0, 1, 2].map(|c| added[c * n + column]);
             for &k in counted.of_ray(r) {
@@ -130,8 +137,8 @@ kernel! {
 
 kernel! {
     /// Adds the samples' colours to their rays'.
-    fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], m: usize,
-        sums: &mut [RaySum]) {
+    fn sum_colours<L>(samples: &Samples, counted: &Counted, colour: &[f32], sums: &mut [RaySum]) {
+        let m = counted.sample.len();
         for &r in &counted.rays {
             let sum = &mut sums[r as usize].colour;
             for &k in counted.of_ray(r) {
@@ -146,10 +153,12 @@ kernel! {
 
 kernel! {
     /// Gradient by what was added to each ray's raw colours: `gradient` has three rows of n.
+    /// `colour` has the samples' colours, `colours` the gradient by each ray's.
     fn gradients_by_added<L>(
-        samples: &Samples, counted: &Counted, colour: &[f32], m: usize, colours: &[[f32; 3]],
+        samples: &Samples, counted: &Counted, colour: &[f32], colours: &[[f32; 3]],
         gradient: &mut [f32], n: usize,
     ) {
+        let m = counted.sample.len();
         for (column, &r) in counted.rays.iter().enumerate() {
             let g = colours[r as usize];
             let mut sum = [0.0f32; 3];
@@ -181,14 +190,26 @@ pub(crate) fn dot(a: &[f32; DENSITY_OUTPUTS], b: &[f32; DENSITY_OUTPUTS]) -> f32
     products[0]
 }
 
+/// A ray's gradients, from which those of its samples follow.
+#[derive(Clone, Copy)]
+struct AtRay<'a> {
+    /// Places of its samples among those that count, from front to back.
+    places: &'a [u32],
+    /// Gradient by its colour.
+    colour: [f32; 3],
+    /// Gradient by its composited outputs of the density network.
+    composited: [f32; DENSITY_OUTPUTS],
+}
+
 kernel! {
     /// Gradients of one ray's samples by the density network's outputs, but for that by the raw
     /// density; `along` gets transmittances, weights, places and the gradient by each weight.
     fn gradients_along<L>(
-        samples: &Samples, counted: &Counted, places: &[u32], colour: &[f32], m: usize, g: [f32; 3],
-        composited: &[f32; DENSITY_OUTPUTS], along: &mut AlongRay,
+        samples: &Samples, counted: &Counted, colour: &[f32], ray: &AtRay<'_>, along: &mut AlongRay,
         gradients: &mut [[f32; DENSITY_OUTPUTS]],
     ) {
+        let (places, g, composited) = (ray.places, ray.colour, &ray.composited);
+        let m = counted.sample.len();
         for (j, &k) in places.iter().enumerate() {
             let (k, i) = (k as usize, counted.sample[k as usize] as usize);
             let w = samples.weight[i];
@@ -219,18 +240,12 @@ pub(crate) fn view_network<'a>(
     let Layers { view, .. } = field.layers;
     let [hidden1, hidden2] = hidden;
     let hidden1 = hidden1.fit(view[0].outputs * n);
-    run(field, view[0], input, hidden1, n, After::Relu);
+    multiply(view[0].matrix(&field.network), input, hidden1, n, After::Relu);
     let hidden2 = hidden2.fit(view[1].outputs * n);
-    run(field, view[1], hidden1, hidden2, n, After::Relu);
+    multiply(view[1].matrix(&field.network), hidden1, hidden2, n, After::Relu);
     let added = added.fit(view[2].outputs * n);
-    run(field, view[2], hidden2, added, n, After::Linear);
+    multiply(view[2].matrix(&field.network), hidden2, added, n, After::Linear);
     added
-}
-
-/// Runs a layer on `n` columns.
-#[inline]
-fn run(field: &Field, layer: Layer, x: &[f32], y: &mut [f32], n: usize, after: After<'_>) {
-    multiply(&field.network[layer.range()], x, y, layer.inputs, layer.outputs, n, after);
 }
 
 impl AlongRay {
@@ -265,9 +280,9 @@ impl Shading {
         composite(samples, counted, rays, sums, input, n);
         let added = view_network(field, input, &mut self.hidden, &mut self.added, n);
         let colour = self.colour.fit(3 * m);
-        raw_colours(counted, added, n, colour, m);
+        raw_colours(counted, added, n, colour);
         sigmoids(colour);
-        sum_colours(samples, counted, colour, m, sums);
+        sum_colours(samples, counted, colour, sums);
     }
 
     /// Goes back from rays to the density network's outputs of every sample that counts, and adds
@@ -289,12 +304,12 @@ impl Shading {
         for row in a[..3 * n].chunks_exact_mut(n) {
             row[counted.rays.len()..].fill(0.0);
         }
-        gradients_by_added(samples, counted, colour, m, towards.colours, a, n);
+        gradients_by_added(samples, counted, colour, towards.colours, a, n);
         let [hidden1, hidden2] = &self.hidden;
         let (hidden1, hidden2) = (&hidden1[..first.outputs * n], &hidden2[..second.outputs * n]);
-        network.back(third, hidden2, After::Gate(hidden2), n, a, b);
-        network.back(second, hidden1, After::Gate(hidden1), n, b, a);
-        network.back(first, &self.input[..VIEW_INPUTS * n], After::Linear, n, a, b);
+        network.back(third, LayerInput::Hidden(hidden2), n, a, b);
+        network.back(second, LayerInput::Hidden(hidden1), n, b, a);
+        network.back(first, LayerInput::First(&self.input[..VIEW_INPUTS * n]), n, a, b);
 
         gradients.clear();
         gradients.resize(m, [0.0; DENSITY_OUTPUTS]);
@@ -308,7 +323,8 @@ impl Shading {
             let len = places.len();
             let mut composited = [0.0; DENSITY_OUTPUTS];
             (0..VIEW_FEATURES).for_each(|f| composited[VIEW_FEATURE + f] = b[f * n + column]);
-            gradients_along(samples, counted, places, colour, m, g, &composited, along, gradients);
+            let at = AtRay { places, colour: g, composited };
+            gradients_along(samples, counted, colour, &at, along, gradients);
             let (t, weight) = (&along.t[..len], &along.weight[..len]);
             let ray = ShadedRay { t, weight, step, channels, places, transmittance, background };
             let mut loss = LossGradients {

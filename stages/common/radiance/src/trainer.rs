@@ -148,32 +148,10 @@ impl Trainer {
         }
 
         let first_bundle = self.tally.bundles;
-        let work = StepWork {
-            field: &self.field,
-            transposed: &self.transposed,
-            supervision: &*supervision,
-            options: &self.options,
-            first_bundle,
-            first_ray: self.tally.rays,
-            bundles,
-        };
-        let workers = &self.workers;
-        self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
-            let mut worker = lock(workers).pop().unwrap_or_default();
-            shard.run(&mut worker, &work, bundles * i / SHARDS..bundles * (i + 1) / SHARDS);
-            lock(workers).push(worker);
-        });
-
+        self.run_shards(&*supervision, bundles);
+        self.sum_network_gradients();
         let samples: usize = self.shards.iter().map(|s| s.samples).sum();
         let loss = self.shards.iter().map(|s| s.loss).sum::<f64>() / bundles as f64;
-        let shards = &self.shards;
-        let parts = self.gradients.network.par_chunks_mut(1024).enumerate();
-        parts.for_each(|(i, sums)| {
-            for shard in shards {
-                let part = &shard.network[1024 * i..][..sums.len()];
-                sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
-            }
-        });
         self.tally.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / (bundles * bundle) as f64;
         let fault = self.fault(loss);
@@ -192,6 +170,37 @@ impl Trainer {
         }
         self.tally.steps += 1;
         Ok(Some(StepReport { loss, rays: bundles * bundle, samples, skipped: fault.is_some() }))
+    }
+
+    /// Takes a step's bundles forward and back, each shard a range of them.
+    fn run_shards(&mut self, supervision: &impl Supervisor, bundles: usize) {
+        let work = StepWork {
+            field: &self.field,
+            transposed: &self.transposed,
+            supervision,
+            options: &self.options,
+            first_bundle: self.tally.bundles,
+            first_ray: self.tally.rays,
+            bundles,
+        };
+        let workers = &self.workers;
+        self.shards.par_iter_mut().enumerate().for_each(|(i, shard)| {
+            let mut worker = lock(workers).pop().unwrap_or_default();
+            shard.run(&mut worker, &work, bundles * i / SHARDS..bundles * (i + 1) / SHARDS);
+            lock(workers).push(worker);
+        });
+    }
+
+    /// Adds up the networks' gradients of all shards, in the shards' order.
+    fn sum_network_gradients(&mut self) {
+        let shards = &self.shards;
+        let parts = self.gradients.network.par_chunks_mut(1024).enumerate();
+        parts.for_each(|(i, sums)| {
+            for shard in shards {
+                let part = &shard.network[1024 * i..][..sums.len()];
+                sums.iter_mut().zip(part).for_each(|(sum, g)| *sum += g);
+            }
+        });
     }
 
     /// What isn't finite, before anything has been changed by it.
