@@ -1,13 +1,13 @@
 //! Figures over all views that another result is needed for.
 
-use ::metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};
 use artifact::{Failure, GivenInput};
+use metrics::{METRICS_FILE, Metrics, NearReferences, ViewScores};
 use scene::{Camera, Views};
 
 use crate::metric::value;
 
 /// Views count as near a reference within this angle between the optical axes, in degrees.
-const NEAR: f64 = 60.0;
+const NEAR_DEGREES: f64 = 60.0;
 
 /// What the view that fares worst gains over the same view of another result, in dB. Views without
 /// HR truth are left out.
@@ -39,7 +39,7 @@ pub(crate) fn near_references(
     truth: &Views,
     references: &Views,
 ) -> Option<NearReferences> {
-    let least = NEAR.to_radians().cos();
+    let least = NEAR_DEGREES.to_radians().cos();
     let near: Vec<f64> = (scored.iter().zip(&truth.views))
         .filter(|(_, view)| {
             references.views.iter().any(|other| cosine(&view.camera, &other.camera) >= least)
@@ -63,7 +63,7 @@ mod tests {
     use std::path::Path;
 
     use super::*;
-    use ::metrics::{Score, Scores};
+    use metrics::{Score, Scores};
     use scene::{Background, Bounds, Distortion, Intrinsics, View};
 
     fn scores(name: &str, psnr: Option<f64>) -> ViewScores {

@@ -1,7 +1,7 @@
 //! `eval`: scores views against ground truth, and says by which conventions.
 //!
-//! * `metric`: what a metric is; `metrics`: all of them. A new one is a file, and two lines in
-//!   `metrics/mod.rs`.
+//! * `metric`: what a metric is; `scoring`: all of them. A new one is a file, and two lines in
+//!   `scoring/mod.rs`.
 //! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are
 //!   given and the build has libtorch): against HR truth.
 //! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there
@@ -10,21 +10,20 @@
 //!   the rendered depths, against the view.
 //! * `derived`: the scores near references and the least gain, over all views.
 //!
-//! The crate `metrics` has the types of `metrics.json`. A module here has this name, too, so paths
-//! into the crate begin with `::`.
+//! The crate `metrics` has the types of `metrics.json`.
 //!
 //! Means over views are means of per-view values. Open backgrounds are scored on white. Where a
 //! view has a mask, what doesn't count is taken as right, and PSNR is that of the rest.
 
 mod derived;
 mod metric;
-mod metrics;
 mod scored_view;
+mod scoring;
 
 use std::collections::BTreeMap;
 
-use ::metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
 use contract::{Input, Output};
+use metrics::{METRICS_FILE, Metrics, Scores, ViewScores};
 use pixels::{DEGRADATION_FILE, Degradation, Image, Palette, Rgba8, heat, write_png};
 use rayon::prelude::*;
 use scene::{Background, Views};
@@ -32,13 +31,13 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
-#[cfg(feature = "torch")]
-pub use self::metrics::Lpips;
-pub use self::metrics::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
-use self::metrics::{Perceptual, metrics};
 use derived::{least_gain, near_references};
 use metric::{Metric, mean_of};
 use scored_view::{ScoredScene, ScoredView};
+#[cfg(feature = "torch")]
+pub use scoring::Lpips;
+pub use scoring::{DepthError, LpipsNetwork, Ssim, WarpScore, depth_error, psnr, ssim};
+use scoring::{Perceptual, metrics};
 
 /// Parameters of `eval`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]

@@ -1,12 +1,12 @@
 use std::collections::BTreeMap;
 
-use ::metrics::{Figure, Score, Scores};
+use metrics::{Figure, Score, Scores};
 use pixels::Rgba8;
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// Something that views are scored by. A new one is a type in a file of `metrics/`, and its place
-/// in the list of `metrics/mod.rs`: `metrics.json`, the page and the summary follow from what it
+/// Something that views are scored by. A new one is a type in a file of `scoring/`, and its place
+/// in the list of `scoring/mod.rs`: `metrics.json`, the page and the summary follow from what it
 /// says of itself.
 pub(crate) trait Metric: Sync {
     /// Its key among the conventions, and its pictures' folder.

@@ -10,7 +10,7 @@ const HARMONIC: f32 = 0.282_094_79;
 
 /// Standard deviation of a disc along its surface, over the distance of neighbours: discs close the
 /// surface, seen from however near.
-const RADIUS: f64 = 0.5;
+const DISC_DEVIATION: f64 = 0.5;
 /// Standard deviation along the normal, over that.
 const FLATNESS: f64 = 0.1;
 /// Opacity of a disc on an opaque surface. There are several in each square of the distance; more
@@ -38,7 +38,7 @@ fn splat(surfel: &Surfel) -> [f32; 17] {
     let [r, g, b] = surfel.colour.map(|v| (v - 0.5) / HARMONIC);
     let opacity =
         (DISC_OPACITY * f64::from(surfel.opacity)).clamp(OPACITY_BOUNDS[0], OPACITY_BOUNDS[1]);
-    let along = RADIUS * surfel.spacing;
+    let along = DISC_DEVIATION * surfel.spacing;
     let [along, across] = [along, FLATNESS * along].map(|deviation| deviation.ln() as f32);
     let turn = DQuat::from_rotation_arc(DVec3::Z, surfel.normal).as_quat();
     let logit = (opacity / (1.0 - opacity)).ln() as f32;

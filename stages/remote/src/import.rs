@@ -16,7 +16,7 @@ use crate::transfer::Checked;
 
 /// A longer path is no path.
 const PATH_LIMIT: u64 = 8 << 10;
-const PIECE: usize = 1 << 18;
+const PIECE_BYTES: usize = 1 << 18;
 const REMEDY: &str = "nothing is taken in; export it again from a whole store";
 
 /// Reads what `export` wrote. Nothing is taken in before all is verified.
@@ -197,7 +197,7 @@ impl<'a, R: Read> Reader<'a, R> {
             to.map(|to| create(to).with_context(|| to.display().to_string())).transpose()?;
         let name = self.name_of(&path);
         let mut checked = Checked::new(file);
-        let mut piece = vec![0; PIECE];
+        let mut piece = vec![0; PIECE_BYTES];
         loop {
             let count =
                 entry.read(&mut piece).map_err(|e| self.refuse(format!("{path:?}: {e}")))?;

@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use stage::Pace;
 
 /// Between two lines where there is no terminal.
-const INTERVAL: Duration = Duration::from_secs(10);
+const LINE_INTERVAL: Duration = Duration::from_secs(10);
 
 /// Bytes done of bytes in all, with the time left: a bar on a terminal, a line now and then
 /// elsewhere. Knows of signals, too: work looks at both between two pieces.
@@ -53,7 +53,7 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_position(done);
             bar.set_message(words(state.pace.left(done, self.total)));
-        } else if self.total > 0 && state.shown.elapsed() >= INTERVAL {
+        } else if self.total > 0 && state.shown.elapsed() >= LINE_INTERVAL {
             state.shown = Instant::now();
             report_line!("{}: {}", self.label, words(state.pace.left(done, self.total)));
         }

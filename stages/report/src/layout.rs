@@ -5,10 +5,10 @@
 pub(crate) const WIDTH: f64 = 184.0;
 pub(crate) const HEIGHT: f64 = 74.0;
 /// Between two boxes of a layer, and between layers.
-const GAP: f64 = 24.0;
-const RISE: f64 = 34.0;
+const BOX_GAP: f64 = 24.0;
+const LAYER_GAP: f64 = 34.0;
 /// Between a lane and what is beside it.
-const LANE: f64 = 16.0;
+const LANE_GAP: f64 = 16.0;
 /// Rounds of moving things towards what they are joined to.
 const ROUNDS: usize = 12;
 
@@ -71,7 +71,7 @@ pub(crate) fn draw(count: usize, edges: &[(usize, usize)]) -> Drawing {
     let left = items.iter().map(|item| item.x - item.half_width()).fold(f64::INFINITY, f64::min);
     let left = if left.is_finite() { left } else { 0.0 };
     items.iter_mut().for_each(|item| item.x -= left);
-    let top = |layer: usize| layer as f64 * (HEIGHT + RISE);
+    let top = |layer: usize| layer as f64 * (HEIGHT + LAYER_GAP);
     Drawing {
         width: items.iter().map(|item| item.x + item.half_width()).fold(0.0, f64::max),
         height: top(count_of_layers.max(1) - 1) + HEIGHT,
@@ -89,7 +89,7 @@ fn arrange(items: &mut [Item], layers: &mut [Vec<usize>]) {
         for &index in layer.iter() {
             let half = items[index].half_width();
             items[index].x = x + half;
-            x += 2.0 * half + GAP;
+            x += 2.0 * half + BOX_GAP;
         }
     }
     for round in 0..ROUNDS {
@@ -120,10 +120,10 @@ fn settle(items: &mut [Item], layer: &[usize]) {
     let mut right: Vec<f64> = wishes.iter().map(|wish| wish.1).collect();
     let mut left = right.clone();
     for i in 1..wishes.len() {
-        right[i] = right[i].max(right[i - 1] + WIDTH + GAP);
+        right[i] = right[i].max(right[i - 1] + WIDTH + BOX_GAP);
     }
     for i in (1..wishes.len()).rev() {
-        left[i - 1] = left[i - 1].min(left[i] - WIDTH - GAP);
+        left[i - 1] = left[i - 1].min(left[i] - WIDTH - BOX_GAP);
     }
     let mut taken: Vec<(f64, f64)> = Vec::new();
     for (place, (index, _)) in wishes.iter().enumerate() {
@@ -153,7 +153,7 @@ fn wish(items: &[Item], index: usize) -> f64 {
 
 /// The place for a lane next to a wish, beside what is taken (centre and half its width).
 fn free_place(taken: &[(f64, f64)], wish: f64) -> f64 {
-    let room = |half: f64| half + LANE;
+    let room = |half: f64| half + LANE_GAP;
     let beside = taken.iter().flat_map(|(x, half)| [x + room(*half), x - room(*half)]);
     let is_free = |at: &f64| taken.iter().all(|(x, half)| (x - at).abs() > room(*half) - 1e-6);
     let near = |a: &f64, b: &f64| (a - wish).abs().total_cmp(&(b - wish).abs());
@@ -186,10 +186,10 @@ mod tests {
     fn edges_pass_beside_boxes() {
         let drawing = draw(5, &[(0, 1), (1, 2), (2, 3), (1, 3), (3, 4), (1, 4)]);
         assert_eq!(drawing.boxes.iter().map(|b| b[1]).collect::<Vec<_>>(), {
-            let step = HEIGHT + RISE;
+            let step = HEIGHT + LAYER_GAP;
             vec![0.0, step, 2.0 * step, 3.0 * step, 4.0 * step]
         });
-        assert_eq!(drawing.height, 5.0 * HEIGHT + 4.0 * RISE);
+        assert_eq!(drawing.height, 5.0 * HEIGHT + 4.0 * LAYER_GAP);
         // prep → eval goes straight down through two layers, outside of their boxes.
         let long = &drawing.edges[5];
         let lanes: Vec<f64> = long

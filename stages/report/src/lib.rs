@@ -70,9 +70,9 @@ impl Default for Params {
 pub struct Report;
 
 /// Bytes that a page has at most, but for the text of very long runs.
-const PAGE_BYTES: usize = 15_000_000;
-/// Bytes for what is said of each picture beside the picture itself.
-const MARGIN: usize = 700_000;
+const MOST_PAGE_BYTES: usize = 15_000_000;
+/// Bytes of all that is said of the pictures beside the pictures themselves.
+const CAPTION_BYTES: usize = 700_000;
 
 impl Stage for Report {
     type Params = Params;
@@ -101,7 +101,7 @@ impl Stage for Report {
         run.check().map_err(|e| Failure::BadInput(e.to_string()))?;
         let report = gather::Report::new(&run);
         let text = page::page(&report, None)?.into_string().len();
-        let budget = PAGE_BYTES.saturating_sub(text + MARGIN);
+        let budget = MOST_PAGE_BYTES.saturating_sub(text + CAPTION_BYTES);
         let data = data::Data::new(context, &report, params, budget)?;
         let html = page::page(&report, Some(&data))?.into_string();
         std::fs::write(context.output_path("index.html")?, &html)?;

@@ -79,7 +79,7 @@ const QUALITIES: [Quality; 11] = [
 ];
 
 /// Pictures whose size tells that of all.
-const SAMPLE: usize = 16;
+const SAMPLE_PICTURES: usize = 16;
 
 /// Writes originals to `views/` and returns copies that have room in `budget` bytes of a page.
 pub(crate) fn pictures(
@@ -149,7 +149,7 @@ fn first_quality(originals: &[Original], budget: usize) -> anyhow::Result<usize>
         return Ok(0);
     }
     let sample: Vec<&Original> =
-        originals.iter().step_by(originals.len().div_ceil(SAMPLE).max(1)).collect();
+        originals.iter().step_by(originals.len().div_ceil(SAMPLE_PICTURES).max(1)).collect();
     for place in 1..QUALITIES.len() {
         let copies: Vec<Picture> = sample
             .par_iter()

@@ -211,7 +211,10 @@ fn block_details(run: &RunRecord, block: &Block<'_>, number: usize) -> Markup {
             summary {
                 b { (block.name) }
                 @if !program.is_empty() && program != block.name { " " small { "(" (program) ")" } }
-                " " small { (block.stand()) @if block.count() == 1 && block.undone.is_empty() { " · " (block.cost()) } }
+                " " small {
+                    (block.stand())
+                    @if block.count() == 1 && block.undone.is_empty() { " · " (block.cost()) }
+                }
             }
             // A link's target, which opens what it is in.
             span id={ "stage-" (number) } class="target" {}

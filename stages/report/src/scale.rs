@@ -14,7 +14,7 @@ pub(crate) struct Scale {
 /// Colours of a scale: what a browser puts between two can't be told from the true ones.
 const COLOURS: usize = 24;
 /// Numbers beside a scale, at least: they are round.
-const TICKS: f64 = 4.0;
+const LEAST_TICKS: f64 = 4.0;
 
 impl Scale {
     /// Of error maps, up to the error that has their brightest colour.
@@ -56,9 +56,9 @@ fn ticks(low: f64, high: f64) -> Vec<(f64, String)> {
     if !(span > 0.0 && span.is_finite()) {
         return vec![(0.0, format!("{low}"))];
     }
-    let power = 10f64.powf((span / TICKS).log10().floor());
+    let power = 10f64.powf((span / LEAST_TICKS).log10().floor());
     let factors = [5.0, 2.0, 1.0].map(|factor| factor * power);
-    let step = factors.into_iter().find(|step| span / step >= TICKS - 0.01).unwrap_or(power);
+    let step = factors.into_iter().find(|step| span / step >= LEAST_TICKS - 0.01).unwrap_or(power);
     let digits = (-step.log10().floor()).max(0.0) as usize;
     let first = (low / step - 1e-9).ceil() as i64;
     let last = (high / step + 1e-9).floor() as i64;

@@ -7,7 +7,7 @@ use crate::gather::Report;
 use crate::row::Row;
 
 /// Figures in the summary.
-const SUMMARY: usize = 4;
+const SUMMARY_FIGURES: usize = 4;
 /// Cells of the table of all views' figures, from which on a page leaves it out.
 const MAX_CELLS: usize = 12_000;
 
@@ -24,7 +24,7 @@ pub(crate) fn summary(report: &Report<'_>) -> Markup {
                     (report.rows.len()) " results: " b { (best.label) } }
             }
             dl {
-                @for (figure, mean) in known.take(SUMMARY) {
+                @for (figure, mean) in known.take(SUMMARY_FIGURES) {
                     div { dt { (figure.label) } dd { (figure.text(mean)) } }
                 }
                 @if best.training > 0.0 {

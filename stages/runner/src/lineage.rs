@@ -4,13 +4,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
 use artifact::{Manifest, label};
+use metrics::METRICS_FILE;
 use planning::{Change, changes};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use store::{Record, Store};
-
-/// Metrics of an artifact.
-const METRICS_FILE: &str = "metrics.json";
 
 /// Finished actions with all that they were made of, by stage and point.
 pub(crate) struct Lineage {

@@ -92,7 +92,12 @@ mod tests {
     fn a_new_metric_says_how_it_is_shown() {
         let mut figures = Figures::default();
         figures.add(&AnyMetrics::from(json!({"figures": [
-            {"path": "sharpness/mean", "label": "sharpness ↑", "digits": 1, "higher_is_better": true},
+            {
+                "path": "sharpness/mean",
+                "label": "sharpness ↑",
+                "digits": 1,
+                "higher_is_better": true,
+            },
             {"path": "blur", "label": "blur ↓", "digits": 3, "higher_is_better": false},
         ]})));
         assert_eq!(figures.titles(&[&"sharpness.mean".to_owned()]), ["sharpness"]);

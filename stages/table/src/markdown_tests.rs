@@ -6,9 +6,17 @@ use metrics::AnyMetrics;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 
-/// As `metrics.json` describes them.
+/// As `metrics.json` describes it.
+fn figure(path: &str, label: &str, digits: usize, higher_is_better: bool) -> Value {
+    json!({
+        "path": path,
+        "label": label,
+        "digits": digits,
+        "higher_is_better": higher_is_better,
+    })
+}
+
 fn figures() -> Figures {
-    let figure = |path: &str, label: &str, digits: usize, higher: bool| json!({"path": path, "label": label, "digits": digits, "higher_is_better": higher});
     let mut figures = Figures::default();
     figures.add(&AnyMetrics::from(json!({"figures": [
         figure("psnr", "PSNR", 2, true),

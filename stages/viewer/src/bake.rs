@@ -12,9 +12,9 @@ use crate::view::{NUMBERS, fit};
 use crate::visibility::seen_by;
 
 /// Places along a voxel's side at which the field is asked.
-const PLACES: usize = 2;
+const PLACES_PER_SIDE: usize = 2;
 /// Places of a voxel.
-const ALL_PLACES: usize = PLACES * PLACES * PLACES;
+const PLACES_PER_VOXEL: usize = PLACES_PER_SIDE * PLACES_PER_SIDE * PLACES_PER_SIDE;
 /// Directions at most for which a voxel's colour is fitted.
 const MOST_DIRECTIONS: usize = 16;
 /// Opacity below which a voxel is empty: less than half a step of a byte.
@@ -85,10 +85,14 @@ fn places(
     voxels
         .flat_map(|voxel| {
             let own = [voxel % SIDE, voxel / SIDE % SIDE, voxel / (SIDE * SIDE) % SIDE];
-            (0..ALL_PLACES).map(move |i| {
-                let sub = [i % PLACES, i / PLACES % PLACES, i / (PLACES * PLACES)];
+            (0..PLACES_PER_VOXEL).map(move |i| {
+                let sub = [
+                    i % PLACES_PER_SIDE,
+                    i / PLACES_PER_SIDE % PLACES_PER_SIDE,
+                    i / (PLACES_PER_SIDE * PLACES_PER_SIDE),
+                ];
                 std::array::from_fn(|axis| {
-                    let within = (sub[axis] as f32 + 0.5) / PLACES as f32;
+                    let within = (sub[axis] as f32 + 0.5) / PLACES_PER_SIDE as f32;
                     ((corner[axis] + own[axis]) as f32 + within) / resolution as f32
                 })
             })
@@ -103,7 +107,7 @@ fn opacities<S: Source>(sources: &[S], brick: [usize; 3], resolution: usize) -> 
     let mut opacity = vec![0.0; VOXELS];
     for source in sources {
         let samples = source.sample(&places);
-        for (sum, samples) in opacity.iter_mut().zip(samples.chunks_exact(ALL_PLACES)) {
+        for (sum, samples) in opacity.iter_mut().zip(samples.chunks_exact(PLACES_PER_VOXEL)) {
             *sum += share * opacity_of(samples, resolution);
         }
     }
@@ -114,21 +118,21 @@ fn opacities<S: Source>(sources: &[S], brick: [usize; 3], resolution: usize) -> 
 /// lies one behind the other. Of the three axes the one counts that stops most, so that a thin wall
 /// lets nothing through.
 fn opacity_of(samples: &[PointSample], resolution: usize) -> f32 {
-    let length = 1.0 / (PLACES * resolution) as f32;
+    let length = 1.0 / (PLACES_PER_SIDE * resolution) as f32;
     (0..3).map(|axis| stopped_along(axis, samples, length)).fold(0.0, f32::max)
 }
 
 /// Share of the light along an axis that a voxel's samples stop, each over a length.
 fn stopped_along(axis: u32, samples: &[PointSample], length: f32) -> f32 {
-    let step = PLACES.pow(axis);
-    let columns = (0..ALL_PLACES).filter(|i| (i / step).is_multiple_of(PLACES));
+    let step = PLACES_PER_SIDE.pow(axis);
+    let columns = (0..PLACES_PER_VOXEL).filter(|i| (i / step).is_multiple_of(PLACES_PER_SIDE));
     let stopped: f32 = columns
         .map(|first| {
-            let depth: f32 = (0..PLACES).map(|k| samples[first + k * step].density).sum();
+            let depth: f32 = (0..PLACES_PER_SIDE).map(|k| samples[first + k * step].density).sum();
             -(-depth * length).exp_m1()
         })
         .sum();
-    stopped / (PLACES * PLACES) as f32
+    stopped / (PLACES_PER_SIDE * PLACES_PER_SIDE) as f32
 }
 
 /// Cameras of each voxel and of those around it: what one sees of a voxel's neighbour it sees of
@@ -173,13 +177,13 @@ impl<S: Source> Colours<'_, S> {
         let places = places(brick, voxels.iter().copied(), self.resolution);
         let directions: Vec<Vec<[f32; 3]>> = voxels
             .iter()
-            .zip(places.chunks_exact(ALL_PLACES))
-            .map(|(&voxel, places)| self.directions(places[ALL_PLACES / 2], seen[voxel]))
+            .zip(places.chunks_exact(PLACES_PER_VOXEL))
+            .map(|(&voxel, places)| self.directions(places[PLACES_PER_VOXEL / 2], seen[voxel]))
             .collect();
         let mut sums = vec![([0.0f32; 3], [0.0f32; NUMBERS], 0.0f32); voxels.len()];
         for source in self.sources {
             let samples = source.sample(&places);
-            let voxels = samples.chunks_exact(ALL_PLACES).zip(&directions);
+            let voxels = samples.chunks_exact(PLACES_PER_VOXEL).zip(&directions);
             for ((samples, directions), (colour, view, weight)) in voxels.zip(&mut sums) {
                 let own = opacity_of(samples, self.resolution);
                 let (c, v) = shade(source, samples, directions, self.resolution);
@@ -334,9 +338,9 @@ pub(crate) mod tests {
     }
 
     fn wall(along: usize, k: usize) -> Vec<PointSample> {
-        (0..ALL_PLACES)
+        (0..PLACES_PER_VOXEL)
             .map(|i| {
-                let is_in = i / PLACES.pow(along as u32) % PLACES == k;
+                let is_in = i / PLACES_PER_SIDE.pow(along as u32) % PLACES_PER_SIDE == k;
                 PointSample { density: if is_in { 5e3 } else { 0.0 }, ..PointSample::default() }
             })
             .collect()
@@ -350,7 +354,7 @@ pub(crate) mod tests {
             let expected = 1.0 - (-5e3f32 / 512.0).exp();
             assert!((opacity - expected).abs() < 1e-5, "{opacity} {expected}");
         }
-        assert_eq!(opacity_of(&[PointSample::default(); ALL_PLACES], 256), 0.0);
+        assert_eq!(opacity_of(&[PointSample::default(); PLACES_PER_VOXEL], 256), 0.0);
     }
 
     fn baked_with(threads: usize) -> Volume {

@@ -7,7 +7,7 @@ use scene::{Bounds, Camera, common_direction};
 use crate::bake::{Volume, in_box};
 
 /// Sine of the angle above the horizon from which things look best.
-const FROM_ABOVE: f64 = 0.4;
+const ELEVATION_SINE: f64 = 0.4;
 
 /// Middle and extent of a scene, in scene units: where voxels lie, or the box without any.
 pub(crate) fn middle(bounds: &Bounds, volume: &Volume) -> (DVec3, f64) {
@@ -61,7 +61,7 @@ pub(crate) fn start(cameras: &[&Camera], up: DVec3) -> usize {
     let off: Vec<f64> = if common_direction(cameras.iter().copied()).is_some() {
         cameras.iter().map(|camera| camera.centre().distance(middle)).collect()
     } else {
-        cameras.iter().map(|camera| (-camera.forward().dot(up) - FROM_ABOVE).abs()).collect()
+        cameras.iter().map(|camera| (-camera.forward().dot(up) - ELEVATION_SINE).abs()).collect()
     };
     (0..cameras.len()).min_by(|&a, &b| off[a].total_cmp(&off[b])).unwrap_or_default()
 }
@@ -99,7 +99,7 @@ mod tests {
         let cameras: Vec<&Camera> = cameras.iter().collect();
         assert!(up(&cameras).dot(up_is) > 0.9999, "{}", up(&cameras));
         let start = cameras[start(&cameras, up_is)];
-        assert!((-start.forward().dot(up_is) - FROM_ABOVE).abs() < 0.1);
+        assert!((-start.forward().dot(up_is) - ELEVATION_SINE).abs() < 0.1);
         // One camera alone says it by itself.
         assert!(up(&cameras[..1]).dot(cameras[0].rotation().y_axis) > 0.9999);
     }

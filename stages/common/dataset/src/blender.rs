@@ -47,7 +47,8 @@ mod tests {
 
     fn with_pose(entry: &str) -> String {
         format!(
-            r#"{{"camera_angle_x": 0.7, "frames": [{{"file_path": "./train/r_0", "transform_matrix": [[{entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#
+            r#"{{"camera_angle_x": 0.7, "frames": [{{"file_path": "./train/r_0",
+                "transform_matrix": [[{entry},0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}}]}}"#
         )
     }
 

@@ -342,14 +342,16 @@ mod tests {
 
     fn frames(head: &str, first: &str) -> String {
         format!(
-            r#"{{{head}, "frames": [{{"file_path": "images/a.png", {first} {POSE}}}, {{"file_path": "./images/b.png", {POSE}}},
+            r#"{{{head}, "frames": [{{"file_path": "images/a.png", {first} {POSE}}},
+                {{"file_path": "./images/b.png", {POSE}}},
                 {{"file_path": "images/gone.png", {POSE}}}]}}"#
         )
     }
 
     #[test]
     fn what_a_frame_says_goes_before_what_holds_for_all() {
-        let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1, "p2": 0.01, "camera_model": "OPENCV""#;
+        let head = r#""fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14, "w": 40, "h": 30, "k1": 0.1,
+            "p2": 0.01, "camera_model": "OPENCV""#;
         let set = set(&frames(head, r#""fl_x": 60, "k1": 0,"#)).unwrap();
         let of = |i: usize| set.frames[i].taken_with;
         let distortion = Distortion { radial: [0.0; 3], tangential: [0.0, 0.01] };
@@ -399,7 +401,8 @@ mod tests {
 
     #[test]
     fn a_split_of_its_own_is_kept() {
-        let head = r#""fl_x": 50, "train_filenames": ["images/b.png"], "test_filenames": ["./images/a.png"]"#;
+        let head = r#""fl_x": 50, "train_filenames": ["images/b.png"],
+            "test_filenames": ["./images/a.png"]"#;
         assert_eq!(
             set(&frames(head, "")).unwrap().split,
             Some(Split { train: vec![1], test: vec![0] })

@@ -101,7 +101,8 @@ impl Hash {
 
 struct Crate {
     dir: PathBuf,
-    /// Names under `[dependencies]` and `[build-dependencies]`; tests can't change an artifact.
+    /// Names under `[dependencies]` and `[build-dependencies]`, those of single systems among them;
+    /// tests can't change an artifact.
     dependencies: Vec<String>,
 }
 
@@ -123,23 +124,33 @@ fn workspace_crates(root: &Path, workspace: &Table, start: &Path) -> BTreeMap<St
             continue;
         }
         let mut dependencies = Vec::new();
-        for section in ["dependencies", "build-dependencies"] {
-            for (name, spec) in
-                manifest.get(section).and_then(Value::as_table).into_iter().flatten()
-            {
-                dependencies.push(name.clone());
-                let path = match spec.get("path") {
-                    Some(path) => path.as_str().map(|p| dir.join(p)),
-                    None => shared
-                        .and_then(|s| s.get(name))
-                        .and_then(|s| s.get("path"))
-                        .and_then(Value::as_str)
-                        .map(|p| root.join(p)),
-                };
-                waiting.extend(path);
-            }
+        for (name, spec) in dependencies_of(&manifest) {
+            dependencies.push(name.clone());
+            let path = match spec.get("path") {
+                Some(path) => path.as_str().map(|p| dir.join(p)),
+                None => shared
+                    .and_then(|s| s.get(name))
+                    .and_then(|s| s.get("path"))
+                    .and_then(Value::as_str)
+                    .map(|p| root.join(p)),
+            };
+            waiting.extend(path);
         }
         found.insert(name, Crate { dir, dependencies });
+    }
+    found
+}
+
+/// What a crate depends on but for its tests: on all systems, and on some
+/// (`[target.SYSTEM.dependencies]`). What only another system needs counts, too: at worst a key
+/// changes that needn't.
+fn dependencies_of(manifest: &Table) -> Vec<(&String, &Value)> {
+    let systems = manifest.get("target").and_then(Value::as_table).into_iter().flatten();
+    let mut found = Vec::new();
+    for table in systems.filter_map(|(_, system)| system.as_table()).chain([manifest]) {
+        for section in ["dependencies", "build-dependencies"] {
+            found.extend(table.get(section).and_then(Value::as_table).into_iter().flatten());
+        }
     }
     found
 }
@@ -192,8 +203,8 @@ fn text(package: &Table, key: &str) -> String {
 mod tests {
     use super::*;
 
-    /// A workspace of four crates: `stage` uses `shared` and the package `used`, and `extra` with a
-    /// feature alone; nothing uses `other`.
+    /// A workspace of four crates: `stage` uses `shared` and the package `used`, `extra` with a
+    /// feature alone, and the package `linux` on one system; nothing uses `other`.
     const FILES: [(&str, &str); 11] = [
         (
             "Cargo.toml",
@@ -207,13 +218,15 @@ mod tests {
              [[package]]\nname = \"used\"\nversion = \"1.0.0\"\nchecksum = \"aa\"\n\
              dependencies = [\"deep\"]\n\
              [[package]]\nname = \"deep\"\nversion = \"1.0.0\"\nchecksum = \"bb\"\n\
+             [[package]]\nname = \"linux\"\nversion = \"1.0.0\"\nchecksum = \"dd\"\n\
              [[package]]\nname = \"stray\"\nversion = \"1.0.0\"\nchecksum = \"cc\"\n",
         ),
         (
             "stage/Cargo.toml",
             "[package]\nname = \"stage\"\n[features]\nmore = [\"dep:extra\"]\n\
              [dependencies]\nshared = {workspace = true}\n\
-             extra = {workspace = true, optional = true}\n[dev-dependencies]\nstray = \"1\"\n",
+             extra = {workspace = true, optional = true}\n[dev-dependencies]\nstray = \"1\"\n\
+             [target.'cfg(target_os = \"linux\")'.dependencies]\nlinux = \"1\"\n",
         ),
         ("stage/src/main.rs", "fn main() {}"),
         ("stage/tests/it.rs", "// a test"),
@@ -260,6 +273,7 @@ mod tests {
             ("shared/Cargo.toml", "workspace = true", "workspace = true, features = []"),
             ("Cargo.lock", "checksum = \"aa\"", "checksum = \"ab\""),
             ("Cargo.lock", "checksum = \"bb\"", "checksum = \"bc\""),
+            ("Cargo.lock", "checksum = \"dd\"", "checksum = \"de\""),
             ("Cargo.toml", "lto = true", "lto = false"),
         ] {
             assert_ne!(fingerprint(Some(edit)), own, "{edit:?}");

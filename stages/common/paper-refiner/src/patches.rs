@@ -14,7 +14,7 @@ pub(crate) const PATCH: usize = 64;
 /// Pixels by which patches overlap unless told otherwise: a quarter.
 pub const OVERLAP: usize = 16;
 /// Pixels along each side of a patch that look for a reference patch.
-const LOOKS: usize = 4;
+const LOOKS_PER_SIDE: usize = 4;
 
 /// A patch's top left corner.
 type Corner = (usize, usize);
@@ -118,10 +118,10 @@ fn matches(
 ) -> Vec<(usize, Corner)> {
     let surface = rendered.surface();
     let surfaces: Vec<Surface<'_>> = references.iter().map(|r| r.rendered.surface()).collect();
-    let step = PATCH / LOOKS;
+    let step = PATCH / LOOKS_PER_SIDE;
     let mut found = Vec::new();
-    for (dx, dy) in
-        (0..LOOKS).flat_map(|j| (0..LOOKS).map(move |i| (i * step + step / 2, j * step + step / 2)))
+    for (dx, dy) in (0..LOOKS_PER_SIDE)
+        .flat_map(|j| (0..LOOKS_PER_SIDE).map(move |i| (i * step + step / 2, j * step + step / 2)))
     {
         for (r, other) in surfaces.iter().enumerate() {
             let Some(visibility) = surface.visibility(x + dx, y + dy, other) else { continue };

@@ -38,7 +38,7 @@ pub struct PaperTrainer {
 }
 
 /// Perspectives of an image, the one that changes nothing among them.
-const PERSPECTIVES: u64 = 200;
+const PERSPECTIVES_PER_IMAGE: u64 = 200;
 /// Pixels that a reference patch lies away at most.
 const REFERENCE_REACH: usize = 64;
 /// Purposes of draws.
@@ -147,9 +147,10 @@ impl<'a> TrainingPatch<'a> {
         rng: &mut CounterRng,
     ) -> Self {
         let (width, height) = (example.truth.width, example.truth.height);
-        let which = rng.below(PERSPECTIVES);
+        let which = rng.below(PERSPECTIVES_PER_IMAGE);
         // The same 200 throughout.
-        let mut shape = CounterRng::new(options.seed, WARPS, number * PERSPECTIVES + which);
+        let mut shape =
+            CounterRng::new(options.seed, WARPS, number * PERSPECTIVES_PER_IMAGE + which);
         let warp = if which == 0 {
             Perspective::identity(width, height)
         } else {

@@ -256,7 +256,8 @@ fn command_lines_that_cannot_be_meant() {
         ),
         (
             &["-p", "kernel=bxo"],
-            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you mean \"box\"?",
+            "stage prep: parameter kernel: \"bxo\" is not one of \"box\", \"average\"; did you \
+            mean \"box\"?",
         ),
         (
             &["-p", "seed=1"],

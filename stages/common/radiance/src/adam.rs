@@ -35,9 +35,9 @@ impl AdamStep {
 pub(crate) type Touched = [u8];
 
 /// Blocks whose marks are looked at together.
-const STRETCH: usize = 256;
+const BLOCKS_PER_LOOK: usize = 256;
 /// Blocks by which memory is asked for before it is needed.
-const AHEAD: usize = 8;
+const BLOCKS_AHEAD: usize = 8;
 
 kernel! {
     /// One lazy Adam step: entries whose gradient is 0 keep value and moments (a vertex no ray came
@@ -51,9 +51,9 @@ kernel! {
             gradients.as_chunks_mut::<LANES>().0);
         let (first, second) = (first.as_chunks_mut::<LANES>().0, second.as_chunks_mut::<LANES>().0);
         let most = touched.len().min(weights.len());
-        let mut list = [0; STRETCH];
-        for start in (0..most).step_by(STRETCH) {
-            let marks = &mut touched[start..(start + STRETCH).min(most)];
+        let mut list = [0; BLOCKS_PER_LOOK];
+        for start in (0..most).step_by(BLOCKS_PER_LOOK) {
+            let marks = &mut touched[start..(start + BLOCKS_PER_LOOK).min(most)];
             if marks.iter().fold(0, |any, m| any | m) == 0 {
                 continue;
             }
@@ -64,7 +64,7 @@ kernel! {
             }
             for at in 0..count {
                 // Blocks lie far apart in memory, and there is little to do for each.
-                let ahead = list[(at + AHEAD).min(count - 1)];
+                let ahead = list[(at + BLOCKS_AHEAD).min(count - 1)];
                 L::prefetch(&weights[ahead]);
                 L::prefetch(&gradients[ahead]);
                 L::prefetch(&first[ahead]);

@@ -6,7 +6,7 @@ use crate::spec::{BRICK, FEATURES};
 /// Bytes of a brick: two cache lines.
 const ALIGNMENT: usize = BRICK * FEATURES * size_of::<f32>();
 /// Numbers by which the first one is moved at most.
-const MOVED: usize = ALIGNMENT / size_of::<f32>() - 1;
+const MOST_MOVED: usize = ALIGNMENT / size_of::<f32>() - 1;
 
 /// Numbers that begin at a whole brick, so that a vector lies in one cache line and a brick in two.
 /// The allocator's own arrays begin 16 bytes later, where vectors lie in two and bricks in three.
@@ -22,10 +22,10 @@ pub(crate) struct Aligned {
 
 impl Aligned {
     pub(crate) fn zeros(len: usize) -> Self {
-        let mut memory = vec![0.0; len + MOVED];
+        let mut memory = vec![0.0; len + MOST_MOVED];
         ask_for_large_pages(&mut memory);
         // The offset is one that can't be only where addresses can't be looked at.
-        let start = memory.as_ptr().align_offset(ALIGNMENT).min(MOVED);
+        let start = memory.as_ptr().align_offset(ALIGNMENT).min(MOST_MOVED);
         Self { memory, start, len }
     }
 

@@ -26,7 +26,7 @@ pub struct PointSample {
 }
 
 /// Places in one pass: their activations stay in the cache.
-const AT_ONCE: usize = 256;
+const PLACES_PER_PASS: usize = 256;
 
 impl Field {
     /// Whether some cell of the occupancy between two corners of the unit cube may hold something.
@@ -45,7 +45,7 @@ impl Field {
         let occupied: Vec<usize> =
             (0..places.len()).filter(|&i| self.may_hold(places[i], places[i])).collect();
         let mut rows = DensityRows::default();
-        for chosen in occupied.chunks(AT_ONCE) {
+        for chosen in occupied.chunks(PLACES_PER_PASS) {
             let n = chosen.len().next_multiple_of(LANES);
             let mut positions = vec![0.0; 3 * n];
             for (k, &i) in chosen.iter().enumerate() {

@@ -383,21 +383,20 @@ pub(crate) mod x86 {
 /// Defines a kernel: one body, generic over `L: Lanes`, compiled for every family and chosen at run
 /// time.
 macro_rules! kernel {
-    ($(#[$meta:meta])* $vis:vis fn $name:ident<$lanes:ident>($($arg:ident: $ty:ty),* $(,)?) $body:block) => {
+    (
+        $(#[$meta:meta])*
+        $vis:vis fn $name:ident<$lanes:ident>($($arg:ident: $ty:ty),* $(,)?) $body:block
+    ) => {
         $(#[$meta])*
-        #[allow(clippy::too_many_arguments, reason = "slices and sizes of one kernel")]
         $vis fn $name($($arg: $ty),*) {
-            #[allow(clippy::too_many_arguments, reason = "slices and sizes of one kernel")]
             #[inline(always)]
             fn body<$lanes: $crate::simd::Lanes>($($arg: $ty),*) $body
             #[cfg(target_arch = "x86_64")]
-            #[allow(clippy::too_many_arguments, reason = "slices and sizes of one kernel")]
             #[target_feature(enable = "avx512f,avx512vl,avx512bw,avx512dq,avx2,fma")]
             fn avx512($($arg: $ty),*) {
                 body::<$crate::simd::x86::Avx512>($($arg),*);
             }
             #[cfg(target_arch = "x86_64")]
-            #[allow(clippy::too_many_arguments, reason = "slices and sizes of one kernel")]
             #[target_feature(enable = "avx2,fma")]
             fn avx2($($arg: $ty),*) {
                 body::<$crate::simd::x86::Avx2>($($arg),*);

@@ -15,7 +15,7 @@ pub struct Tally {
 }
 
 /// Steps that must lie between two faults.
-const APART: u64 = 100;
+const LEAST_STEPS_APART: u64 = 100;
 
 impl Default for Tally {
     fn default() -> Self {
@@ -43,7 +43,7 @@ impl Tally {
 
     /// Takes note of a step that wasn't finite; whether the training may go on.
     pub fn forgives(&mut self) -> bool {
-        let again = self.last_fault.is_some_and(|before| self.steps - before < APART);
+        let again = self.last_fault.is_some_and(|before| self.steps - before < LEAST_STEPS_APART);
         self.last_fault = Some(self.steps);
         self.rate_scale *= 0.5;
         !again

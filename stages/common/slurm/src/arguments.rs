@@ -100,8 +100,9 @@ mod tests {
         words.join("|")
     }
 
-    const BEFORE: &str = "--parsable|--nodes=1|--ntasks=1|--requeue|--open-mode=append|--job-name=train-ss [supersample=2]|\
-        --chdir=/work|--output=/s/50%%/7.log|--signal=B:USR1@90";
+    const BEFORE: &str = "--parsable|--nodes=1|--ntasks=1|--requeue|--open-mode=append|\
+        --job-name=train-ss [supersample=2]|--chdir=/work|--output=/s/50%%/7.log|\
+        --signal=B:USR1@90";
 
     #[test]
     fn each_wish_is_an_argument() {

@@ -50,7 +50,7 @@ const TASKS: &str = "tasks.json";
 const SCRIPT: &str = "job.sh";
 
 /// Between two attempts at the lock.
-const PAUSE: Duration = Duration::from_millis(50);
+const ATTEMPT_INTERVAL: Duration = Duration::from_millis(50);
 
 impl Submission {
     /// A submission to be, in a store's folder.
@@ -144,7 +144,7 @@ pub(crate) fn lock(root: &Path, is_stopped: &dyn Fn() -> bool) -> Result<Option<
         match file.try_lock() {
             Ok(()) => return Ok(Some(file)),
             Err(TryLockError::WouldBlock) if is_stopped() => return Ok(None),
-            Err(TryLockError::WouldBlock) => std::thread::sleep(PAUSE),
+            Err(TryLockError::WouldBlock) => std::thread::sleep(ATTEMPT_INTERVAL),
             Err(TryLockError::Error(error)) => return Err(fail(error)),
         }
     }

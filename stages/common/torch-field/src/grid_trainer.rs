@@ -28,7 +28,7 @@ pub struct GridTrainer {
 }
 
 /// Places that are looked at together.
-const LOOKS: usize = 1 << 18;
+const PLACES_AT_ONCE: usize = 1 << 18;
 
 /// What a piece of a step leaves.
 struct GridPiece {
@@ -220,7 +220,7 @@ impl GridTrainer {
             return Ok(());
         }
         let mut found = Vec::with_capacity(cells.len());
-        for cells in cells.chunks(LOOKS) {
+        for cells in cells.chunks(PLACES_AT_ONCE) {
             let positions: Vec<f32> =
                 cells.iter().flat_map(|&cell| Occupancy::place_in(cell, seed, at)).collect();
             let positions = Tensor::f_from_slice(&positions)?

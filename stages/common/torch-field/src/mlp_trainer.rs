@@ -42,9 +42,9 @@ pub struct MlpTrainer {
 /// Shards of a step on the CPU: by its rays alone, so that sums have one order at any thread count.
 /// Where a shard has few rays, libtorch's calls cost more than what they compute.
 fn shards(rays: usize) -> usize {
-    const MOST: usize = 8;
-    const RAYS: usize = 16;
-    rays.div_ceil(RAYS).clamp(1, MOST)
+    const MOST_SHARDS: usize = 8;
+    const RAYS_PER_SHARD: usize = 16;
+    rays.div_ceil(RAYS_PER_SHARD).clamp(1, MOST_SHARDS)
 }
 
 /// Samples that go through the fine network at once: few, so that what they leave on their way
@@ -54,10 +54,10 @@ const CHUNK_SAMPLES: usize = 4096;
 const STUCK_STEPS: u64 = 200;
 /// Less of the light than this stopped by all samples: the background alone explains the images,
 /// and ReLU has no gradient there.
-const CLEAR: f64 = 1e-3;
+const LEAST_STOPPED_SHARE: f64 = 1e-3;
 /// More of the light than this stopped by the first sample: what is left is of rays whose second
 /// happens to be drawn close to it, and what lies behind gets no gradient.
-const WALL: f64 = 0.9;
+const MOST_FIRST_STOPPED_SHARE: f64 = 0.9;
 
 /// What a network makes of a step's rays, all together.
 #[derive(Clone, Copy, Default)]
@@ -81,10 +81,10 @@ impl StoppedLight {
     /// Why nothing more is learnt, if that is so for as many rays.
     fn stuck(self, rays: f64) -> Option<&'static str> {
         match self {
-            Self { all, .. } if all < CLEAR * rays => {
+            Self { all, .. } if all < LEAST_STOPPED_SHARE * rays => {
                 Some("it sees nothing but the background, and its ReLU passes no gradient")
             }
-            Self { first, .. } if first > WALL * rays => {
+            Self { first, .. } if first > MOST_FIRST_STOPPED_SHARE * rays => {
                 Some("it sees a wall right before every camera, and nothing behind it")
             }
             _ => None,

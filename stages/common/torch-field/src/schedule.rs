@@ -14,17 +14,17 @@ pub enum Schedule {
 
 impl Schedule {
     /// Epochs during which the code's schedule falls.
-    const FALLING: u64 = 10;
+    const FALLING_EPOCHS: u64 = 10;
 
     /// The rate when a share of the training is done.
     pub fn rate(self, highest: f64, decay: f64, done: f64) -> f64 {
         let progress = match self {
             Self::Exponential => done,
             Self::Epochs { epochs } => {
-                let epochs = epochs.max(2 * Self::FALLING);
+                let epochs = epochs.max(2 * Self::FALLING_EPOCHS);
                 let epoch = ((done * epochs as f64) as u64).min(epochs - 1);
-                (epoch + 1 + Self::FALLING).saturating_sub(epochs) as f64
-                    / (Self::FALLING + 1) as f64
+                (epoch + 1 + Self::FALLING_EPOCHS).saturating_sub(epochs) as f64
+                    / (Self::FALLING_EPOCHS + 1) as f64
             }
         };
         highest * decay.powf(progress)

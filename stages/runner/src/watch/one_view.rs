@@ -7,7 +7,7 @@ use serde_json::Value;
 use super::chain::Chain;
 
 /// The file that lists a folder's views.
-const VIEWS: &str = "views.json";
+const VIEWS_FILE: &str = "views.json";
 
 /// The view that is watched.
 pub(super) struct OneView {
@@ -46,19 +46,19 @@ impl OneView {
         for entry in std::fs::read_dir(folder)? {
             let entry = entry?;
             // The manifest describes the uncut folder.
-            if ![VIEWS, MANIFEST_FILE].iter().any(|name| entry.file_name() == *name) {
+            if ![VIEWS_FILE, MANIFEST_FILE].iter().any(|name| entry.file_name() == *name) {
                 std::os::unix::fs::symlink(entry.path(), into.join(entry.file_name()))?;
             }
         }
         if let Some(views) = list.get_mut("views").and_then(Value::as_array_mut) {
             views.retain(|view| name_of(view) == Some(&self.name));
         }
-        artifact::write_json(&into.join(VIEWS), &list)
+        artifact::write_json(&into.join(VIEWS_FILE), &list)
     }
 }
 
 fn list(folder: &Path) -> io::Result<Value> {
-    Ok(serde_json::from_slice(&std::fs::read(folder.join(VIEWS))?)?)
+    Ok(serde_json::from_slice(&std::fs::read(folder.join(VIEWS_FILE))?)?)
 }
 
 fn views(list: &Value) -> &[Value] {
@@ -84,7 +84,7 @@ mod tests {
         std::fs::write(whole.join(MANIFEST_FILE), "{}").unwrap();
         let view = |name| json!({"camera": {"name": name}, "image": "images/b.png"});
         let list_of = |views: &[Value]| json!({"background": "white", "views": views});
-        artifact::write_json(&whole.join(VIEWS), &list_of(&[view("a"), view("b")])).unwrap();
+        artifact::write_json(&whole.join(VIEWS_FILE), &list_of(&[view("a"), view("b")])).unwrap();
         OneView { name: "b".to_owned(), pixels: 1 }.of(&whole, &one).unwrap();
         assert_eq!(list(&one).unwrap(), list_of(&[view("b")]));
         assert_eq!(std::fs::read_to_string(one.join("images/b.png")).unwrap(), "b");

@@ -1,4 +1,4 @@
-use ::metrics::{Figure, Score, Scores};
+use metrics::{Figure, Score, Scores};
 
 use crate::metric::{Measured, Metric, value};
 use crate::scored_view::{ScoredScene, ScoredView};

@@ -42,7 +42,7 @@ pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ::metrics::Figure;
+    use metrics::Figure;
 
     /// Every figure's number is among the scores, and has a name of its own.
     #[test]

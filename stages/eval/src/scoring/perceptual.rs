@@ -1,5 +1,5 @@
-use ::metrics::{Figure, Score, Scores};
 use artifact::{Failure, GivenInput};
+use metrics::{Figure, Score, Scores};
 use pixels::Image;
 
 #[cfg(feature = "torch")]

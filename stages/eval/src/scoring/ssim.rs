@@ -1,4 +1,4 @@
-use ::metrics::{Figure, Score, Scores};
+use metrics::{Figure, Score, Scores};
 use pixels::Image;
 
 use crate::metric::{Measured, Metric, value};
@@ -103,8 +103,8 @@ impl Metric for SsimMetric {
     }
 
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and pixels; \
-        borders reflected (ssim), or pixels whose window is whole (ssim_valid)"
+        "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and \
+        pixels; borders reflected (ssim), or pixels whose window is whole (ssim_valid)"
             .to_owned()
     }
 

@@ -1,5 +1,5 @@
-use ::metrics::{Figure, Score};
 use artifact::{FailureExt as _, GivenInput};
+use metrics::{Figure, Score};
 use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
@@ -79,9 +79,9 @@ impl Metric for WarpMetric {
     }
 
     fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "the true picture of the view whose camera is nearest, brought over by both rendered depths, \
-        against the view's own, where both see the same surface (depths within 2 %, or within a \
-        pixel as the view sees them; opacity at least one half)"
+        "the true picture of the view whose camera is nearest, brought over by both rendered \
+        depths, against the view's own, where both see the same surface (depths within 2 %, or \
+        within a pixel as the view sees them; opacity at least one half)"
             .to_owned()
     }
 

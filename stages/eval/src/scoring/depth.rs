@@ -1,6 +1,6 @@
-use ::metrics::{Figure, Score, Scores};
 use anyhow::Context as _;
 use artifact::FailureExt as _;
+use metrics::{Figure, Score, Scores};
 use pixels::{ExrImage, read_exr};
 
 use crate::metric::{Measured, Metric, value};

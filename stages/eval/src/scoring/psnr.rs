@@ -1,4 +1,4 @@
-use ::metrics::{Figure, Score, Scores};
+use metrics::{Figure, Score, Scores};
 use pixels::{Image, psnr_of};
 
 use crate::metric::{Measured, Metric, value};
