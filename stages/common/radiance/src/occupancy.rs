@@ -4,7 +4,7 @@
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
-use crate::ray::{FASTEST, NormalizedRay, RayMap};
+use crate::ray::{FASTEST, MOST_BENT, NormalizedRay, RayMap};
 use crate::simd::kernel;
 use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
 
@@ -340,25 +340,45 @@ impl EmptyCube {
     #[inline(always)]
     fn exit(&self, ray: &NormalizedRay, inverse: &[f32; 3], at: f32, position: &[f32; 3]) -> f32 {
         let Self { low, side } = *self;
+        let RayMap::Straight { .. } = ray.map else { return self.bent_exit(ray, at, position) };
         let mut exit = f32::INFINITY;
-        if let RayMap::Straight { .. } = ray.map {
-            for i in 0..3 {
-                let face = low[i] + if ray.direction[i] > 0.0 { side } else { 0 };
-                let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
-                if ray.direction[i] != 0.0 && until < exit {
-                    exit = until;
-                }
+        for i in 0..3 {
+            let face = low[i] + if ray.direction[i] > 0.0 { side } else { 0 };
+            let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
+            if ray.direction[i] != 0.0 && until < exit {
+                exit = until;
             }
-        } else {
-            // No sooner than the nearest face can be reached.
-            for i in 0..3 {
-                let (below, above) =
-                    (low[i] as f32 / GRID as f32, (low[i] + side) as f32 / GRID as f32);
-                exit = exit.min((position[i] - below).min(above - position[i]));
-            }
-            exit = (1.0 / FASTEST).mul_add(exit, at);
         }
         exit
+    }
+
+    /// A t at which a bent ray is still inside: bounded by its greatest speed, and by its velocity
+    /// at `at` with the most that this changes.
+    #[inline(always)]
+    fn bent_exit(&self, ray: &NormalizedRay, at: f32, position: &[f32; 3]) -> f32 {
+        // A ray takes about a step through half a cell, and goes on by a step anyway.
+        if self.side == 1 {
+            return at;
+        }
+        let velocity = ray.velocity(at);
+        let (mut nearest, mut stay) = (f32::INFINITY, f32::INFINITY);
+        for i in 0..3 {
+            let low = self.low[i] as f32 / GRID as f32;
+            let high = (self.low[i] + self.side) as f32 / GRID as f32;
+            // Rounding may put a place outside: the ray then goes on by a step.
+            let (below, above) = ((position[i] - low).max(0.0), (high - position[i]).max(0.0));
+            nearest = nearest.min(below.min(above));
+            let (ahead, behind) = if velocity[i] > 0.0 { (above, below) } else { (below, above) };
+            let speed = velocity[i].abs();
+            // Roots of v·Δ + a·Δ²/2 = ahead and v·Δ - a·Δ²/2 = -behind.
+            let to_ahead =
+                2.0 * ahead / (speed + (2.0 * MOST_BENT).mul_add(ahead, speed * speed).sqrt());
+            let to_behind = (speed + (2.0 * MOST_BENT).mul_add(behind, speed * speed).sqrt())
+                * (1.0 / MOST_BENT);
+            stay = stay.min(to_ahead).min(to_behind);
+        }
+        // Less than the bound, by more than rounding.
+        (nearest * (1.0 / FASTEST)).max(stay * 0.999) + at
     }
 }
 

@@ -1,3 +1,5 @@
+use std::cell::RefCell;
+
 use rayon::prelude::*;
 
 use crate::chunk::{CHUNK_RAYS, Chunk};
@@ -59,21 +61,27 @@ impl RayField for Field {
     }
 }
 
+thread_local! {
+    /// Kept from one call to the next: views are rendered in bands, and buffers grow slowly.
+    static CHUNK: RefCell<Chunk> = RefCell::default();
+}
+
 impl Field {
     /// Colour, opacity and depth of each ray, in parallel; the result doesn't depend on the number
     /// of threads.
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
-        rays.par_chunks(CHUNK_RAYS)
-            .map_init(Chunk::default, |chunk, rays| {
-                let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
-                chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
-                let far = self.bounds.far as f32;
-                let rays = rays.iter().enumerate();
-                rays.map(|(i, ray)| pixel(ray, &clipped[i], &chunk.sums[i], far))
-                    .collect::<Vec<_>>()
-            })
-            .flatten_iter()
-            .collect()
+        let chunks = rays.par_chunks(CHUNK_RAYS);
+        let pixels = |rays| CHUNK.with_borrow_mut(|chunk| self.render_chunk(rays, chunk));
+        chunks.flat_map_iter(pixels).collect()
+    }
+
+    /// Colour, opacity and depth of at most [`CHUNK_RAYS`] rays.
+    fn render_chunk(&self, rays: &[Ray], chunk: &mut Chunk) -> Vec<Pixel> {
+        let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
+        chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
+        let far = self.bounds.far as f32;
+        let rays = rays.iter().enumerate();
+        rays.map(|(i, ray)| pixel(ray, &clipped[i], &chunk.sums[i], far)).collect()
     }
 }
 
