@@ -103,6 +103,18 @@ def files(artifact: pathlib.Path, options: argparse.Namespace, has_old_names: bo
     return found
 
 
+def unequal(before, after, path: str) -> list[str]:
+    """Where two values differ, by path; of JSON with what they are."""
+    if before == after:
+        return []
+    if isinstance(before, dict) and isinstance(after, dict):
+        keys = sorted(before.keys() | after.keys())
+        return [found for key in keys for found in unequal(before.get(key), after.get(key), f"{path} {key}")]
+    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        return [found for i, pair in enumerate(zip(before, after)) for found in unequal(*pair, f"{path} {i}")]
+    return [path if isinstance(before, bytes) or isinstance(after, bytes) else f"{path}: {before!r}, now {after!r}"]
+
+
 def compare(name: str, options: argparse.Namespace) -> bool:
     """Whether both builds make the same of an experiment; says what differs."""
     words = EXPERIMENTS[name].replace("DATA", str(options.data.resolve())).split()
@@ -113,8 +125,7 @@ def compare(name: str, options: argparse.Namespace) -> bool:
         for label in sorted(old.keys() & new.keys()):
             before, after = files(old[label], options, options.before_renames), files(new[label], options, False)
             compared += len(after)
-            unequal = [path for path in sorted(before.keys() | after.keys()) if before.get(path) != after.get(path)]
-            differences += [f"{label}: {path}" for path in unequal]
+            differences += unequal(before, after, f"{label}:")
     what = f"{len(differences)} differences" if differences else "equal"
     print(f"{name}: {compared} files of {len(new)} artifacts: {what}", *differences, sep="\n  ", flush=True)
     return not differences
