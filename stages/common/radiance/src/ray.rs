@@ -110,6 +110,18 @@ impl NormalizedRay {
         }
     }
 
+    /// The places in the unit cube at several t, an array an axis: written so that it vectorises.
+    #[inline(always)]
+    pub(crate) fn positions<const N: usize>(&self, t: &[f32; N]) -> [[f32; N]; 3] {
+        let mut places = [[0.0; N]; 3];
+        for (i, &t) in t.iter().enumerate() {
+            for (axis, x) in places.iter_mut().zip(self.position(t)) {
+                axis[i] = x;
+            }
+        }
+        places
+    }
+
     /// How fast the place in the unit cube moves at t, for each unit of t.
     #[inline(always)]
     pub(crate) fn velocity(&self, t: f32) -> [f32; 3] {
