@@ -103,15 +103,22 @@ def files(artifact: pathlib.Path, options: argparse.Namespace, has_old_names: bo
     return found
 
 
+MISSING = object()
+
+
 def unequal(before, after, path: str) -> list[str]:
     """Where two values differ, by path; of JSON with what they are."""
-    if before == after:
-        return []
+    if before is MISSING or after is MISSING:
+        return [f"{path}: only {'now' if before is MISSING else 'before'}"]
     if isinstance(before, dict) and isinstance(after, dict):
         keys = sorted(before.keys() | after.keys())
-        return [found for key in keys for found in unequal(before.get(key), after.get(key), f"{path} {key}")]
-    if isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
+        return [found for key in keys for found in unequal(before.get(key, MISSING), after.get(key, MISSING), f"{path} {key}")]
+    if isinstance(before, list) and isinstance(after, list):
+        if len(before) != len(after):
+            return [f"{path}: {len(before)} entries, now {len(after)}"]
         return [found for i, pair in enumerate(zip(before, after)) for found in unequal(*pair, f"{path} {i}")]
+    if before == after:
+        return []
     return [path if isinstance(before, bytes) or isinstance(after, bytes) else f"{path}: {before!r}, now {after!r}"]
 
 

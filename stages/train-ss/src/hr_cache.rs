@@ -222,8 +222,8 @@ struct Block<'a> {
 }
 
 impl CachedView {
-    /// What the kernel makes of it at some LR columns and rows, at most [`LR_PIXELS_NEAR`] of each, with a
-    /// block as freshly rendered.
+    /// What the kernel makes of it at some LR columns and rows, at most [`LR_PIXELS_NEAR`] of each,
+    /// with a block as freshly rendered.
     fn projected(
         &self,
         block: &Block<'_>,

@@ -16,7 +16,8 @@ pub(crate) struct Matrix {
 pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
     let (header, data) = parts(bytes).ok_or("it doesn't begin as one")?;
     if header.len() > LONGEST_HEADER {
-        return Err(format!("its header has {} bytes", header.len()));
+        let length = header.len();
+        return Err(format!("its header has {length} bytes; NumPy reads {LONGEST_HEADER}"));
     }
     let kind = entry(header, "descr")
         .and_then(quoted)

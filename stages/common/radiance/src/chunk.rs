@@ -3,7 +3,7 @@
 
 use crate::aligned::Aligned;
 use crate::field::Field;
-use crate::occupancy::{March, Strides};
+use crate::march::{March, Strides};
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};

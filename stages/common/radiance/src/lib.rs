@@ -51,6 +51,7 @@ mod composite;
 mod field;
 mod field_file;
 mod grid;
+mod march;
 mod math;
 mod mlp;
 mod occupancy;
@@ -77,7 +78,8 @@ pub use field::Field;
 pub use field_file::{
     FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
 };
-pub use occupancy::{Occupancy, Strides};
+pub use march::Strides;
+pub use occupancy::Occupancy;
 pub use passes::Passes;
 pub use points::PointSample;
 pub use ranges::OutOfRange;

@@ -4,14 +4,12 @@
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
-use crate::ray::{FASTEST, MOST_BENT, NormalizedRay, RayMap};
-use crate::simd::kernel;
 use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
 
 /// Cells in all.
 pub(crate) const CELLS: usize = GRID * GRID * GRID;
 /// A word holds 4³ of what is below it: cells in a brick, bricks in a block.
-const SIDE: usize = 4;
+pub(crate) const SIDE: usize = 4;
 /// Bricks and blocks along each axis.
 const BRICKS: usize = GRID / SIDE;
 const BLOCKS: usize = BRICKS / SIDE;
@@ -35,7 +33,7 @@ const KEPT_SHARE: f32 = 0.7;
 
 /// Which cell along each axis of `side` a number means.
 #[inline(always)]
-fn corner(cell: usize, side: usize) -> [usize; 3] {
+pub(crate) fn corner(cell: usize, side: usize) -> [usize; 3] {
     [cell % side, cell / side % side, cell / (side * side)]
 }
 
@@ -232,7 +230,7 @@ impl Occupancy {
     }
 
     /// What a cell holds.
-    fn cell(&self, cell: usize) -> Cell {
+    pub(crate) fn cell(&self, cell: usize) -> Cell {
         let (word, bit) = place(corner(cell, GRID), BRICKS);
         match (self.bricks[word] >> bit & 1, self.dense[word] >> bit & 1) {
             (0, _) => Cell::Empty,
@@ -278,112 +276,17 @@ impl Occupancy {
     }
 }
 
-/// Where a ray's march stands: the number of its next step; [`DONE`] once it has left the box.
-pub(crate) const DONE: u32 = u32::MAX;
-
-/// Rays to march, and how.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct March<'a> {
-    pub(crate) occupancy: &'a Occupancy,
-    pub(crate) rays: &'a [NormalizedRay],
-    /// Share of a step by which each ray's samples are shifted.
-    pub(crate) offsets: &'a [f32],
-    /// Distance between samples, in cube sides.
-    pub(crate) step: f32,
-    /// Whether thin cells get fewer samples.
-    pub(crate) strides: Strides,
-}
-
-/// Where rays take samples in thin cells.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Strides {
-    /// At every step, as in dense cells: to render.
-    Even,
-    /// At every other step, each for both: to train, where samples of other rays lie in between.
-    ByCell,
-}
-
-/// Samples found by marching, ray by ray.
-#[derive(Debug, Default)]
-pub(crate) struct Marched {
-    /// Where each sample lies along its ray.
-    pub(crate) t: Vec<f32>,
-    /// How many steps it stands for.
-    pub(crate) lengths: Vec<f32>,
-    /// Its place in the unit cube.
-    pub(crate) positions: Vec<[f32; 3]>,
-    /// First sample of each active ray, and the end.
-    pub(crate) starts: Vec<usize>,
-}
-
-impl Marched {
-    #[inline(always)]
-    fn push(&mut self, t: f32, length: f32, position: [f32; 3]) {
-        self.t.push(t);
-        self.lengths.push(length);
-        self.positions.push(position);
-    }
-}
-
 /// A cube of empty cells: a cell, a brick or a block.
 #[derive(Clone, Copy)]
-struct EmptyCube {
+pub(crate) struct EmptyCube {
     /// Its first cell along each axis.
-    low: [usize; 3],
+    pub(crate) low: [usize; 3],
     /// Cells along each axis.
-    side: usize,
+    pub(crate) side: usize,
 }
 
-impl EmptyCube {
-    /// The t at which a ray leaves the cube, or, where the ray is bent, one at which it is still
-    /// inside. At t = `at` the ray is at `position`; `inverse` is 1 over its direction.
-    #[inline(always)]
-    fn exit(&self, ray: &NormalizedRay, inverse: &[f32; 3], at: f32, position: &[f32; 3]) -> f32 {
-        let Self { low, side } = *self;
-        let RayMap::Straight { .. } = ray.map else { return self.bent_exit(ray, at, position) };
-        let mut exit = f32::INFINITY;
-        for i in 0..3 {
-            let face = low[i] + if ray.direction[i] > 0.0 { side } else { 0 };
-            let until = (face as f32 / GRID as f32 - ray.origin[i]) * inverse[i];
-            if ray.direction[i] != 0.0 && until < exit {
-                exit = until;
-            }
-        }
-        exit
-    }
-
-    /// A t at which a bent ray is still inside: bounded by its greatest speed, and by its velocity
-    /// at `at` with the most that this changes.
-    #[inline(always)]
-    fn bent_exit(&self, ray: &NormalizedRay, at: f32, position: &[f32; 3]) -> f32 {
-        // A ray takes about a step through half a cell, and goes on by a step anyway.
-        if self.side == 1 {
-            return at;
-        }
-        let velocity = ray.velocity(at);
-        let (mut nearest, mut stay) = (f32::INFINITY, f32::INFINITY);
-        for i in 0..3 {
-            let low = self.low[i] as f32 / GRID as f32;
-            let high = (self.low[i] + self.side) as f32 / GRID as f32;
-            // Rounding may put a place outside: the ray then goes on by a step.
-            let (below, above) = ((position[i] - low).max(0.0), (high - position[i]).max(0.0));
-            nearest = nearest.min(below.min(above));
-            let (ahead, behind) = if velocity[i] > 0.0 { (above, below) } else { (below, above) };
-            let speed = velocity[i].abs();
-            // Roots of v·Δ + a·Δ²/2 = ahead and v·Δ - a·Δ²/2 = -behind.
-            let to_ahead =
-                2.0 * ahead / (speed + (2.0 * MOST_BENT).mul_add(ahead, speed * speed).sqrt());
-            let to_behind = (speed + (2.0 * MOST_BENT).mul_add(behind, speed * speed).sqrt())
-                * (1.0 / MOST_BENT);
-            stay = stay.min(to_ahead).min(to_behind);
-        }
-        // Less than the bound, by more than rounding.
-        (nearest * (1.0 / FASTEST)).max(stay * 0.999) + at
-    }
-}
-
-/// What lies around a place.
-enum Held {
+/// What lies around a place: a [`Cell`], and of empty ones how many are empty together.
+pub(crate) enum Held {
     Empty(EmptyCube),
     Thin,
     Dense,
@@ -392,7 +295,7 @@ enum Held {
 impl Occupancy {
     /// What a cell holds; of empty ones, as many around it as are empty together.
     #[inline(always)]
-    fn held(&self, cell: [usize; 3]) -> Held {
+    pub(crate) fn held(&self, cell: [usize; 3]) -> Held {
         let brick = cell.map(|c| c / SIDE);
         let (block_word, brick_bit) = place(brick, BLOCKS);
         let (brick_word, cell_bit) = place(cell, BRICKS);
@@ -412,184 +315,9 @@ impl Occupancy {
     }
 }
 
-/// Steps of a bent ray whose places are found together, in one vector: their exponentials cost
-/// more than all else.
-const STEPS_AHEAD: usize = 8;
-
-/// Marches a ray on from step `k`, `AHEAD` places at a time; gives its next step.
-#[inline(always)]
-fn march_ray<const AHEAD: usize>(
-    march: &March<'_>,
-    ray: usize,
-    most: usize,
-    mut k: u32,
-    samples: &mut Marched,
-) -> u32 {
-    let March { occupancy, step, .. } = *march;
-    let (ray, offset) = (&march.rays[ray], march.offsets[ray]);
-    let every = march.strides == Strides::Even;
-    let (per_step, inverse) = (1.0 / step, ray.direction.map(|d| 1.0 / d));
-    let mut left = most;
-    while left > 0 {
-        let first = k;
-        let ahead: [f32; AHEAD] =
-            std::array::from_fn(|i| (first as f32 + i as f32 + offset).mul_add(step, ray.enter));
-        let places = ray.positions(&ahead);
-        while left > 0 && ((k - first) as usize) < AHEAD {
-            let at = ahead[(k - first) as usize];
-            if at >= ray.leave {
-                return DONE;
-            }
-            let p = places.map(|axis| axis[(k - first) as usize]);
-            match occupancy.held(cell_of(p)) {
-                Held::Empty(cube) => {
-                    // Where the ray leaves what is empty; at least one step on.
-                    let exit = cube.exit(ray, &inverse, at, &p);
-                    let onwards = (exit - ray.enter).mul_add(per_step, -offset).ceil();
-                    // `as` saturates: an exit that is NaN or infinite moves on by one step.
-                    k = (k + 1).max(if onwards.is_finite() { onwards as u32 } else { 0 });
-                    continue;
-                }
-                Held::Thin if !every => {
-                    let middle = (k as f32 + offset + 0.5).mul_add(step, ray.enter);
-                    if k & 1 == 0 && middle < ray.leave {
-                        samples.push(middle, 2.0, ray.position(middle));
-                        left -= 1;
-                    }
-                }
-                Held::Thin | Held::Dense => {
-                    samples.push(at, 1.0, p);
-                    left -= 1;
-                }
-            }
-            k += 1;
-        }
-    }
-    k
-}
-
-kernel! {
-    /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies
-    /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; by
-    /// [`Strides::ByCell`], a thin one gives a sample of two steps where k is even, in the middle
-    /// of both. `next` is each ray's k, from 0 to [`DONE`].
-    pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
-        samples: &mut Marched) {
-        for &r in active {
-            samples.starts.push(samples.t.len());
-            let (ray, next) = (r as usize, &mut next[r as usize]);
-            *next = match march.rays[ray].map {
-                RayMap::Straight { .. } => march_ray::<1>(march, ray, most, *next, samples),
-                RayMap::Contracted { .. } => {
-                    march_ray::<STEPS_AHEAD>(march, ray, most, *next, samples)
-                }
-            };
-        }
-        samples.starts.push(samples.t.len());
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use counter_rng::CounterRng;
-
-    /// What step k of a ray gives, without leaps: a sample's t and its length.
-    fn sample(occupancy: &Occupancy, ray: &NormalizedRay, step: f32, k: u32) -> Option<(f32, f32)> {
-        let t = (k as f32 + 0.3).mul_add(step, ray.enter);
-        let middle = (k as f32 + 0.3 + 0.5).mul_add(step, ray.enter);
-        let c = cell_of(ray.position(t));
-        match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
-            Cell::Dense if t < ray.leave => Some((t, 1.0)),
-            Cell::Thin if k.is_multiple_of(2) && middle < ray.leave => Some((middle, 2.0)),
-            _ => None,
-        }
-    }
-
-    /// All samples of a ray without leaps, and those found by marching in parts, as the renderer
-    /// does.
-    fn both(occupancy: &Occupancy, ray: NormalizedRay, step: f32) -> [Vec<(f32, f32)>; 2] {
-        let (mut next, mut found) = ([0], Marched::default());
-        let strides = Strides::ByCell;
-        let march_on = March { occupancy, rays: &[ray], offsets: &[0.3], step, strides };
-        while next[0] != DONE {
-            march(&march_on, 5, &[0], &mut next, &mut found);
-        }
-        let expected = (0..2000).filter_map(|k| sample(occupancy, &ray, step, k)).collect();
-        [expected, found.t.into_iter().zip(found.lengths).collect()]
-    }
-
-    #[test]
-    fn skipping_loses_no_sample() {
-        let mut occupancy = Occupancy::full();
-        occupancy.set(|cell| match cell {
-            _ if (cell / 7) % 11 != 0 || cell % GRID <= 40 => Cell::Empty,
-            _ if (cell / GRID).is_multiple_of(2) => Cell::Thin,
-            _ => Cell::Dense,
-        });
-        let step = 3.0f32.sqrt() / 512.0;
-        for seed in 0..200 {
-            let mut rng = CounterRng::new(1, 2, seed);
-            let mut unit = || rng.uniform();
-            let origin = [unit(), unit(), unit()];
-            let d = [unit() - 0.5, unit() - 0.5, if seed % 5 == 0 { 0.0 } else { unit() - 0.5 }];
-            let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-            let direction = d.map(|x| x / length);
-            let leave = (0..3)
-                .filter(|&i| direction[i] != 0.0)
-                .map(|i| {
-                    (if direction[i] > 0.0 { 1.0 - origin[i] } else { -origin[i] }) / direction[i]
-                })
-                .fold(f32::INFINITY, f32::min);
-            let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
-            let [expected, found] = both(&occupancy, ray, step);
-            // Rounding at a face may move one sample in a thousand across it.
-            let missing = expected.iter().filter(|t| !found.contains(t)).count();
-            assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());
-            assert!(found.iter().all(|t| expected.contains(t)));
-        }
-    }
-
-    /// Bent rays leap over empty cells, bricks and blocks of all sizes, and lose no sample.
-    #[test]
-    fn bent_rays_lose_no_sample() {
-        let mut occupancy = Occupancy::full();
-        let middle = |cell: usize| corner(cell, GRID).map(|c| (c as f32 + 0.5) / GRID as f32);
-        let mut rng = CounterRng::new(3, 0, 0);
-        let balls: Vec<[f32; 4]> = (0..40).map(|_| [(); 4].map(|()| rng.uniform())).collect();
-        let is_inside = |p: [f32; 3], [x, y, z, size]: [f32; 4]| {
-            let away = (p[0] - x).powi(2) + (p[1] - y).powi(2) + (p[2] - z).powi(2);
-            away < (0.12 * size).powi(2)
-        };
-        occupancy.set(|cell| match balls.iter().position(|&b| is_inside(middle(cell), b)) {
-            None => Cell::Empty,
-            Some(ball) if ball % 3 == 0 => Cell::Thin,
-            Some(_) => Cell::Dense,
-        });
-        let bounds = scene::Bounds {
-            min: [-1.0; 3],
-            max: [1.0; 3],
-            near: 0.01,
-            far: 500.0,
-            space: scene::Space::Contraction,
-        };
-        let step = 3.0f32.sqrt() / 512.0;
-        let mut samples = 0;
-        for seed in 0..600 {
-            let mut rng = CounterRng::new(4, 0, seed);
-            let mut draw = || 2.0 * rng.uniform() - 1.0;
-            let wide = [0.5, 1.5, 8.0][seed as usize % 3];
-            let origin = [wide * draw(), wide * draw(), wide * draw()];
-            let d = [draw(), draw(), draw()];
-            let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
-            let direction = d.map(|x| x / length);
-            let ray = crate::ray::Ray { origin, direction, background: [0.0; 3] };
-            let [expected, found] = both(&occupancy, crate::ray::clip(&bounds, &ray), step);
-            samples += expected.len();
-            assert!(expected == found, "{ray:?}: {} and {}", expected.len(), found.len());
-        }
-        assert!(samples > 5_000, "{samples} samples");
-    }
 
     /// What goes on stays in the cells that were occupied and their neighbours, whatever density is
     /// found elsewhere, and within a mask.

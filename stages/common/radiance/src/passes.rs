@@ -1,7 +1,7 @@
 use crate::aligned::Aligned;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
-use crate::occupancy::Strides;
+use crate::march::Strides;
 use crate::ray::{Ray, clip};
 use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};

@@ -76,11 +76,12 @@ impl Default for RayMap {
     }
 }
 
-/// Most that a contracted ray moves through the cube for each unit of t.
+/// Most that a contracted ray moves through the cube for each unit of t: neared by rays that pass
+/// far from the centre.
 pub(crate) const FASTEST: f32 = 2.0;
 
-/// Most that such a ray's velocity changes for each unit of t: just below, for a ray through the
-/// centre.
+/// Most by which a contracted ray's velocity changes for each unit of t: reached just outside the
+/// ball by a ray through the centre.
 pub(crate) const MOST_BENT: f32 = 12.0;
 
 /// sinh(4t). Near 0 it has the absolute error of a difference of two numbers near 1, which is that
@@ -125,6 +126,7 @@ impl NormalizedRay {
     /// How fast the place in the unit cube moves at t, for each unit of t.
     #[inline(always)]
     pub(crate) fn velocity(&self, t: f32) -> [f32; 3] {
+        // A straight ray is a curve, too.
         let RayMap::Contracted { radii, .. } = self.map else { return self.direction };
         let e = exp(4.0 * t);
         let half = 0.5 * radii;

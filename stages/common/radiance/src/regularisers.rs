@@ -1,6 +1,6 @@
 //! Regularisers: losses on a ray besides the squared error of its colour. Each has a weight and a
 //! function that adds the loss's gradient to the ray's gradients. `torch-field` computes the losses
-//! for autograd; `reference.rs` checks the gradients in f64.
+//! for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
 
 /// Weights of what is asked of rays beside their colours; 0 asks for nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::chunk::{CHUNK_RAYS, Chunk};
 use crate::field::Field;
-use crate::occupancy::Strides;
+use crate::march::Strides;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::samples::RaySum;
 use crate::spec::UNSEEN;
@@ -62,7 +62,8 @@ impl RayField for Field {
 }
 
 thread_local! {
-    /// Kept from one call to the next: views are rendered in bands, and buffers grow slowly.
+    /// Kept from one call to the next: views are rendered in bands, and buffers grow slowly. Some
+    /// ten MB a thread.
     static CHUNK: RefCell<Chunk> = RefCell::default();
 }
 
@@ -71,17 +72,19 @@ impl Field {
     /// of threads.
     pub fn render(&self, rays: &[Ray]) -> Vec<Pixel> {
         let chunks = rays.par_chunks(CHUNK_RAYS);
-        let pixels = |rays| CHUNK.with_borrow_mut(|chunk| self.render_chunk(rays, chunk));
-        chunks.flat_map_iter(pixels).collect()
+        chunks.flat_map_iter(|rays| self.render_chunk(rays)).collect()
     }
 
     /// Colour, opacity and depth of at most [`CHUNK_RAYS`] rays.
-    fn render_chunk(&self, rays: &[Ray], chunk: &mut Chunk) -> Vec<Pixel> {
+    fn render_chunk(&self, rays: &[Ray]) -> Vec<Pixel> {
+        let mut chunk = CHUNK.take();
         let clipped: Vec<_> = rays.iter().map(|r| clip(&self.bounds, r)).collect();
         chunk.forward(self, &clipped, &[0.5; CHUNK_RAYS][..rays.len()], Strides::Even);
         let far = self.bounds.far as f32;
-        let rays = rays.iter().enumerate();
-        rays.map(|(i, ray)| pixel(ray, &clipped[i], &chunk.sums[i], far)).collect()
+        let seen = rays.iter().zip(&clipped).zip(&chunk.sums);
+        let pixels = seen.map(|((ray, clipped), sum)| pixel(ray, clipped, sum, far)).collect();
+        CHUNK.set(chunk);
+        pixels
     }
 }
 

@@ -4,9 +4,9 @@ use crate::aligned::Aligned;
 use crate::composite::{optical_depths, weights};
 use crate::field::Field;
 use crate::grid::encode;
+use crate::march::{DONE, March, Marched, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
-use crate::occupancy::{DONE, March, Marched, march};
 use crate::simd::LANES;
 use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY};
 

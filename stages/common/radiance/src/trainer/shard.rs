@@ -3,7 +3,7 @@ use std::ops::Range;
 use super::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
-use crate::occupancy::Strides;
+use crate::march::Strides;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::supervisor::Supervisor;
