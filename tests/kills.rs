@@ -134,8 +134,10 @@ fn kills_at_random_moments_lose_nothing() {
         std::thread::sleep(moment);
         collector = collector.or_else(|| Some(collect(&project)));
         // Asked before, since a runner that is killed has no children any more.
-        let stages = children(runner.id());
+        let mut stages = children(runner.id());
         let what = strike(&mut random, &runner, &stages);
+        // One may have been started in between.
+        stages.extend(children(runner.id()));
         let place = format!("round {round}: seed {seed}, {what} after {moment:?}");
         println!("{place}");
         let run = ended(runner, &place);
