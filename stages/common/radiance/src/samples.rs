@@ -4,7 +4,7 @@ use crate::aligned::Aligned;
 use crate::composite::{optical_depths, weights};
 use crate::field::Field;
 use crate::grid::encode;
-use crate::march::{DONE, March, Marched, march};
+use crate::march::{DONE, March, Marched, Strides, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
 use crate::simd::LANES;
@@ -23,9 +23,11 @@ pub(crate) struct RaySum {
     pub(crate) median: Option<f32>,
 }
 
-/// Samples of each ray in the first rounds and in all later ones: few while a surface may stop the
-/// ray, then more.
-const ROUNDS: [usize; 4] = [8, 8, 16, 32];
+/// Samples of each ray in the first rounds of a training and in all later ones: few while a surface
+/// may stop the ray, then more.
+const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
+/// Samples of each ray in a round of rendering: a trained field's surfaces stop rays within few.
+const RENDERING_ROUND: usize = 8;
 
 /// Samples that were marched together. Their rows have a length of `n`, whole vectors.
 #[derive(Clone, Copy, Debug)]
@@ -169,7 +171,10 @@ impl Samples {
     /// Takes the next samples of every active ray, and puts their positions into the network's
     /// rows. So far `counted` samples count.
     fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
-        let most = ROUNDS[self.rounds.len().min(ROUNDS.len() - 1)];
+        let most = match rays.strides {
+            Strides::Even => RENDERING_ROUND,
+            Strides::ByCell => TRAINING_ROUNDS[self.rounds.len().min(TRAINING_ROUNDS.len() - 1)],
+        };
         let start = self.marched.t.len();
         self.marched.starts.clear();
         march(rays, most, &self.active, &mut self.next, &mut self.marched);
