@@ -206,8 +206,11 @@ impl Project {
 
     pub fn command(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(bin("nerf-sr"));
-        command.args(arguments).current_dir(self.dir.path()).env_remove("NERF_SR_STORE");
-        command.env_remove("NERF_SR_EXECUTOR").env_remove("NERF_SR_SITE");
+        command.args(arguments).current_dir(self.dir.path());
+        // Defaults of whoever runs the tests.
+        for name in ["STORE", "EXECUTOR", "SITE", "DATA"] {
+            command.env_remove(format!("NERF_SR_{name}"));
+        }
         command
     }
 
