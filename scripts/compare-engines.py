@@ -129,7 +129,8 @@ def panel(scene: str, results: list[Result], left: int) -> str:
         x, y = place(longest * share, low + (high - low) * share)
         parts.append(f'<line x1="{left + LEFT}" x2="{left + WIDTH - 10}" y1="{y:.1f}" y2="{y:.1f}" stroke="#ddd"/>')
         parts.append(f'<text x="{left + LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{low + (high - low) * share:.1f}</text>')
-        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 22}" text-anchor="middle">{longest * share:.0f}</text>')
+        anchor = "end" if share == 1 else "middle"
+        parts.append(f'<text x="{x:.1f}" y="{HEIGHT - 22}" text-anchor="{anchor}">{longest * share:.0f}</text>')
     parts.append(f'<text x="{left + (LEFT + WIDTH) / 2}" y="{HEIGHT - 6}" text-anchor="middle">processor seconds of training</text>')
     for build, curve in curves.items():
         places = [place(*point) for point in sorted(curve)]
