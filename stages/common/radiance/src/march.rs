@@ -58,7 +58,9 @@ impl EmptyCube {
     #[inline(always)]
     fn exit(&self, ray: &NormalizedRay, inverse: &[f32; 3], at: f32, position: &[f32; 3]) -> f32 {
         let Self { low, side } = *self;
-        let RayMap::Straight { .. } = ray.map else { return self.bent_exit(ray, at, position) };
+        if let RayMap::Contracted { radii, .. } = ray.map {
+            return self.bent_exit(ray, radii, at, position);
+        }
         let mut exit = f32::INFINITY;
         for i in 0..3 {
             let face = low[i] + if ray.direction[i] > 0.0 { side } else { 0 };
@@ -73,12 +75,18 @@ impl EmptyCube {
     /// A t at which a bent ray is still inside: bounded by its greatest speed, and by its velocity
     /// at `at` with the most that this changes.
     #[inline(always)]
-    fn bent_exit(&self, ray: &NormalizedRay, at: f32, position: &[f32; 3]) -> f32 {
+    fn bent_exit(
+        &self,
+        ray: &NormalizedRay,
+        radii: f32,
+        at: f32,
+        position: &[f32; 3],
+    ) -> f32 {
         // A ray takes about a step through half a cell, and goes on by a step anyway.
         if self.side == 1 {
             return at;
         }
-        let velocity = ray.velocity(at);
+        let velocity = ray.contracted_velocity(radii, at);
         let (mut nearest, mut stay) = (f32::INFINITY, f32::INFINITY);
         for i in 0..3 {
             let low = self.low[i] as f32 / GRID as f32;

@@ -101,10 +101,7 @@ impl NormalizedRay {
                 std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i]))
             }
             RayMap::Contracted { radii, .. } => {
-                let along = radii * sinh4(t);
-                let u: [f32; 3] =
-                    std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
-                let length = u.iter().map(|x| x * x).sum::<f32>().sqrt();
+                let (u, length) = self.before_contraction(radii * sinh4(t));
                 let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
                 u.map(|x| (0.25 * factor).mul_add(x, 0.5))
             }
@@ -123,17 +120,22 @@ impl NormalizedRay {
         places
     }
 
-    /// How fast the place in the unit cube moves at t, for each unit of t.
+    /// A contracted ray's point `along` from the one nearest to the centre, and its distance from
+    /// the centre, all in ball radii.
     #[inline(always)]
-    pub(crate) fn velocity(&self, t: f32) -> [f32; 3] {
-        // A straight ray is a curve, too.
-        let RayMap::Contracted { radii, .. } = self.map else { return self.direction };
+    fn before_contraction(&self, along: f32) -> ([f32; 3], f32) {
+        let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
+        (u, u.iter().map(|x| x * x).sum::<f32>().sqrt())
+    }
+
+    /// How fast the place of a contracted ray moves in the unit cube at t, for each unit of t.
+    #[inline(always)]
+    pub(crate) fn contracted_velocity(&self, radii: f32, t: f32) -> [f32; 3] {
         let e = exp(4.0 * t);
         let half = 0.5 * radii;
         // A quarter of how fast `along` grows: the cube is four radii wide.
         let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
-        let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
-        let length = u.iter().map(|x| x * x).sum::<f32>().sqrt();
+        let (u, length) = self.before_contraction(along);
         if length <= 1.0 {
             return self.direction.map(|d| speed * d);
         }
@@ -401,12 +403,15 @@ mod tests {
             let origin = [far * draw(), far * draw(), far * draw()];
             let direction = unit([draw(), draw(), draw()].map(f64::from)).as_vec3().to_array();
             let seen = clip(&bounds, &ray(origin, direction));
+            let RayMap::Contracted { radii, .. } = seen.map else {
+                panic!("the space is contracted");
+            };
             let step = 2e-3;
             let mut t = seen.enter;
             while t + step < seen.leave {
                 let [a, b] = [t, t + step].map(|t| seen.position(t));
                 assert!(length(a, b) < FASTEST * step + 1e-6, "at {t} of {seen:?}");
-                let [before, after] = [t, t + step].map(|t| seen.velocity(t));
+                let [before, after] = [t, t + step].map(|t| seen.contracted_velocity(radii, t));
                 let measured: [f32; 3] = std::array::from_fn(|i| (b[i] - a[i]) / step);
                 let middle = std::array::from_fn(|i| 0.5 * (before[i] + after[i]));
                 assert!(length(measured, middle) < 0.01, "{measured:?} {middle:?} at {t}");

@@ -1,5 +1,5 @@
 //! What views are scored by: a file for each metric. A new one is a file, and here its `mod` and
-//! its place in the list.
+//! its line in the list.
 
 mod depth;
 mod low_resolution;
@@ -13,29 +13,24 @@ mod warp;
 
 use crate::metric::Metric;
 
-use depth::DepthMetric;
 pub use depth::{DepthError, depth_error};
-use low_resolution::LowResolutionMetric;
 #[cfg(feature = "torch")]
 pub use lpips::Lpips;
 pub use lpips_network::LpipsNetwork;
 pub(crate) use perceptual::Perceptual;
-use psnr::PsnrMetric;
 pub use psnr::psnr;
-use ssim::SsimMetric;
 pub use ssim::{Ssim, ssim};
-use warp::WarpMetric;
 pub use warp::WarpScore;
 
 /// All metrics, in the order in which they are shown.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
-        Box::new(PsnrMetric),
-        Box::new(SsimMetric),
+        Box::new(psnr::PsnrMetric),
+        Box::new(ssim::SsimMetric),
         Box::new(perceptual),
-        Box::new(LowResolutionMetric),
-        Box::new(WarpMetric),
-        Box::new(DepthMetric),
+        Box::new(low_resolution::LowResolutionMetric),
+        Box::new(warp::WarpMetric),
+        Box::new(depth::DepthMetric),
     ]
 }
 
