@@ -15,7 +15,7 @@ NERF_SR := target/release/nerf-sr
 # Real scenes and network weights, for the targets that measure.
 DATA ?= $(or $(NERF_SR_DATA),../shared/data)
 
-.PHONY: help demo build-demo build remote install setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean goldens
+.PHONY: help demo build-demo build remote install setup test faults lint lego sweep quality table results refine-table refine-ablation held-out ablation tradeoff seeds bench bench-runner compare-engines fuzz clean reference goldens
 
 help: ## Show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST)
@@ -173,6 +173,9 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 
 compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS="FACTOR …" SCENES="lego 100x2" PICTURE=FILE.svg
 	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
+
+reference: build ## Make schemas/ and docs/reference/ anew, from the types and the built programs
+	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas
 
 goldens: ## Make the golden files anew, with pinned versions of Pillow, scikit-image and PyTorch
 	python3 -m venv .venv && .venv/bin/pip install --quiet -r scripts/goldens/requirements.txt && .venv/bin/python scripts/goldens

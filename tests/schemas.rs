@@ -1,7 +1,5 @@
 //! `schemas/` and `docs/reference/` are made from the types and from what the built stages say; this
-//! test keeps them current. After `make build`,
-//! `UPDATE=1 cargo test --release --workspace --exclude nerf-sr-remote --test schemas` writes them
-//! anew.
+//! test keeps them current. `make reference` writes them anew.
 
 #![allow(missing_docs, reason = "a test")]
 
