@@ -94,8 +94,8 @@ pub struct GridParams {
     /// Maximum number of rays in a step.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
-    /// Number of samples that a step aims at. Steps have fewer rays while space is full of
-    /// semi-transparent density.
+    /// Number of samples that the first steps aim at. The last steps aim at four times as many.
+    /// Steps have fewer rays while space is full of semi-transparent density.
     #[schemars(range(min = 1024, max = 16_777_216), extend("x-group" = "sampling"))]
     pub samples_per_step: u32,
     /// Order in which pixels are drawn.
@@ -176,7 +176,7 @@ impl Default for GridParams {
         let grid = Architecture::default();
         Self {
             rays: 30_000_000,
-            max_rays_per_step: 4_096,
+            max_rays_per_step: 8_192,
             samples_per_step: 16_384,
             order: Order::Random,
             pixel_importance: None,
@@ -188,7 +188,7 @@ impl Default for GridParams {
             learning_rate: 4e-2,
             level_rate: 0.8,
             mlp_learning_rate: 1e-2,
-            learning_rate_decay: 0.25,
+            learning_rate_decay: 0.1,
             ema_decay: 0.97,
             network_decay: 1e-6,
             n_levels: grid.levels,

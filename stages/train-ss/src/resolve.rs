@@ -23,7 +23,7 @@ const FLOATER_LOSS: f64 = 0.001;
 /// How much more often detail is drawn, in random order.
 const PIXEL_IMPORTANCE: f64 = 10.0;
 /// Gradients shorter than so many times the mean are drawn at random.
-const ROULETTE: f32 = 1.0;
+const ROULETTE: f32 = 0.25;
 /// Cells of the finest level for each LR pixel across the field.
 const CELLS_PER_PIXEL: f64 = 2.56;
 

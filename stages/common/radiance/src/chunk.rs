@@ -4,6 +4,7 @@
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::march::{March, Strides};
+use crate::occupancy::Met;
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
@@ -174,6 +175,11 @@ impl Chunk {
         shading.backward(field, (samples, counted, sums), towards, network, &mut back.gradients);
         back.choose(samples, counted, roulette);
         back.run(field, samples, network, into);
+    }
+
+    /// Lists the cells where samples of the last forward pass stop light.
+    pub(crate) fn list_met(&self, step: f32, met: &mut Vec<Met>) {
+        self.samples.list_met(&self.counted, step, met);
     }
 
     /// Samples marched in the last forward pass.

@@ -79,7 +79,7 @@ pub use field_file::{
     FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
 };
 pub use march::Strides;
-pub use occupancy::Occupancy;
+pub use occupancy::{Met, Occupancy};
 pub use passes::Passes;
 pub use points::PointSample;
 pub use ranges::OutOfRange;

@@ -62,6 +62,24 @@ pub(crate) fn cell_of(place: [f32; 3]) -> [usize; 3] {
     place.map(|x| (x * GRID as f32).max(0.0).min(GRID as f32 - 1.0) as i32 as usize)
 }
 
+/// A density that a ray has met in a cell, where it stops light.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Met {
+    /// Number of the cell.
+    pub cell: u32,
+    /// Density for a cube side.
+    pub density: f32,
+}
+
+impl Met {
+    /// At a place of the unit cube.
+    #[inline(always)]
+    pub fn at(place: [f32; 3], density: f32) -> Self {
+        let [x, y, z] = cell_of(place);
+        Self { cell: (x + GRID * (y + GRID * z)) as u32, density }
+    }
+}
+
 /// Density of a cell that hasn't been looked at.
 const UNKNOWN: f32 = -1.0;
 
@@ -210,6 +228,17 @@ impl Occupancy {
         self.set_words(bricks, dense);
     }
 
+    /// Raises cells to densities that rays have met, for the next update. Cells that haven't been
+    /// looked at count as dense anyway.
+    pub fn keep(&mut self, met: &[Met]) {
+        for &Met { cell, density } in met {
+            let known = &mut self.density[cell as usize];
+            if *known != UNKNOWN {
+                *known = known.max(density);
+            }
+        }
+    }
+
     /// Mean density of the cells that have been looked at; parts are summed in order.
     fn mean_density(&self) -> f32 {
         let parts: Vec<(f64, u32)> = (self.density.par_chunks(GRID * GRID))
@@ -356,6 +385,29 @@ mod tests {
             let found = occupancy.cells_to_update(step);
             assert!(found.into_iter().map(|cell| cell as usize).eq(expected), "step {step}");
         }
+    }
+
+    /// A cell becomes empty when updates miss its surface, unless rays meet the surface.
+    #[test]
+    fn a_cell_that_rays_meet_stays() {
+        let (missed, found, place) = (200_100, 1e3, [0.6, 0.2, 0.9]);
+        let met = Met::at(place, found);
+        assert_eq!(corner(met.cell as usize, GRID), cell_of(place));
+        let mut occupancy = Occupancy::full();
+        let all: Vec<u32> = (0..CELLS as u32).collect();
+        let mut densities = vec![0.0; CELLS];
+        occupancy.keep(&[met]);
+        assert_eq!(occupancy.density()[met.cell as usize], UNKNOWN);
+        (densities[missed], densities[met.cell as usize]) = (found, found);
+        occupancy.update(&all, &densities, 0.003);
+        assert_eq!(occupancy.cells().count(), 2);
+        densities.fill(0.0);
+        densities[0] = found;
+        for _ in 0..50 {
+            occupancy.keep(&[met, Met { density: 0.1, ..met }]);
+            occupancy.update(&all, &densities, 0.003);
+        }
+        assert!(occupancy.cells().eq([0, met.cell as usize]));
     }
 
     #[test]

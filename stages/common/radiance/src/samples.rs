@@ -7,8 +7,9 @@ use crate::grid::encode;
 use crate::march::{DONE, March, Marched, Strides, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
+use crate::occupancy::Met;
 use crate::simd::LANES;
-use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY};
+use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY, MET};
 
 /// What one ray adds up to.
 #[derive(Clone, Copy, Debug, Default)]
@@ -235,6 +236,16 @@ impl Samples {
                 }
             }
         }
+    }
+
+    /// Lists the cells where samples stop light. A sample stands for `step` times its length, in
+    /// cube sides.
+    pub(crate) fn list_met(&self, counted: &Counted, step: f32, met: &mut Vec<Met>) {
+        let Marched { positions, lengths, .. } = &self.marched;
+        let samples = counted.sample.iter().map(|&i| i as usize);
+        met.extend(samples.filter(|&i| self.weight[i] > MET).map(|i| {
+            Met::at(positions[i], self.tau[i] / (lengths[i] * step))
+        }));
     }
 
     /// Derivative of a sample's optical depth by its raw density.

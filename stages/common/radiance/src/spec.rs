@@ -39,6 +39,10 @@ pub const THIN: f32 = 0.05;
 /// Optical depth of a step below which a cell is empty, once the mean is above it.
 pub const EMPTY: f32 = 0.01;
 
+/// Weight of a sample above which its cell keeps the density found there: a random place may miss a
+/// thin surface, and the cell would become empty.
+pub const MET: f32 = 0.01;
+
 /// Adam's decay of the two moments of gradients. The second moment forgets sooner than usual, since
 /// a grid entry is seen now and then.
 pub const ADAM_BETA: [f64; 2] = [0.9, 0.99];

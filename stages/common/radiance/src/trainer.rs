@@ -138,7 +138,7 @@ impl Trainer {
     ) -> Result<Option<StepReport>, TrainingError> {
         supervision.set_progress(self.tally.done(self.options.rays));
         let bundle = supervision.rays_per_bundle();
-        let wanted = self.options.rays_of_step(self.samples_per_ray);
+        let wanted = self.options.rays_of_step(&self.tally, self.samples_per_ray);
         let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else {
             return Ok(None);
         };
@@ -163,6 +163,9 @@ impl Trainer {
         } else {
             self.apply();
             self.average();
+            for shard in &self.shards {
+                self.field.occupancy.keep(&shard.met);
+            }
             let colours = self.shards.iter().flat_map(|s| s.colours.chunks_exact(bundle));
             (first_bundle..)
                 .zip(colours)

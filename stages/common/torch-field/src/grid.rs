@@ -1,8 +1,8 @@
 use radiance::spec::{
-    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, OCCUPANCY_CELLS,
-    RAW_COLOUR, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
+    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, MET,
+    OCCUPANCY_CELLS, RAW_COLOUR, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
 };
-use radiance::{Architecture, Field, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
+use radiance::{Architecture, Field, Met, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
@@ -79,9 +79,23 @@ pub(crate) struct GridSeen {
     pub(crate) shaded_colour: Tensor,
     pub(crate) shaded_weight: Tensor,
     pub(crate) shaded_ray: Tensor,
+    /// Their places in the unit cube (s × 3), and densities for a cube side (s).
+    shaded_position: Tensor,
+    shaded_density: Tensor,
     /// Samples where there may be something.
     pub(crate) samples: usize,
     maps: RayMaps,
+}
+
+impl GridSeen {
+    /// Cells where samples stop light.
+    pub(crate) fn met(&self) -> Result<Vec<Met>, TchError> {
+        let (weights, densities) = (host(&self.shaded_weight)?, host(&self.shaded_density)?);
+        let positions = host(&self.shaded_position)?;
+        let samples = weights.iter().zip(densities).zip(positions.as_chunks::<3>().0);
+        let met = samples.filter(|((weight, _), _)| **weight > MET);
+        Ok(met.map(|((_, density), &place)| Met::at(place, density)).collect())
+    }
 }
 
 fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
@@ -300,6 +314,7 @@ impl TorchGrid {
         let ray = at.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
+        let density = outputs.i((.., 0)).f_detach()?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?;
         let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
         Ok(GridSeen {
             premultiplied: sum_by_ray(&weight.f_mul(&colour)?, &ray, n)?,
@@ -310,6 +325,8 @@ impl TorchGrid {
             shaded_colour: colour,
             shaded_weight: weight,
             shaded_ray: ray,
+            shaded_position: positions.f_index_select(0, &shaded)?,
+            shaded_density: density.f_exp()?,
             samples: kept.numel(),
             maps,
         })

@@ -2,7 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
-use radiance::{Field, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
+use radiance::{Field, Met, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
 use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -36,6 +36,7 @@ struct GridPiece {
     colours: Vec<[f32; 3]>,
     loss: f64,
     samples: usize,
+    met: Vec<Met>,
 }
 
 impl GridTrainer {
@@ -92,7 +93,7 @@ impl GridTrainer {
     ) -> Result<Option<StepReport>, TorchFieldError> {
         supervision.set_progress(self.tally.done(self.options.rays));
         let bundle = supervision.rays_per_bundle();
-        let wanted = self.options.rays_of_step(self.samples_per_ray);
+        let wanted = self.options.rays_of_step(&self.tally, self.samples_per_ray);
         let Some(bundles) = self.tally.bundles_of_step(self.options.rays, wanted, bundle) else {
             return Ok(None);
         };
@@ -104,8 +105,14 @@ impl GridTrainer {
         let loss = pieces.iter().map(|p| p.loss).sum::<f64>() / bundles as f64;
         self.tally.count(bundles, bundle);
         self.samples_per_ray = samples as f64 / rays as f64;
-        let (colours, gradients): (Vec<_>, Vec<_>) =
-            pieces.into_iter().map(|p| (p.colours, p.gradients)).unzip();
+        let mut met = Vec::new();
+        let (colours, gradients): (Vec<_>, Vec<_>) = pieces
+            .into_iter()
+            .map(|piece| {
+                met.extend(piece.met);
+                (piece.colours, piece.gradients)
+            })
+            .unzip();
         let mut gradients = gradients.into_iter();
         let mut sum = gradients.next().unwrap_or_default();
         no_grad(|| {
@@ -121,6 +128,7 @@ impl GridTrainer {
             }
         } else {
             no_grad(|| self.apply(&sum))?;
+            self.occupancy.keep(&met);
             step.remember(supervision, colours.iter().map(Vec::as_slice));
         }
         self.tally.steps += 1;
@@ -166,6 +174,7 @@ impl GridTrainer {
             colours: judged.colours,
             loss: judged.loss,
             samples: seen.samples,
+            met: seen.met()?,
         })
     }
 

@@ -5,8 +5,12 @@ use crate::regularisers::Regularisers;
 use crate::tally::Tally;
 
 /// Steps between those of the weights' average, and the share of the rays after which it begins.
-const AVERAGE_EVERY: u64 = 16;
+const AVERAGE_EVERY: u64 = 4;
 const AVERAGE_FROM: f64 = 0.7;
+
+/// Samples of the last step over those of the first. Small steps find the shape early; later, larger
+/// steps have less noise.
+const STEP_GROWTH: f64 = 4.0;
 
 /// How to train.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,8 +19,8 @@ pub struct TrainingOptions {
     pub rays: u64,
     /// Most rays in a step.
     pub max_rays_per_step: usize,
-    /// Samples that a step aims at; while space is full of semi-transparent density, steps have
-    /// fewer rays.
+    /// Samples that the first steps aim at; the last steps aim at four times as many. While space is
+    /// full of semi-transparent density, steps have fewer rays.
     pub samples_per_step: usize,
     /// Learning rate of the grid's coarsest level at its highest.
     pub learning_rate: f64,
@@ -45,8 +49,10 @@ pub struct TrainingOptions {
 
 impl TrainingOptions {
     /// Rays in a step, where a ray had so many samples in the one before.
-    pub fn rays_of_step(&self, samples_per_ray: f64) -> usize {
-        let wanted = (self.samples_per_step as f64 / samples_per_ray.max(0.1)) as usize;
+    pub fn rays_of_step(&self, tally: &Tally, samples_per_ray: f64) -> usize {
+        let samples =
+            self.samples_per_step as f64 * libm::pow(STEP_GROWTH, tally.done(self.rays));
+        let wanted = (samples / samples_per_ray.max(0.1)) as usize;
         wanted.clamp(256, self.max_rays_per_step.max(256))
     }
 

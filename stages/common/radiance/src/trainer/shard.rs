@@ -4,6 +4,7 @@ use super::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
 use crate::march::Strides;
+use crate::occupancy::Met;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
 use crate::supervisor::Supervisor;
@@ -29,6 +30,8 @@ pub(super) struct Shard {
     pub(super) network: Vec<f32>,
     pub(super) loss: f64,
     pub(super) samples: usize,
+    /// Cells where light was stopped.
+    pub(super) met: Vec<Met>,
 }
 
 /// Buffers of one thread.
@@ -53,6 +56,7 @@ impl Shard {
     ) {
         self.colours.clear();
         self.features.clear();
+        self.met.clear();
         self.network.resize(work.field.network.len(), 0.0);
         self.network.fill(0.0);
         (self.loss, self.samples) = (0.0, 0);
@@ -91,6 +95,7 @@ impl Shard {
         worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
         worker.chunk.forward(field, &worker.clipped, &worker.offsets, Strides::ByCell);
         self.samples += worker.chunk.samples();
+        worker.chunk.list_met(field.step(), &mut self.met);
         for (colour, (sum, background)) in
             worker.colours.iter_mut().zip(worker.chunk.sums.iter().zip(&worker.backgrounds))
         {
