@@ -56,6 +56,7 @@ pub fn device(name: &str) -> Result<Device, DeviceError> {
     let Some(index) = index else {
         return refuse("no such device; cpu, cuda or cuda:N is expected".to_owned());
     };
+    load_cuda();
     let found = Cuda::device_count();
     if !Cuda::is_available() || found == 0 {
         return refuse(
@@ -70,6 +71,18 @@ pub fn device(name: &str) -> Result<Device, DeviceError> {
     }
     Ok(Device::Cuda(index))
 }
+
+/// Loads libtorch's part for CUDA, where there is one. Linkers leave it out, since a program uses
+/// none of its symbols.
+#[cfg(unix)]
+fn load_cuda() {
+    // SAFETY: loading runs the library's constructors, which register its kernels with libtorch, as
+    // in Python. It stays loaded.
+    unsafe { libc::dlopen(c"libtorch_cuda.so".as_ptr(), libc::RTLD_NOW | libc::RTLD_GLOBAL) };
+}
+
+#[cfg(not(unix))]
+fn load_cuda() {}
 
 /// Whether libtorch failed for want of memory: then a smaller piece may do.
 pub fn is_out_of_memory(error: &TchError) -> bool {
