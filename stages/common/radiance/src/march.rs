@@ -75,13 +75,7 @@ impl EmptyCube {
     /// A t at which a bent ray is still inside: bounded by its greatest speed, and by its velocity
     /// at `at` with the most that this changes.
     #[inline(always)]
-    fn bent_exit(
-        &self,
-        ray: &NormalizedRay,
-        radii: f32,
-        at: f32,
-        position: &[f32; 3],
-    ) -> f32 {
+    fn bent_exit(&self, ray: &NormalizedRay, radii: f32, at: f32, position: &[f32; 3]) -> f32 {
         // A ray takes about a step through half a cell, and goes on by a step anyway.
         if self.side == 1 {
             return at;

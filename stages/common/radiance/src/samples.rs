@@ -243,9 +243,11 @@ impl Samples {
     pub(crate) fn list_met(&self, counted: &Counted, step: f32, met: &mut Vec<Met>) {
         let Marched { positions, lengths, .. } = &self.marched;
         let samples = counted.sample.iter().map(|&i| i as usize);
-        met.extend(samples.filter(|&i| self.weight[i] > MET).map(|i| {
-            Met::at(positions[i], self.tau[i] / (lengths[i] * step))
-        }));
+        met.extend(
+            samples
+                .filter(|&i| self.weight[i] > MET)
+                .map(|i| Met::at(positions[i], self.tau[i] / (lengths[i] * step))),
+        );
     }
 
     /// Derivative of a sample's optical depth by its raw density.

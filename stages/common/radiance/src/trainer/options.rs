@@ -50,8 +50,7 @@ pub struct TrainingOptions {
 impl TrainingOptions {
     /// Rays in a step, where a ray had so many samples in the one before.
     pub fn rays_of_step(&self, tally: &Tally, samples_per_ray: f64) -> usize {
-        let samples =
-            self.samples_per_step as f64 * libm::pow(STEP_GROWTH, tally.done(self.rays));
+        let samples = self.samples_per_step as f64 * libm::pow(STEP_GROWTH, tally.done(self.rays));
         let wanted = (samples / samples_per_ray.max(0.1)) as usize;
         wanted.clamp(256, self.max_rays_per_step.max(256))
     }
