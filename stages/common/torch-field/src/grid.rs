@@ -79,23 +79,21 @@ pub(crate) struct GridSeen {
     pub(crate) shaded_colour: Tensor,
     pub(crate) shaded_weight: Tensor,
     pub(crate) shaded_ray: Tensor,
-    /// Their places in the unit cube (s × 3), and densities for a cube side (s).
-    shaded_position: Tensor,
-    shaded_density: Tensor,
+    /// In training: cells where samples stop light.
+    pub(crate) met: Vec<Met>,
     /// Samples where there may be something.
     pub(crate) samples: usize,
     maps: RayMaps,
 }
 
-impl GridSeen {
-    /// Cells where samples stop light.
-    pub(crate) fn met(&self) -> Result<Vec<Met>, TchError> {
-        let (weights, densities) = (host(&self.shaded_weight)?, host(&self.shaded_density)?);
-        let positions = host(&self.shaded_position)?;
-        let samples = weights.iter().zip(densities).zip(positions.as_chunks::<3>().0);
-        let met = samples.filter(|((weight, _), _)| **weight > MET);
-        Ok(met.map(|((_, density), &place)| Met::at(place, density)).collect())
-    }
+/// Cells where samples stop light, by the weights (s × 1), positions (s × 3) and raw densities (s)
+/// of samples.
+fn cells_met(weight: &Tensor, positions: &Tensor, raw: &Tensor) -> Result<Vec<Met>, TchError> {
+    let met = weight.f_squeeze_dim(-1)?.f_gt(f64::from(MET))?.f_nonzero()?.f_squeeze_dim(-1)?;
+    let density = raw.f_index_select(0, &met)?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?.f_exp()?;
+    let (places, densities) = (host(&positions.f_index_select(0, &met)?)?, host(&density)?);
+    let places = places.as_chunks::<3>().0.iter();
+    Ok(places.zip(densities).map(|(&place, density)| Met::at(place, density)).collect())
 }
 
 fn levels(architecture: &Architecture) -> Vec<TorchLevel> {
@@ -314,7 +312,12 @@ impl TorchGrid {
         let ray = at.f_div_scalar_mode(count, "floor")?;
         let weight = weights.f_reshape([-1])?.f_index_select(0, &at)?.f_unsqueeze(-1)?;
         let outputs = outputs.f_index_select(0, &shaded)?;
-        let density = outputs.i((.., 0)).f_detach()?.f_clamp_max(f64::from(MAX_RAW_DENSITY))?;
+        let met = match strides {
+            Strides::Even => Vec::new(),
+            Strides::ByCell => no_grad(|| {
+                cells_met(&weight, &positions.f_index_select(0, &shaded)?, &outputs.i((.., 0)))
+            })?,
+        };
         let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
         Ok(GridSeen {
             premultiplied: sum_by_ray(&weight.f_mul(&colour)?, &ray, n)?,
@@ -325,8 +328,7 @@ impl TorchGrid {
             shaded_colour: colour,
             shaded_weight: weight,
             shaded_ray: ray,
-            shaded_position: positions.f_index_select(0, &shaded)?,
-            shaded_density: density.f_exp()?,
+            met,
             samples: kept.numel(),
             maps,
         })

@@ -174,7 +174,7 @@ impl GridTrainer {
             colours: judged.colours,
             loss: judged.loss,
             samples: seen.samples,
-            met: seen.met()?,
+            met: seen.met,
         })
     }
 
@@ -456,9 +456,9 @@ mod tests {
         std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
     }
 
-    /// Step by step the same losses as the hand-written trainer's, through two looks at the
-    /// occupancy and into the average of the weights, in every space; and in the end the same
-    /// field.
+    /// Step by step the same losses as the hand-written trainer's, through an update of the
+    /// occupancy and into the average of the weights, in every space; in the end the same densities
+    /// of cells, also where rays met something, and the same field.
     #[test]
     fn trains_as_the_hand_written_trainer_does() {
         let ndc = Space::Ndc(Frustum {
@@ -491,6 +491,12 @@ mod tests {
                 assert!(judge.step(&mut its).unwrap().is_none() && losses.len() == 36);
                 assert!(losses[35] < 0.9 * losses[0], "{losses:?}");
                 assert_eq!(mine.seen.len(), its.seen.len());
+                let (known, other) = (ours.field().parts().2.density(), judge.occupancy.density());
+                let pairs = known.iter().zip(other).filter(|(a, _)| **a > 0.0);
+                let differ = pairs.filter(|(a, b)| (**a / **b - 1.0).abs() > 1e-3).count();
+                // Without what rays met in the last steps, 4 cells and more differ. A GPU's rounding
+                // may put samples into other cells.
+                assert!(device != Device::Cpu || differ < 3, "{space:?}: {differ} cells");
                 let rays: Vec<Ray> = (0..50)
                     .flat_map(|g| {
                         let mut rays = [Ray::default(); 4];
