@@ -1,7 +1,6 @@
 //! `eval`: scores views against ground truth, and says by which conventions.
 //!
-//! * `metric`: what a metric is; `scoring`: all of them. A new one is a file, and two lines in
-//!   `scoring/mod.rs`.
+//! * `metric`: what a metric is; `scoring`: all of them. A new one changes `scoring/mod.rs` alone.
 //! * [`psnr`], [`ssim`], `lpips` (by SqueezeNet, AlexNet and VGG-16, each where its weights are
 //!   given and the build has libtorch): against HR truth.
 //! * `low_resolution`: PSNR and SSIM of the render shrunk to LR. Where photographs are all there

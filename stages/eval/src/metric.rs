@@ -5,9 +5,8 @@ use pixels::Rgba8;
 
 use crate::scored_view::{ScoredScene, ScoredView};
 
-/// Something that views are scored by. A new one is a type in a file of `scoring/`, and its place
-/// in the list of `scoring/mod.rs`: `metrics.json`, the page and the summary follow from what it
-/// says of itself.
+/// Something that views are scored by. A new one is a type in `scoring/mod.rs`, and its line in the
+/// list there: `metrics.json`, the page and the summary follow from what it says of itself.
 pub(crate) trait Metric: Sync {
     /// Its key among the conventions, and its pictures' folder.
     fn name(&self) -> &'static str;

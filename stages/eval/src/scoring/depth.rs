@@ -1,10 +1,4 @@
-use anyhow::Context as _;
-use artifact::FailureExt as _;
-use metrics::{Figure, Score, Scores};
-use pixels::{ExrImage, read_exr};
-
-use crate::metric::{Measured, Metric, value};
-use crate::scored_view::{ScoredScene, ScoredView};
+use pixels::ExrImage;
 
 /// How far depth is off, in scene units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -38,52 +32,6 @@ pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> 
         median_absolute: errors[errors.len() / 2],
         missed: seen.iter().filter(|&&i| a[i] < 0.5).count() as f64 / count,
     })
-}
-
-/// [`depth_error`], where there is true depth.
-pub(crate) struct DepthMetric;
-
-impl Metric for DepthMetric {
-    fn name(&self) -> &'static str {
-        "depth"
-    }
-
-    fn figures(&self) -> Vec<Figure> {
-        vec![
-            Figure::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
-            Figure::new("depth/median_absolute", "depth error, median of pixels ↓", 4, false),
-            Figure::new("depth/missed", "share of surface missed ↓", 4, false),
-        ]
-    }
-
-    fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "z-depth in scene units, of the pixels at whose centre the truth sees a surface; missed: \
-        the share of them where the render's opacity is below one half"
-            .to_owned()
-    }
-
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let (scene, place) = (view.scene, format!("view {}", view.view.camera.name));
-        let (Some(found), Some(expected)) = (&view.view.depth, &view.true_view.depth) else {
-            return Ok(Measured::default());
-        };
-        let found = read_exr(&scene.views_in.path(found)).bad_input(&place)?;
-        let expected = read_exr(&scene.truth_in.path(expected)).bad_input(&place)?;
-        let error = depth_error(&found, &expected);
-        let error = error.context("depth needs channels Z and A of one size").bad_input(&place)?;
-        let score = Score::several([
-            ("mean_absolute", error.mean_absolute),
-            ("median_absolute", error.median_absolute),
-            ("missed", error.missed),
-        ]);
-        Ok(Measured::one(self.name(), score))
-    }
-
-    fn in_words(&self, mean: &Scores) -> Option<String> {
-        let [mean, median] =
-            ["mean_absolute", "median_absolute"].map(|part| value(mean, &format!("depth/{part}")));
-        Some(format!("depth error {:.4} mean, {:.4} median", mean?, median?))
-    }
 }
 
 #[cfg(test)]

@@ -1,8 +1,7 @@
-//! What views are scored by: a file for each metric. A new one is a file, and here its `mod` and
-//! its line in the list.
+//! All metrics. A new one is a type in this file, and its line in [`metrics`]. Long formulas have
+//! files of their own, and know nothing of [`Metric`].
 
 mod depth;
-mod low_resolution;
 #[cfg(feature = "torch")]
 mod lpips;
 mod lpips_network;
@@ -11,7 +10,13 @@ mod psnr;
 mod ssim;
 mod warp;
 
-use crate::metric::Metric;
+use anyhow::Context as _;
+use artifact::FailureExt as _;
+use metrics::{Figure, Score, Scores};
+use pixels::read_exr;
+
+use crate::metric::{Measured, Metric, value};
+use crate::scored_view::{ScoredScene, ScoredView};
 
 pub use depth::{DepthError, depth_error};
 #[cfg(feature = "torch")]
@@ -25,19 +30,203 @@ pub use warp::WarpScore;
 /// All metrics, in the order in which they are shown.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
-        Box::new(psnr::PsnrMetric),
-        Box::new(ssim::SsimMetric),
+        Box::new(PsnrMetric),
+        Box::new(SsimMetric),
         Box::new(perceptual),
-        Box::new(low_resolution::LowResolutionMetric),
-        Box::new(warp::WarpMetric),
-        Box::new(depth::DepthMetric),
+        Box::new(LowResolutionMetric),
+        Box::new(WarpMetric),
+        Box::new(DepthMetric),
     ]
+}
+
+/// [`psnr`], of the pixels that count.
+struct PsnrMetric;
+
+impl Metric for PsnrMetric {
+    fn name(&self) -> &'static str {
+        "psnr"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![Figure::new("psnr", "PSNR ↑ dB", 2, true)]
+    }
+
+    fn convention(&self, scene: &ScoredScene<'_>) -> String {
+        let is_masked = scene.truth.views.iter().any(|view| view.mask.is_some());
+        let masked = if is_masked { "; of the pixels that masks leave" } else { "" };
+        format!(
+            "-10 log10 of the mean squared error over pixels and channels in [0, 1]; prediction in \
+            half precision, clamped; mean of per-view values{masked}"
+        )
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
+        let decibels = psnr::masked_psnr(&view.found, expected, view.counted_share);
+        Ok(Measured::one("psnr", Score::One(decibels)))
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        Some(format!("PSNR {:.2} dB", value(mean, "psnr")?))
+    }
+}
+
+/// [`ssim`], by what the window does at the border.
+struct SsimMetric;
+
+impl Metric for SsimMetric {
+    fn name(&self) -> &'static str {
+        "ssim"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("ssim", "SSIM ↑", 4, true),
+            Figure::new("ssim_valid", "SSIM ↑ whole windows", 4, true),
+        ]
+    }
+
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
+        "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and \
+        pixels; borders reflected (ssim), or pixels whose window is whole (ssim_valid)"
+            .to_owned()
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
+        let Ssim { reflected, valid } = ssim(&view.found, expected);
+        let mut measured = Measured::one("ssim", Score::One(reflected));
+        measured.scores.insert("ssim_valid".to_owned(), Score::One(valid));
+        Ok(measured)
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        Some(format!("SSIM {:.4}", value(mean, "ssim")?))
+    }
+}
+
+/// PSNR and SSIM of a render shrunk to LR, by the kernel that made the LR images or is taken to
+/// have made them, against the view's LR image.
+struct LowResolutionMetric;
+
+impl Metric for LowResolutionMetric {
+    fn name(&self) -> &'static str {
+        "low_resolution"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("low_resolution/psnr", "PSNR at LR ↑ dB", 2, true),
+            Figure::new("low_resolution/ssim", "SSIM at LR ↑", 4, true),
+        ]
+    }
+
+    fn convention(&self, scene: &ScoredScene<'_>) -> String {
+        let kernel = scene.made.map_or_else(
+            || "a box, for want of a better guess".to_owned(),
+            |made| format!("{:?}", made.kernel).to_lowercase(),
+        );
+        format!("the render shrunk by {kernel}, against the view's LR picture")
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some(lr) = &view.lr else { return Ok(Measured::default()) };
+        let score = Score::several([
+            ("psnr", psnr::masked_psnr(&lr.shrunk, &lr.expected, lr.counted_share)),
+            ("ssim", ssim(&lr.shrunk, &lr.expected).reflected),
+        ]);
+        Ok(Measured::one(self.name(), score))
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        // Where there is HR truth, its figures say more.
+        if value(mean, "psnr").is_some() {
+            return None;
+        }
+        let [psnr, ssim] =
+            ["psnr", "ssim"].map(|part| value(mean, &format!("low_resolution/{part}")));
+        Some(format!("at LR: PSNR {:.2} dB · SSIM {:.4}", psnr?, ssim?))
+    }
+}
+
+/// [`warp`], where there is HR truth and rendered depth.
+struct WarpMetric;
+
+impl Metric for WarpMetric {
+    fn name(&self) -> &'static str {
+        "warp"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
+            Figure::new("warp/seen", "share that neighbours see ↑", 4, true),
+        ]
+    }
+
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
+        "the true picture of the view whose camera is nearest, brought over by both rendered \
+        depths, against the view's own, where both see the same surface (depths within 2 %, or \
+        within a pixel as the view sees them; opacity at least one half)"
+            .to_owned()
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let Some((score, picture)) = warp::warped(view)? else { return Ok(Measured::default()) };
+        let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
+        Ok(Measured { picture: Some(picture), ..Measured::one(self.name(), score) })
+    }
+}
+
+/// [`depth_error`], where there is true depth.
+struct DepthMetric;
+
+impl Metric for DepthMetric {
+    fn name(&self) -> &'static str {
+        "depth"
+    }
+
+    fn figures(&self) -> Vec<Figure> {
+        vec![
+            Figure::new("depth/mean_absolute", "depth error, mean of pixels ↓", 4, false),
+            Figure::new("depth/median_absolute", "depth error, median of pixels ↓", 4, false),
+            Figure::new("depth/missed", "share of surface missed ↓", 4, false),
+        ]
+    }
+
+    fn convention(&self, _: &ScoredScene<'_>) -> String {
+        "z-depth in scene units, of the pixels at whose centre the truth sees a surface; missed: \
+        the share of them where the render's opacity is below one half"
+            .to_owned()
+    }
+
+    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
+        let (scene, place) = (view.scene, format!("view {}", view.view.camera.name));
+        let (Some(found), Some(expected)) = (&view.view.depth, &view.true_view.depth) else {
+            return Ok(Measured::default());
+        };
+        let found = read_exr(&scene.views_in.path(found)).bad_input(&place)?;
+        let expected = read_exr(&scene.truth_in.path(expected)).bad_input(&place)?;
+        let error = depth_error(&found, &expected);
+        let error = error.context("depth needs channels Z and A of one size").bad_input(&place)?;
+        let score = Score::several([
+            ("mean_absolute", error.mean_absolute),
+            ("median_absolute", error.median_absolute),
+            ("missed", error.missed),
+        ]);
+        Ok(Measured::one(self.name(), score))
+    }
+
+    fn in_words(&self, mean: &Scores) -> Option<String> {
+        let [mean, median] =
+            ["mean_absolute", "median_absolute"].map(|part| value(mean, &format!("depth/{part}")));
+        Some(format!("depth error {:.4} mean, {:.4} median", mean?, median?))
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use metrics::Figure;
 
     /// Every figure's number is among the scores, and has a name of its own.
     #[test]

@@ -1,8 +1,4 @@
-use metrics::{Figure, Score, Scores};
 use pixels::Image;
-
-use crate::metric::{Measured, Metric, value};
-use crate::scored_view::{ScoredScene, ScoredView};
 
 /// Mean structural similarity, by what the window does at the border.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,38 +81,4 @@ fn reflected(shifted: usize, length: usize) -> usize {
     let period = 2 * (length - 1);
     let at = (shifted + period * RADIUS - RADIUS) % period;
     at.min(period - at)
-}
-
-/// [`ssim`], by what the window does at the border.
-pub(crate) struct SsimMetric;
-
-impl Metric for SsimMetric {
-    fn name(&self) -> &'static str {
-        "ssim"
-    }
-
-    fn figures(&self) -> Vec<Figure> {
-        vec![
-            Figure::new("ssim", "SSIM ↑", 4, true),
-            Figure::new("ssim_valid", "SSIM ↑ whole windows", 4, true),
-        ]
-    }
-
-    fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "Gaussian 11×11, σ 1.5, data range 1, K1 0.01, K2 0.03, f64; mean over channels and \
-        pixels; borders reflected (ssim), or pixels whose window is whole (ssim_valid)"
-            .to_owned()
-    }
-
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some(expected) = &view.expected else { return Ok(Measured::default()) };
-        let Ssim { reflected, valid } = ssim(&view.found, expected);
-        let mut measured = Measured::one("ssim", Score::One(reflected));
-        measured.scores.insert("ssim_valid".to_owned(), Score::One(valid));
-        Ok(measured)
-    }
-
-    fn in_words(&self, mean: &Scores) -> Option<String> {
-        Some(format!("SSIM {:.4}", value(mean, "ssim")?))
-    }
 }

@@ -1,10 +1,8 @@
 use artifact::{FailureExt as _, GivenInput};
-use metrics::{Figure, Score};
 use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
-use crate::metric::{Measured, Metric};
-use crate::scored_view::{ScoredScene, ScoredView, read_image};
+use crate::scored_view::{ScoredView, read_image};
 
 /// A view's true image against its neighbour's, brought over by the rendered depths: depth is right
 /// where colours agree.
@@ -63,37 +61,8 @@ fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
     Some(Surface { camera, depth: image.channel("Z")?, opacity: image.channel("A")? })
 }
 
-/// [`warp`], where there is HR truth and rendered depth.
-pub(crate) struct WarpMetric;
-
-impl Metric for WarpMetric {
-    fn name(&self) -> &'static str {
-        "warp"
-    }
-
-    fn figures(&self) -> Vec<Figure> {
-        vec![
-            Figure::new("warp/psnr", "PSNR of neighbours by depth ↑ dB", 2, true),
-            Figure::new("warp/seen", "share that neighbours see ↑", 4, true),
-        ]
-    }
-
-    fn convention(&self, _: &ScoredScene<'_>) -> String {
-        "the true picture of the view whose camera is nearest, brought over by both rendered \
-        depths, against the view's own, where both see the same surface (depths within 2 %, or \
-        within a pixel as the view sees them; opacity at least one half)"
-            .to_owned()
-    }
-
-    fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
-        let Some((score, picture)) = warped(view)? else { return Ok(Measured::default()) };
-        let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
-        Ok(Measured { picture: Some(picture), ..Measured::one(self.name(), score) })
-    }
-}
-
 /// The true image of a view's nearest neighbour, seen from the view by the rendered depths.
-fn warped(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
+pub(super) fn warped(view: &ScoredView<'_>) -> anyhow::Result<Option<(WarpScore, Rgba8)>> {
     let (scene, own_camera) = (view.scene, &view.view.camera);
     let Some(expected) = &view.expected else { return Ok(None) };
     let Some(other) = neighbour(own_camera, &scene.views.views) else { return Ok(None) };
