@@ -57,6 +57,27 @@ fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
     metrics["views"].as_array().unwrap().iter().map(|view| scored_figures(view, figures)).collect()
 }
 
+/// Paths of all numbers of some scores.
+fn paths(scores: &Value) -> Vec<String> {
+    let of_one = |(name, score): (&String, &Value)| match score.as_object() {
+        None => vec![name.clone()],
+        Some(parts) => parts.keys().map(|part| format!("{name}/{part}")).collect(),
+    };
+    scores.as_object().unwrap().iter().flat_map(of_one).collect()
+}
+
+/// Every number has a figure, without which no page would show it.
+#[track_caller]
+fn figures_name_all_numbers(metrics: &Value) {
+    let figures = metrics["figures"].as_array().unwrap();
+    for path in paths(&metrics["mean"]) {
+        assert!(
+            figures.iter().any(|figure| figure["path"] == path.as_str()),
+            "no figure of {path}"
+        );
+    }
+}
+
 #[track_caller]
 fn says(look: &Value, result: &str, metrics: &Value) {
     for (view, figures) in shown(metrics) {
@@ -92,6 +113,7 @@ fn a_page_shows_a_sweep_as_eval_scored_it() {
         let metrics = std::fs::read(folder.join("metrics.json")).unwrap();
         let metrics: Value = serde_json::from_slice(&metrics).unwrap();
         assert!(metrics["mean"]["psnr"].is_number());
+        figures_name_all_numbers(&metrics);
         looks.iter().for_each(|look| says(look, result, &metrics));
     }
     // Without the originals the page works.

@@ -27,7 +27,8 @@ pub use psnr::psnr;
 pub use ssim::{Ssim, ssim};
 pub use warp::WarpScore;
 
-/// All metrics, in the order in which they are shown.
+/// All metrics, in the order in which they are shown. The page ranks results by the first figure,
+/// and its summary has the first four.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
         Box::new(PsnrMetric),
@@ -228,7 +229,7 @@ impl Metric for DepthMetric {
 mod tests {
     use super::*;
 
-    /// Every figure's number is among the scores, and has a name of its own.
+    /// No two figures share a path or a label.
     #[test]
     fn figures_are_told_apart() {
         let all = metrics(Perceptual::new(None).unwrap());
