@@ -41,7 +41,7 @@ pub const EMPTY: f32 = 0.01;
 
 /// Weight of a sample above which its cell keeps the density found there: a random place may miss a
 /// thin surface, and the cell would become empty.
-pub const MET: f32 = 0.01;
+pub const MET: f32 = 0.03;
 
 /// Adam's decay of the two moments of gradients. The second moment forgets sooner than usual, since
 /// a grid entry is seen now and then.
