@@ -119,8 +119,8 @@ pub struct GridParams {
     #[schemars(range(min = 16, max = 8192), extend("x-group" = "sampling", "x-default" = BY_SCENE))]
     pub march_steps: Option<u32>,
     /// Weight of the distortion loss, which concentrates the sample weights along a ray. Default:
-    /// 0.004 in NDC with `background: opaque`, where empty space would otherwise fill with density;
-    /// else 0, because the loss costs detail.
+    /// with `background: opaque`, where empty space would otherwise fill with density, 0.004 in NDC
+    /// and 0.002 in a contraction; else 0, because the loss costs detail.
     #[schemars(range(min = 0.0, max = 10.0), extend("x-group" = "loss", "x-default" = BY_SCENE))]
     pub distortion: Option<f64>,
     /// Weight of the floater loss, which penalises semi-transparent density of the background's

@@ -16,8 +16,9 @@ const EPOCHS: u64 = 20;
 const EPOCHS_IN_NDC: u64 = 30;
 /// Steps of precrop of the published training on Blender's scenes.
 const PRECROP_STEPS: u32 = 1000;
-/// Weight of the distortion loss in NDC with nothing behind the scene.
+/// Weights of the distortion loss with nothing behind the scene, in NDC and in a contraction.
 const DISTORTION_IN_NDC: f64 = 0.004;
+const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 /// Weight of the floater loss before a background that has one colour.
 const FLOATER_LOSS: f64 = 0.001;
 /// How much more often detail is drawn, in random order.
@@ -267,10 +268,15 @@ impl GridParams {
     }
 
     fn regularisers(&self, scene: &SceneFacts) -> ResolvedRegularisers {
-        let is_open = scene.is_ndc() && scene.background == Background::Opaque;
+        let distortion = match scene.space {
+            _ if scene.background != Background::Opaque => 0.0,
+            Space::Ndc(_) => DISTORTION_IN_NDC,
+            Space::Contraction => DISTORTION_IN_CONTRACTION,
+            Space::Box => 0.0,
+        };
         let has_colour = matches!(scene.background, Background::White | Background::Black);
         ResolvedRegularisers {
-            distortion: self.distortion.unwrap_or(if is_open { DISTORTION_IN_NDC } else { 0.0 }),
+            distortion: self.distortion.unwrap_or(distortion),
             floater_loss: self.floater_loss.unwrap_or(if has_colour { FLOATER_LOSS } else { 0.0 }),
         }
     }
@@ -514,7 +520,9 @@ mod tests {
             (&grid, boxed, "floater_loss", json!(0.001)),
             (&grid, facts(ndc(), Background::White), "distortion", json!(0.0)),
             (&grid, facts(ndc(), Background::White), "floater_loss", json!(0.001)),
-            (&grid, facts(Space::Contraction, Background::Opaque), "distortion", json!(0.0)),
+            (&grid, facts(Space::Contraction, Background::Opaque), "distortion", json!(0.002)),
+            (&grid, facts(Space::Contraction, Background::White), "distortion", json!(0.0)),
+            (&grid, facts(Space::Box, Background::Opaque), "distortion", json!(0.0)),
             (&grid, facts(Space::Box, Background::Black), "floater_loss", json!(0.001)),
             (&grid, boxed, "march_steps", json!(512)),
             (&grid, boxed, "finest_z", json!(Architecture::default().finest_z)),
