@@ -14,8 +14,8 @@ pub(crate) trait Metric: Sync {
     fn figures(&self) -> Vec<Figure>;
     /// How its figures are made, in words.
     fn convention(&self, scene: &ScoredScene<'_>) -> String;
-    /// Scores a view; nothing where the view lacks what that needs. Pixels that don't count are
-    /// equal in both images: a mean over all pixels still needs [`ScoredView::counted_share`].
+    /// Scores a view; no scores where the view lacks what the metric needs. Pixels that don't count
+    /// are equal in both images: divide a mean over all pixels by [`ScoredView::counted_share`].
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
     /// What a line for people says of means over all views.
     fn in_words(&self, _mean: &Scores) -> Option<String> {

@@ -188,7 +188,7 @@ impl Default for GridParams {
             learning_rate: 4e-2,
             level_rate: 0.8,
             mlp_learning_rate: 1e-2,
-            learning_rate_decay: 0.1,
+            learning_rate_decay: 0.16,
             ema_decay: 0.97,
             network_decay: 1e-6,
             n_levels: grid.levels,

@@ -16,7 +16,7 @@ const EPOCHS: u64 = 20;
 const EPOCHS_IN_NDC: u64 = 30;
 /// Steps of precrop of the published training on Blender's scenes.
 const PRECROP_STEPS: u32 = 1000;
-/// Weights of the distortion loss with nothing behind the scene, in NDC and in a contraction.
+/// Weights of the distortion loss before an opaque background, in NDC and in a contraction.
 const DISTORTION_IN_NDC: f64 = 0.004;
 const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 /// Weight of the floater loss before a background that has one colour.
