@@ -15,7 +15,8 @@ pub(crate) trait Metric: Sync {
     /// How its figures are made, in words.
     fn convention(&self, scene: &ScoredScene<'_>) -> String;
     /// Scores a view; no scores where the view lacks what the metric needs. Pixels that don't count
-    /// are equal in both images: divide a mean over all pixels by [`ScoredView::counted_share`].
+    /// are equal in both images, so their error is 0: divide a mean error over all pixels by
+    /// [`ScoredView::counted_share`], at LR by that of its `lr`.
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
     /// What a line for people says of means over all views.
     fn in_words(&self, _mean: &Scores) -> Option<String> {

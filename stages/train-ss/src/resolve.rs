@@ -268,11 +268,10 @@ impl GridParams {
     }
 
     fn regularisers(&self, scene: &SceneFacts) -> ResolvedRegularisers {
-        let distortion = match scene.space {
-            _ if scene.background != Background::Opaque => 0.0,
-            Space::Ndc(_) => DISTORTION_IN_NDC,
-            Space::Contraction => DISTORTION_IN_CONTRACTION,
-            Space::Box => 0.0,
+        let distortion = match (scene.background, scene.space) {
+            (Background::Opaque, Space::Ndc(_)) => DISTORTION_IN_NDC,
+            (Background::Opaque, Space::Contraction) => DISTORTION_IN_CONTRACTION,
+            (_, Space::Ndc(_) | Space::Contraction | Space::Box) => 0.0,
         };
         let has_colour = matches!(scene.background, Background::White | Background::Black);
         ResolvedRegularisers {

@@ -1,5 +1,5 @@
 //! All metrics. A new one is a type in this file, and its line in [`metrics`]. Long formulas have
-//! files of their own, and know nothing of [`Metric`].
+//! files of their own. Only LPIPS, which holds networks, implements [`Metric`] elsewhere.
 
 mod depth;
 #[cfg(feature = "torch")]
@@ -28,7 +28,7 @@ pub use ssim::{Ssim, ssim};
 pub use warp::WarpScore;
 
 /// All metrics, in the order in which they are shown. The page ranks results by the first figure,
-/// and its summary has the first four.
+/// and its summary has the first four that have a value.
 pub(crate) fn metrics(perceptual: Perceptual) -> Vec<Box<dyn Metric>> {
     vec![
         Box::new(PsnrMetric),
@@ -150,7 +150,7 @@ impl Metric for LowResolutionMetric {
     }
 }
 
-/// [`warp`], where there is HR truth and rendered depth.
+/// [`WarpScore`], where there is HR truth and rendered depth.
 struct WarpMetric;
 
 impl Metric for WarpMetric {
