@@ -57,20 +57,19 @@ fn shown(metrics: &Value) -> BTreeMap<String, BTreeMap<String, String>> {
     metrics["views"].as_array().unwrap().iter().map(|view| scored_figures(view, figures)).collect()
 }
 
-/// Paths of all numbers of some scores.
-fn paths(scores: &Value) -> Vec<String> {
-    let of_one = |(name, score): (&String, &Value)| match score.as_object() {
+/// Paths of a score's numbers.
+fn paths((name, score): (&String, &Value)) -> Vec<String> {
+    match score.as_object() {
         None => vec![name.clone()],
         Some(parts) => parts.keys().map(|part| format!("{name}/{part}")).collect(),
-    };
-    scores.as_object().unwrap().iter().flat_map(of_one).collect()
+    }
 }
 
 /// Every number has a figure, without which no page would show it.
 #[track_caller]
 fn figures_name_all_numbers(metrics: &Value) {
     let figures = metrics["figures"].as_array().unwrap();
-    for path in paths(&metrics["mean"]) {
+    for path in metrics["mean"].as_object().unwrap().iter().flat_map(paths) {
         assert!(
             figures.iter().any(|figure| figure["path"] == path.as_str()),
             "no figure of {path}"
