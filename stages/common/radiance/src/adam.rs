@@ -89,6 +89,15 @@ kernel! {
     }
 }
 
+kernel! {
+    /// Takes weights into their running average, which gets `share` of what is new.
+    pub(crate) fn take_into_average<L>(average: &mut [f32], now: &[f32], share: f32) {
+        for (average, now) in average.iter_mut().zip(now) {
+            *average = share.mul_add(now - *average, *average);
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use counter_rng::uniform;

@@ -17,17 +17,29 @@ pub(crate) struct March<'a> {
     pub(crate) offsets: &'a [f32],
     /// Distance between samples, in cube sides.
     pub(crate) step: f32,
-    /// Whether thin cells get fewer samples.
     pub(crate) strides: Strides,
 }
 
-/// Where rays take samples in thin cells.
+/// Where rays take a sample at every step, and where at every other step, each for both.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Strides {
-    /// At every step, as in dense cells: to render.
+    /// At every step: to render.
     Even,
-    /// At every other step, each for both: to train, where samples of other rays lie in between.
+    /// At every other step in thin cells: to train, where samples of other rays lie in between.
     ByCell,
+    /// At every other step: to begin a training, while density is smooth and nothing is empty.
+    Double,
+}
+
+impl Strides {
+    /// Whether samples in a thin cell, or in a dense one, stand for two steps.
+    fn are_double_in(self, thin: bool) -> bool {
+        match self {
+            Self::Even => false,
+            Self::ByCell => thin,
+            Self::Double => true,
+        }
+    }
 }
 
 /// Samples found by marching, ray by ray.
@@ -107,72 +119,93 @@ impl EmptyCube {
 /// more than all else.
 const STEPS_AHEAD: usize = 8;
 
-/// Marches a ray on from step `k`, `AHEAD` places at a time; gives its next step.
-#[inline(always)]
-fn march_ray<const AHEAD: usize>(
-    march: &March<'_>,
-    ray: usize,
-    most: usize,
-    mut k: u32,
-    samples: &mut Marched,
-) -> u32 {
-    let March { occupancy, step, .. } = *march;
-    let (ray, offset) = (&march.rays[ray], march.offsets[ray]);
-    let is_even = march.strides == Strides::Even;
-    let (per_step, inverse) = (1.0 / step, ray.direction.map(|d| 1.0 / d));
-    let mut left = most;
-    while left > 0 {
-        let first = k;
-        let ahead: [f32; AHEAD] =
-            std::array::from_fn(|i| (first as f32 + i as f32 + offset).mul_add(step, ray.enter));
-        let places = ray.positions(&ahead);
-        while left > 0 && ((k - first) as usize) < AHEAD {
-            let at = ahead[(k - first) as usize];
-            if at >= ray.leave {
-                return DONE;
-            }
-            let p = places.map(|axis| axis[(k - first) as usize]);
-            match occupancy.held(cell_of(p)) {
-                Held::Empty(cube) => {
-                    // Where the ray leaves what is empty; at least one step on.
-                    let exit = cube.exit(ray, &inverse, at, &p);
-                    let onwards = (exit - ray.enter).mul_add(per_step, -offset).ceil();
-                    // `as` saturates: an exit that is NaN or infinite moves on by one step.
-                    k = (k + 1).max(if onwards.is_finite() { onwards as u32 } else { 0 });
-                    continue;
+/// One ray's march.
+struct RayMarch<'a> {
+    march: &'a March<'a>,
+    ray: &'a NormalizedRay,
+    offset: f32,
+    /// 1 over the ray's direction.
+    inverse: [f32; 3],
+    /// Behind this t there is nothing.
+    until: f32,
+}
+
+impl RayMarch<'_> {
+    /// The first step at t or behind it. A t that isn't finite has the first step of all.
+    #[inline(always)]
+    fn step_at(&self, t: f32) -> u32 {
+        let step = (t - self.ray.enter).mul_add(1.0 / self.march.step, -self.offset).ceil();
+        if step.is_finite() { step as u32 } else { 0 }
+    }
+
+    /// Marches on from step `k`, `AHEAD` places at a time; gives the next step.
+    #[inline(always)]
+    fn run<const AHEAD: usize>(&self, most: usize, mut k: u32, samples: &mut Marched) -> u32 {
+        let March { occupancy, step, strides, .. } = *self.march;
+        let (ray, offset) = (self.ray, self.offset);
+        let mut left = most;
+        while left > 0 {
+            let first = k;
+            let ahead: [f32; AHEAD] = std::array::from_fn(|i| {
+                (first as f32 + i as f32 + offset).mul_add(step, ray.enter)
+            });
+            let places = ray.positions(&ahead);
+            while left > 0 && ((k - first) as usize) < AHEAD {
+                let at = ahead[(k - first) as usize];
+                if at >= self.until {
+                    return DONE;
                 }
-                Held::Thin if !is_even => {
-                    let middle = (k as f32 + offset + 0.5).mul_add(step, ray.enter);
-                    if k & 1 == 0 && middle < ray.leave {
-                        samples.push(middle, 2.0, ray.position(middle));
+                let p = places.map(|axis| axis[(k - first) as usize]);
+                match occupancy.held(cell_of(p)) {
+                    Held::Empty(cube) => {
+                        // Where the ray leaves what is empty; at least one step on.
+                        k = (k + 1).max(self.step_at(cube.exit(ray, &self.inverse, at, &p)));
+                        continue;
+                    }
+                    held if strides.are_double_in(matches!(held, Held::Thin)) => {
+                        let middle = (k as f32 + offset + 0.5).mul_add(step, ray.enter);
+                        if k & 1 == 0 && middle < ray.leave {
+                            samples.push(middle, 2.0, ray.position(middle));
+                            left -= 1;
+                        }
+                    }
+                    Held::Thin | Held::Dense => {
+                        samples.push(at, 1.0, p);
                         left -= 1;
                     }
                 }
-                Held::Thin | Held::Dense => {
-                    samples.push(at, 1.0, p);
-                    left -= 1;
-                }
+                k += 1;
             }
-            k += 1;
         }
+        k
     }
-    k
 }
 
 kernel! {
     /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies
-    /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; by
-    /// [`Strides::ByCell`], a thin one gives a sample of two steps where k is even, in the middle
-    /// of both. `next` is each ray's k, from 0 to [`DONE`].
+    /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; where [`Strides`]
+    /// are double, it gives a sample of two steps where k is even, in the middle of both. `next` is each ray's k, from 0 to [`DONE`].
     pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
         samples: &mut Marched) {
         for &r in active {
             samples.starts.push(samples.t.len());
-            let (ray, next) = (r as usize, &mut next[r as usize]);
-            *next = match march.rays[ray].map {
-                RayMap::Straight { .. } => march_ray::<1>(march, ray, most, *next, samples),
+            let (ray, offset) = (march.rays[r as usize], march.offsets[r as usize]);
+            let next = &mut next[r as usize];
+            let inverse = ray.direction.map(|d| 1.0 / d);
+            *next = match ray.map {
+                RayMap::Straight { .. } => match march.occupancy.crossing(&ray, &inverse) {
+                    None => DONE,
+                    Some([from, until]) => {
+                        // Without the constant the compiler takes an exponential here, too.
+                        let ray = &NormalizedRay { map: RayMap::default(), ..ray };
+                        let one = RayMarch { march, ray, offset, inverse, until };
+                        one.run::<1>(most, one.step_at(from).max(*next), samples)
+                    }
+                },
                 RayMap::Contracted { .. } => {
-                    march_ray::<STEPS_AHEAD>(march, ray, most, *next, samples)
+                    let until = ray.leave;
+                    let one = RayMarch { march, ray: &ray, offset, inverse, until };
+                    one.run::<STEPS_AHEAD>(most, *next, samples)
                 }
             };
         }
@@ -187,27 +220,35 @@ mod tests {
     use counter_rng::CounterRng;
 
     /// What step k of a ray gives, without leaps: a sample's t and its length.
-    fn sample(occupancy: &Occupancy, ray: &NormalizedRay, step: f32, k: u32) -> Option<(f32, f32)> {
+    fn sample(march: &March<'_>, k: u32) -> Option<(f32, f32)> {
+        let March { occupancy, rays: &[ray], step, strides, .. } = *march else {
+            panic!("one ray at a time");
+        };
         let t = (k as f32 + 0.3).mul_add(step, ray.enter);
         let middle = (k as f32 + 0.3 + 0.5).mul_add(step, ray.enter);
         let c = cell_of(ray.position(t));
-        match occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2])) {
-            Cell::Dense if t < ray.leave => Some((t, 1.0)),
-            Cell::Thin if k.is_multiple_of(2) && middle < ray.leave => Some((middle, 2.0)),
-            _ => None,
+        let held = occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2]));
+        if held == Cell::Empty || t >= ray.leave {
+            None
+        } else if strides.are_double_in(held == Cell::Thin) {
+            (k.is_multiple_of(2) && middle < ray.leave).then_some((middle, 2.0))
+        } else {
+            Some((t, 1.0))
         }
     }
 
+    const STRIDES: [Strides; 3] = [Strides::Even, Strides::ByCell, Strides::Double];
+
     /// All samples of a ray without leaps, and those found by marching in parts, as the renderer
     /// does.
-    fn both(occupancy: &Occupancy, ray: NormalizedRay, step: f32) -> [Vec<(f32, f32)>; 2] {
+    fn both(occupancy: &Occupancy, ray: NormalizedRay, strides: Strides) -> [Vec<(f32, f32)>; 2] {
         let (mut next, mut found) = ([0], Marched::default());
-        let strides = Strides::ByCell;
+        let step = 3.0f32.sqrt() / 512.0;
         let march_on = March { occupancy, rays: &[ray], offsets: &[0.3], step, strides };
         while next[0] != DONE {
             march(&march_on, 5, &[0], &mut next, &mut found);
         }
-        let expected = (0..2000).filter_map(|k| sample(occupancy, &ray, step, k)).collect();
+        let expected = (0..2000).filter_map(|k| sample(&march_on, k)).collect();
         [expected, found.t.into_iter().zip(found.lengths).collect()]
     }
 
@@ -219,7 +260,6 @@ mod tests {
             _ if (cell / GRID).is_multiple_of(2) => Cell::Thin,
             _ => Cell::Dense,
         });
-        let step = 3.0f32.sqrt() / 512.0;
         for seed in 0..200 {
             let mut rng = CounterRng::new(1, 2, seed);
             let mut unit = || rng.uniform();
@@ -234,7 +274,7 @@ mod tests {
                 })
                 .fold(f32::INFINITY, f32::min);
             let ray = NormalizedRay { origin, direction, leave, ..NormalizedRay::default() };
-            let [expected, found] = both(&occupancy, ray, step);
+            let [expected, found] = both(&occupancy, ray, STRIDES[seed as usize % 3]);
             // Rounding at a face may move one sample in a thousand across it.
             let missing = expected.iter().filter(|t| !found.contains(t)).count();
             assert!(missing * 100 <= expected.len(), "{missing} of {} lost", expected.len());
@@ -258,11 +298,10 @@ mod tests {
             Some(ball) if ball % 3 == 0 => Cell::Thin,
             Some(_) => Cell::Dense,
         });
-        let step = 3.0f32.sqrt() / 512.0;
         let mut samples = 0;
         for seed in 0..600 {
             let ray = bent_ray(seed, [0.5, 1.5, 8.0][seed as usize % 3]);
-            let [expected, found] = both(&occupancy, ray, step);
+            let [expected, found] = both(&occupancy, ray, STRIDES[seed as usize % 3]);
             samples += expected.len();
             assert!(expected == found, "{ray:?}: {} and {}", expected.len(), found.len());
         }

@@ -4,6 +4,8 @@
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
+use crate::march::Strides;
+use crate::ray::NormalizedRay;
 use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
 
 /// Cells in all.
@@ -25,9 +27,9 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 const STEPS_PER_UPDATE: u64 = 32;
 /// An update looks at one occupied cell in so many, and at one empty cell in so many.
 const OCCUPIED_TURNS: usize = 4;
-const EMPTY_TURNS: usize = 16;
-/// Until this step empty cells are looked at as often as occupied ones.
-const WARM_UP_STEPS: u64 = 512;
+const EMPTY_TURNS: usize = 32;
+/// Until this step empty cells are looked at as often as occupied ones: each cell once.
+const WARM_UP_STEPS: u64 = STEPS_PER_UPDATE * OCCUPIED_TURNS as u64;
 /// Share of a density that is left when its cell is looked at again.
 const KEPT_SHARE: f32 = 0.7;
 
@@ -126,6 +128,8 @@ pub struct Occupancy {
     blocks: Vec<u64>,
     /// A bit a dense cell.
     dense: Vec<u64>,
+    /// Lowest and highest corner of the bricks that hold something, in the unit cube.
+    extent: [[f32; 3]; 2],
 }
 
 impl Occupancy {
@@ -137,6 +141,7 @@ impl Occupancy {
             bricks: Vec::new(),
             blocks: Vec::new(),
             dense: Vec::new(),
+            extent: [[0.0; 3], [1.0; 3]],
         };
         full.set(|_| Cell::Dense);
         full
@@ -195,6 +200,16 @@ impl Occupancy {
         };
         let wanted = (cell % (GRID * GRID) + z) % turns == turn % turns;
         allowed && wanted
+    }
+
+    /// How rays take samples at a step of a training: until every cell is known, by double strides.
+    /// A training that goes on from another's field knows where it is.
+    pub fn strides(&self, step: u64) -> Strides {
+        if step < WARM_UP_STEPS && self.allowed.is_none() {
+            Strides::Double
+        } else {
+            Strides::ByCell
+        }
     }
 
     /// Where in a cell to look at that step, in the unit cube.
@@ -276,10 +291,17 @@ impl Occupancy {
 
     fn set_words(&mut self, bricks: Vec<u64>, dense: Vec<u64>) {
         self.blocks = vec![0; BLOCKS * BLOCKS * BLOCKS];
+        let (mut low, mut high) = ([BRICKS; 3], [0; 3]);
         for brick in (0..bricks.len()).filter(|&brick| bricks[brick] != 0) {
-            let (word, bit) = place(corner(brick, BRICKS), BLOCKS);
+            let at = corner(brick, BRICKS);
+            let (word, bit) = place(at, BLOCKS);
             self.blocks[word] |= 1 << bit;
+            for axis in 0..3 {
+                low[axis] = low[axis].min(at[axis]);
+                high[axis] = high[axis].max(at[axis] + 1);
+            }
         }
+        self.extent = [low, high].map(|at| at.map(|brick| brick as f32 / BRICKS as f32));
         (self.bricks, self.dense) = (bricks, dense);
     }
 
@@ -305,7 +327,7 @@ impl Occupancy {
     }
 }
 
-/// A cube of empty cells: a cell, a brick or a block.
+/// A cube of empty cells: a cell, a brick, a block, or an eighth of a brick or block.
 #[derive(Clone, Copy)]
 pub(crate) struct EmptyCube {
     /// Its first cell along each axis.
@@ -321,7 +343,34 @@ pub(crate) enum Held {
     Dense,
 }
 
+/// The first 2³ bits of a word's 4³, and which bits the number of an eighth's first one has.
+const EIGHTH: u64 = 0x33_0033;
+const FIRST_OF_EIGHTH: usize = 0b10_1010;
+/// By how much a ray may pass the extent beside: more than positions are rounded by.
+const MARGIN: f32 = 1e-5;
+
 impl Occupancy {
+    /// The range of t in which a straight ray passes the bricks that hold something, a little
+    /// widened; `None` where it passes beside. `inverse` is 1 over its direction.
+    #[inline(always)]
+    pub(crate) fn crossing(&self, ray: &NormalizedRay, inverse: &[f32; 3]) -> Option<[f32; 2]> {
+        let [low, high] = self.extent;
+        let (mut from, mut to) = (ray.enter, ray.leave);
+        for axis in 0..3 {
+            let (origin, slope) = (ray.origin[axis], ray.direction[axis]);
+            let (low, high) = (low[axis] - MARGIN, high[axis] + MARGIN);
+            if slope == 0.0 {
+                if origin < low || origin > high {
+                    return None;
+                }
+                continue;
+            }
+            let (a, b) = ((low - origin) * inverse[axis], (high - origin) * inverse[axis]);
+            (from, to) = (from.max(a.min(b)), to.min(a.max(b)));
+        }
+        (from < to).then_some([from, to])
+    }
+
     /// What a cell holds; of empty ones, as many around it as are empty together.
     #[inline(always)]
     pub(crate) fn held(&self, cell: [usize; 3]) -> Held {
@@ -332,8 +381,13 @@ impl Occupancy {
         if bricks == 0 {
             let low = brick.map(|b| b / SIDE * (SIDE * SIDE));
             Held::Empty(EmptyCube { low, side: SIDE * SIDE })
+        } else if bricks & EIGHTH << (brick_bit & FIRST_OF_EIGHTH) == 0 {
+            let low = brick.map(|b| b / 2 * (2 * SIDE));
+            Held::Empty(EmptyCube { low, side: 2 * SIDE })
         } else if bricks >> brick_bit & 1 == 0 {
             Held::Empty(EmptyCube { low: brick.map(|b| b * SIDE), side: SIDE })
+        } else if self.bricks[brick_word] & EIGHTH << (cell_bit & FIRST_OF_EIGHTH) == 0 {
+            Held::Empty(EmptyCube { low: cell.map(|c| c / 2 * 2), side: 2 })
         } else if self.bricks[brick_word] >> cell_bit & 1 == 0 {
             Held::Empty(EmptyCube { low: cell, side: 1 })
         } else if self.dense[brick_word] >> cell_bit & 1 == 1 {
@@ -353,11 +407,14 @@ mod tests {
     #[test]
     fn going_on_stays_where_something_was() {
         let mut occupancy = Occupancy::full();
+        assert_eq!(occupancy.strides(WARM_UP_STEPS - 1), Strides::Double);
+        assert_eq!(occupancy.strides(WARM_UP_STEPS), Strides::ByCell);
         let cell = |x: usize, y: usize, z: usize| x + GRID * (y + GRID * z);
         let (inside, corner) = (cell(5, 60, 70), cell(0, GRID - 1, 0));
         occupancy.set(|c| if c == inside || c == corner { Cell::Thin } else { Cell::Empty });
         occupancy.limit_to_occupied();
         assert_eq!(occupancy.cells().count(), 27 + 8);
+        assert_eq!(occupancy.strides(0), Strides::ByCell);
         let mut mask = vec![true; CELLS];
         mask[cell(6, 61, 71)] = false;
         occupancy.limit_to(mask);

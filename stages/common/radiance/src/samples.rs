@@ -174,7 +174,9 @@ impl Samples {
     fn take_samples(&mut self, rays: &March<'_>, counted: usize) -> Round {
         let most = match rays.strides {
             Strides::Even => RENDERING_ROUND,
-            Strides::ByCell => TRAINING_ROUNDS[self.rounds.len().min(TRAINING_ROUNDS.len() - 1)],
+            Strides::ByCell | Strides::Double => {
+                TRAINING_ROUNDS[self.rounds.len().min(TRAINING_ROUNDS.len() - 1)]
+            }
         };
         let start = self.marched.t.len();
         self.marched.starts.clear();

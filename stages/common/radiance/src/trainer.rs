@@ -6,7 +6,7 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use crate::adam::{AdamStep, adam};
+use crate::adam::{AdamStep, adam, take_into_average};
 use crate::aligned::Aligned;
 use crate::field::Field;
 use crate::grid::scatter;
@@ -52,6 +52,8 @@ pub enum TrainingError {
 const SHARDS: usize = 32;
 /// Blocks of a level that the optimiser takes in one piece.
 const ADAM_BLOCKS: usize = 1 << 12;
+/// Weights that are taken into their average in one piece.
+const AVERAGE_PIECE: usize = 1 << 16;
 
 /// Trains a [`Field`] by Adam.
 pub struct Trainer {
@@ -182,6 +184,7 @@ impl Trainer {
             transposed: &self.transposed,
             supervision,
             options: &self.options,
+            strides: self.field.occupancy.strides(self.tally.steps),
             first_bundle: self.tally.bundles,
             first_ray: self.tally.rays,
             bundles,
@@ -285,14 +288,12 @@ impl Trainer {
             grid: field.grid.clone(),
             network: field.network.clone(),
         });
-        let new = 1.0 - self.options.ema_decay;
+        let share = 1.0 - self.options.ema_decay;
         let pairs = [(&mut average.grid, &field.grid), (&mut average.network, &field.network)];
         for (average, now) in pairs {
-            average
-                .par_iter_mut()
-                .with_min_len(1 << 16)
-                .zip(&**now)
-                .for_each(|(a, w)| *a = new.mul_add(w - *a, *a));
+            (average.par_chunks_mut(AVERAGE_PIECE), now.par_chunks(AVERAGE_PIECE))
+                .into_par_iter()
+                .for_each(|(average, now)| take_into_average(average, now, share));
         }
     }
 

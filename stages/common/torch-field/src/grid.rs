@@ -314,7 +314,7 @@ impl TorchGrid {
         let outputs = outputs.f_index_select(0, &shaded)?;
         let met = match strides {
             Strides::Even => Vec::new(),
-            Strides::ByCell => no_grad(|| {
+            Strides::ByCell | Strides::Double => no_grad(|| {
                 cells_met(&weight, &positions.f_index_select(0, &shaded)?, &outputs.i((.., 0)))
             })?,
         };
@@ -350,18 +350,19 @@ impl TorchGrid {
         let held = self
             .held(&maps.positions(&t)?)?
             .f_where_self(&t.f_lt_tensor(&maps.leave)?, &t.f_zeros_like()?)?;
-        // Every other step of a thin cell is one sample, in the middle of both.
-        let thin = match strides {
+        // There every other step is one sample, in the middle of both.
+        let double = match strides {
             // Nowhere.
             Strides::Even => held.f_lt(0.0)?,
             Strides::ByCell => held.f_eq(1.0)?,
+            Strides::Double => held.f_gt(0.0)?,
         };
         let middle = at(&k.f_add_scalar(0.5)?)?;
         let (t, length) =
-            (middle.f_where_self(&thin, &t)?, thin.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
+            (middle.f_where_self(&double, &t)?, double.f_to_kind(Kind::Float)?.f_add_scalar(1.0)?);
         let odd = steps.f_remainder(2.0)?.f_ne(0.0)?;
         let inside = held.f_gt(0.0)?.f_logical_and(&t.f_lt_tensor(&maps.leave)?)?;
-        let inside = inside.f_logical_and(&thin.f_logical_and(&odd)?.f_logical_not()?)?;
+        let inside = inside.f_logical_and(&double.f_logical_and(&odd)?.f_logical_not()?)?;
         let kept = inside.f_reshape([-1])?.f_nonzero()?.f_squeeze_dim(-1)?;
         let positions = maps.positions(&t)?.f_reshape([-1, 3])?.f_index_select(0, &kept)?;
         let length = length.f_reshape([-1])?.f_index_select(0, &kept)?.f_mul_scalar(self.step())?;

@@ -2,7 +2,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
-use radiance::{Field, Met, Occupancy, StepReport, Strides, Supervisor, Tally, TrainingOptions};
+use radiance::{Field, Met, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
 use tch::{Device, TchError, Tensor, no_grad};
 
 use crate::TorchFieldError;
@@ -147,7 +147,7 @@ impl GridTrainer {
         let offsets: Vec<f32> =
             (first..).take(rays.len()).map(|r| self.options.offset(r)).collect();
         let offsets = Tensor::f_from_slice(&offsets)?.f_to_device(self.grid.device)?;
-        let seen = self.grid.see(&rays, &offsets, Strides::ByCell)?;
+        let seen = self.grid.see(&rays, &offsets, self.occupancy.strides(self.tally.steps))?;
         let backgrounds: Vec<f32> = rays.iter().flat_map(|r| r.background).collect();
         let backgrounds = Tensor::f_from_slice(&backgrounds)?
             .f_reshape([-1, 3])?

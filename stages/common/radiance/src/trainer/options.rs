@@ -10,7 +10,7 @@ const AVERAGE_FROM: f64 = 0.7;
 
 /// Samples of the last step over those of the first. Small steps find the shape early; later, larger
 /// steps have less noise.
-const STEP_GROWTH: f64 = 4.0;
+const STEP_GROWTH: f64 = 8.0 / 3.0;
 
 /// How to train.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,7 +19,7 @@ pub struct TrainingOptions {
     pub rays: u64,
     /// Most rays in a step.
     pub max_rays_per_step: usize,
-    /// Samples that the first steps aim at; the last steps aim at four times as many. While space is
+    /// Samples that the first steps aim at; the last steps aim at 8/3 times as many. While space is
     /// full of semi-transparent density, steps have fewer rays.
     pub samples_per_step: usize,
     /// Learning rate of the grid's coarsest level at its highest.

@@ -16,6 +16,7 @@ pub(super) struct StepWork<'a, S> {
     pub(super) transposed: &'a [f32],
     pub(super) supervision: &'a S,
     pub(super) options: &'a TrainingOptions,
+    pub(super) strides: Strides,
     pub(super) first_bundle: u64,
     pub(super) first_ray: u64,
     /// Bundles of the step.
@@ -93,7 +94,7 @@ impl Shard {
         let first_ray = work.first_ray + (here.start * bundle) as u64;
         worker.offsets.clear();
         worker.offsets.extend((0..rays as u64).map(|r| options.offset(first_ray + r)));
-        worker.chunk.forward(field, &worker.clipped, &worker.offsets, Strides::ByCell);
+        worker.chunk.forward(field, &worker.clipped, &worker.offsets, work.strides);
         self.samples += worker.chunk.samples();
         worker.chunk.list_met(field.step(), &mut self.met);
         for (colour, (sum, background)) in
