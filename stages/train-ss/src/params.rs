@@ -94,7 +94,7 @@ pub struct GridParams {
     /// Maximum number of rays in a step.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
-    /// Number of samples that the first steps aim at. The last steps aim at four times as many.
+    /// Number of samples that the first steps aim at. The last steps aim at 8/3 times as many.
     /// Steps have fewer rays while space is full of semi-transparent density.
     #[schemars(range(min = 1024, max = 16_777_216), extend("x-group" = "sampling"))]
     pub samples_per_step: u32,
@@ -177,7 +177,7 @@ impl Default for GridParams {
         Self {
             rays: 30_000_000,
             max_rays_per_step: 8_192,
-            samples_per_step: 16_384,
+            samples_per_step: 24_576,
             order: Order::Random,
             pixel_importance: None,
             supersample_warmup: 0.3,
@@ -185,7 +185,7 @@ impl Default for GridParams {
             march_steps: None,
             distortion: None,
             floater_loss: None,
-            learning_rate: 4e-2,
+            learning_rate: 6e-2,
             level_rate: 0.8,
             mlp_learning_rate: 1e-2,
             learning_rate_decay: 0.16,
