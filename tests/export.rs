@@ -39,7 +39,7 @@ fn short_training() -> Project {
     project.replace("{lr_width: 24, scale: 2}", "{scale: 2}");
     let text = std::fs::read_to_string(project.path("base/pipeline.yaml")).unwrap();
     let line = text.lines().find(|line| line.contains("n_levels")).unwrap();
-    project.replace(line, "    parameters: {rays: 600000}");
+    project.replace(line, "    parameters: {rays: 800000}");
     project
 }
 

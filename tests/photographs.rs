@@ -313,7 +313,7 @@ fn poses_are_refined_and_test_views_registered() {
     }
     std::fs::write(&file, transforms.to_string()).unwrap();
     project.replace("    parameters: {lr_width: 24, scale: 2}\n", "");
-    project.replace("rays: 60000", "rays: 600000");
+    project.replace("rays: 60000", "rays: 900000");
     let ([as_given, only_registered], [only_refined, both]) = (
         scored_registered(&project, "pose_refinement=false"),
         scored_registered(&project, "pose_refinement=true"),

@@ -14,7 +14,7 @@ use common::{
 /// The shipped targets at tiny sizes.
 const REFINED: &str = "
   downscaled-field:
-    parameters: {rays: 40000}
+    parameters: {rays: 80000}
   train-refine:
     parameters: {steps: 60, batch: 4, patch_size: 16, features: 8, blocks: 1}
   upsample:
