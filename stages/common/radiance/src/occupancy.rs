@@ -27,9 +27,11 @@ fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
 const STEPS_PER_UPDATE: u64 = 32;
 /// An update looks at one occupied cell in so many, and at one empty cell in so many.
 const OCCUPIED_TURNS: usize = 4;
-const EMPTY_TURNS: usize = 32;
-/// Until this step empty cells are looked at as often as occupied ones: each cell once.
-const WARM_UP_STEPS: u64 = STEPS_PER_UPDATE * OCCUPIED_TURNS as u64;
+const EMPTY_TURNS: usize = 16;
+/// Until this step empty cells are looked at as often as occupied ones.
+const WARM_UP_STEPS: u64 = 512;
+/// By this step each cell has been looked at.
+const KNOWN_FROM: u64 = STEPS_PER_UPDATE * OCCUPIED_TURNS as u64;
 /// Share of a density that is left when its cell is looked at again.
 const KEPT_SHARE: f32 = 0.7;
 
@@ -205,11 +207,7 @@ impl Occupancy {
     /// How rays take samples at a step of a training: until every cell is known, by double strides.
     /// A training that goes on from another's field knows where it is.
     pub fn strides(&self, step: u64) -> Strides {
-        if step < WARM_UP_STEPS && self.allowed.is_none() {
-            Strides::Double
-        } else {
-            Strides::ByCell
-        }
+        if step < KNOWN_FROM && self.allowed.is_none() { Strides::Double } else { Strides::ByCell }
     }
 
     /// Where in a cell to look at that step, in the unit cube.
@@ -407,8 +405,8 @@ mod tests {
     #[test]
     fn going_on_stays_where_something_was() {
         let mut occupancy = Occupancy::full();
-        assert_eq!(occupancy.strides(WARM_UP_STEPS - 1), Strides::Double);
-        assert_eq!(occupancy.strides(WARM_UP_STEPS), Strides::ByCell);
+        assert_eq!(occupancy.strides(KNOWN_FROM - 1), Strides::Double);
+        assert_eq!(occupancy.strides(KNOWN_FROM), Strides::ByCell);
         let cell = |x: usize, y: usize, z: usize| x + GRID * (y + GRID * z);
         let (inside, corner) = (cell(5, 60, 70), cell(0, GRID - 1, 0));
         occupancy.set(|c| if c == inside || c == corner { Cell::Thin } else { Cell::Empty });
