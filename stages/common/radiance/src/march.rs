@@ -20,14 +20,14 @@ pub(crate) struct March<'a> {
     pub(crate) strides: Strides,
 }
 
-/// Where rays take a sample at every step, and where at every other step, each for both.
+/// Whether rays take a sample at every step, or one of double length at every other step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Strides {
     /// At every step: to render.
     Even,
     /// At every other step in thin cells: to train, where samples of other rays lie in between.
     ByCell,
-    /// At every other step: to begin a training, while density is smooth and nothing is empty.
+    /// At every other step: to begin a training, while density is smooth and little is empty.
     Double,
 }
 
@@ -196,7 +196,8 @@ kernel! {
                 RayMap::Straight { .. } => match march.occupancy.crossing(&ray, &inverse) {
                     None => DONE,
                     Some([from, until]) => {
-                        // Without the constant the compiler takes an exponential here, too.
+                        // Without the constant the compiler computes the exponential of bent rays
+                        // here, too.
                         let ray = &NormalizedRay { map: RayMap::default(), ..ray };
                         let one = RayMarch { march, ray, offset, inverse, until };
                         one.run::<1>(most, one.step_at(from).max(*next), samples)

@@ -299,6 +299,10 @@ impl Occupancy {
                 high[axis] = high[axis].max(at[axis] + 1);
             }
         }
+        if low == [BRICKS; 3] {
+            // Nothing: an extent without an inside.
+            low = high;
+        }
         self.extent = [low, high].map(|at| at.map(|brick| brick as f32 / BRICKS as f32));
         (self.bricks, self.dense) = (bricks, dense);
     }
@@ -341,10 +345,12 @@ pub(crate) enum Held {
     Dense,
 }
 
-/// The first 2³ bits of a word's 4³, and which bits the number of an eighth's first one has.
+/// The first 2³ bits of a word's 4³. The other mask keeps, of a bit's number, what says in which
+/// eighth the bit is.
 const EIGHTH: u64 = 0x33_0033;
 const FIRST_OF_EIGHTH: usize = 0b10_1010;
-/// By how much a ray may pass the extent beside: more than positions are rounded by.
+/// How far outside the extent a ray may pass and still march, for an origin within the unit cube:
+/// more than positions are rounded by.
 const MARGIN: f32 = 1e-5;
 
 impl Occupancy {
@@ -356,7 +362,8 @@ impl Occupancy {
         let (mut from, mut to) = (ray.enter, ray.leave);
         for axis in 0..3 {
             let (origin, slope) = (ray.origin[axis], ray.direction[axis]);
-            let (low, high) = (low[axis] - MARGIN, high[axis] + MARGIN);
+            let margin = MARGIN * (1.0 + origin.abs());
+            let (low, high) = (low[axis] - margin, high[axis] + margin);
             if slope == 0.0 {
                 if origin < low || origin > high {
                     return None;

@@ -438,7 +438,7 @@ mod tests {
         [cell % 128, cell / 128 % 128, cell / 128 / 128].iter().all(|c| (44..84).contains(c))
     }
 
-    fn field(space: Space) -> Field {
+    fn new_field(space: Space) -> Field {
         let architecture = Architecture {
             finest: 32,
             levels: 4,
@@ -447,13 +447,37 @@ mod tests {
             steps: 64,
             ..Architecture::default()
         };
-        let mut field = Field::new(architecture, bounds(space), 5);
+        Field::new(architecture, bounds(space), 5)
+    }
+
+    fn field(space: Space) -> Field {
+        let mut field = new_field(space);
         field.limit_to((0..128 * 128 * 128).map(is_in_the_middle).collect());
         field
     }
 
     fn devices() -> Vec<Device> {
         std::iter::once(Device::Cpu).chain(nets::device("cuda").ok()).collect()
+    }
+
+    /// A training from nothing begins with double strides everywhere, which [`field`] has nowhere:
+    /// equal losses and samples, in a space of straight rays and in one of bent rays.
+    #[test]
+    fn begins_with_double_strides_as_the_hand_written_trainer_does() {
+        for space in [Space::Box, Space::Contraction] {
+            let start = new_field(space);
+            let mut ours = Trainer::new(start.clone(), options());
+            let mut judge = GridTrainer::new(&start, options(), Device::Cpu).unwrap();
+            let [mut mine, mut its] = [(); 2].map(|()| Painted { seen: Vec::new() });
+            for _ in 0..3 {
+                let report = ours.step(&mut mine).unwrap().unwrap();
+                let other = judge.step(&mut its).unwrap().unwrap();
+                assert_eq!((report.rays, report.samples), (other.rays, other.samples));
+                assert!((report.loss / other.loss - 1.0).abs() < 1e-5, "{report:?} {other:?}");
+                // A ray crosses the cube in at most 64 steps.
+                assert!(report.samples <= 33 * report.rays, "{report:?}");
+            }
+        }
     }
 
     /// Step by step the same losses as the hand-written trainer's, through an update of the
