@@ -14,7 +14,7 @@ use common::{
 /// The shipped targets at tiny sizes.
 const REFINED: &str = "
   downscaled-field:
-    parameters: {rays: 80000}
+    parameters: {rays: 40000}
   train-refine:
     parameters: {steps: 60, batch: 4, patch_size: 16, features: 8, blocks: 1}
   upsample:
@@ -38,6 +38,8 @@ fn green(file: &Path) -> Vec<f32> {
 #[test]
 fn refined_views_stand_beside_rendered_ones() {
     let project = project();
+    // From a shorter training the network learns to leave views as they are.
+    project.replace("rays: 40000", "rays: 80000");
     let run = project.ok(&["run", "refined"]);
     assert!(run.contains("out/refined/index.html"), "{run}");
     let page = std::fs::read_to_string(project.path("out/refined/index.html")).unwrap();
