@@ -27,7 +27,7 @@ pub enum Strides {
     Even,
     /// At every other step in thin cells: to train, where samples of other rays lie in between.
     ByCell,
-    /// At every other step: to begin a training, while density is smooth and little is empty.
+    /// At every other step: to begin a training, while density is smooth and little is known.
     Double,
 }
 
@@ -184,7 +184,8 @@ impl RayMarch<'_> {
 kernel! {
     /// Marches on: at most `most` more samples of each of the `active` rays. Step k of a ray lies
     /// at t = enter + (k + offset)·step. An occupied cell gives a sample there; where [`Strides`]
-    /// are double, it gives a sample of two steps where k is even, in the middle of both. `next` is each ray's k, from 0 to [`DONE`].
+    /// are double, it gives a sample of two steps where k is even, in the middle of both. `next` is
+    /// each ray's k, from 0 to [`DONE`].
     pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
         samples: &mut Marched) {
         for &r in active {
