@@ -11,7 +11,7 @@ use common::{
 
 /// Long enough for several checkpoints, the first after about a second; with all that a checkpoint
 /// may hold.
-const PARAMS: &str = r#"{"supervision": "kernel", "exposure": true, "pose_refinement": true, "ensemble": 2, "rays": 300000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 256, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
+const PARAMS: &str = r#"{"supervision": "kernel", "exposure": true, "pose_refinement": true, "ensemble": 2, "rays": 600000, "n_levels": 4, "max_resolution": 64, "log2_hashmap_size": 12, "hidden_dim": 16, "march_steps": 256, "max_rays_per_step": 2048, "samples_per_step": 16384}"#;
 
 #[test]
 fn training_killed_at_any_moment_ends_in_the_same_bytes() {

@@ -65,8 +65,9 @@ fn a_checkpoint_becomes_a_field() {
     prep.fails(2, &["--from-checkpoint: stage demo-scene doesn't have this option"]);
 }
 
-/// Long enough for a look or two on any machine: a look may take a fiftieth of the time.
-const LONG: [&str; 2] = ["-p", "train-ss.rays=1500000"];
+const RAYS: [&str; 2] = ["-p", "train-ss.rays=600000"];
+/// From so many rays on the training waits for a look, since looks may take a fiftieth of the time.
+const LOOKED_AT: &str = "300000";
 
 fn psnr(look: &str) -> f64 {
     let (_, after) = look.split_once("PSNR ").unwrap();
@@ -76,19 +77,21 @@ fn psnr(look: &str) -> f64 {
 #[test]
 fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let project = Project::tiny();
-    let arguments = [&["run", "eval"], LONG.as_slice()].concat();
+    let arguments = [&["run", "eval"], RAYS.as_slice()].concat();
     project.ok(&["run", "prep"]);
     let views = project.json("prep", "truth/views.json", &[]);
     let second = views["views"][1]["camera"]["name"].as_str().unwrap().to_owned();
     let watch = format!("--watch={second}");
-    let watched = project.run(&[arguments.as_slice(), &[watch.as_str()]].concat());
+    let picture = project.path("out/watch/train-ss.png");
+    let mut command = project.command(&[arguments.as_slice(), &[watch.as_str()]].concat());
+    command.env("NERF_SR_SLOW_UNTIL", format!("{LOOKED_AT} {}", picture.display()));
+    let watched = Finished::of(command.output().unwrap());
     assert_eq!(watched.code, 0, "{}", watched.stderr);
     let start = format!("train-ss: view {second}: ");
     let looks: Vec<&str> = watched.stderr.lines().filter(|l| l.starts_with(&start)).collect();
     assert!(!looks.is_empty(), "no look in:\n{}", watched.stderr);
     let last = psnr(looks[looks.len() - 1]);
     assert!(last > 12.0, "{looks:?}");
-    let picture = project.path("out/watch/train-ss.png");
     assert!(looks[0].ends_with("out/watch/train-ss.png"), "{looks:?}");
     let size = pixels::read_png(&picture).unwrap();
     assert_eq!((size.width, size.height), (48, 48));
@@ -96,15 +99,15 @@ fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
 
     // The view's score in the end is what the looks came near to, and the bytes are those of a
     // training that nobody looked at.
-    let scores = project.json("eval", "metrics.json", &LONG);
+    let scores = project.json("eval", "metrics.json", &RAYS);
     let of_view = |view: &&serde_json::Value| view["name"] == json!(second);
     let view = scores["views"].as_array().unwrap().iter().find(of_view).unwrap();
     let end = view["scores"]["psnr"].as_f64().unwrap();
     assert!((end - last).abs() < 3.0, "{end} dB in the end, {last} dB when looked at");
-    let with = project.output_of("train-ss", &LONG);
+    let with = project.output_of("train-ss", &RAYS);
     let other = Project::tiny();
     other.ok(&arguments);
-    assert_eq!(with, other.output_of("train-ss", &LONG));
+    assert_eq!(with, other.output_of("train-ss", &RAYS));
 }
 
 #[test]

@@ -22,7 +22,7 @@ use crate::log::{StageLog, Tenths};
 use crate::verdict::{End, StageFailure, is_noise};
 
 /// Environment that a stage gets; what else changes its result must be declared in its description.
-const ENVIRONMENT: [&str; 11] = [
+const ENVIRONMENT: [&str; 12] = [
     stage::MEMORY_VARIABLE,
     "PATH",
     "HOME",
@@ -34,6 +34,7 @@ const ENVIRONMENT: [&str; 11] = [
     "NO_COLOR",
     "RUST_BACKTRACE",
     stage::STOP_VARIABLE,
+    stage::SLOW_VARIABLE,
 ];
 
 /// Last lines of a stage's stderr in which the reason of a failure is looked for.

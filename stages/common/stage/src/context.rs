@@ -8,7 +8,8 @@ use anyhow::Context as _;
 use artifact::{Failure, GivenInput, report_text, write_json};
 use serde::Serialize;
 
-use crate::progress::{Progress, ProgressMode, StopAfter};
+use crate::hooks::TestHooks;
+use crate::progress::{Progress, ProgressMode};
 
 /// A file that a stage may leave in its output: a few words on the result, which the runner prints
 /// at the end.
@@ -86,7 +87,7 @@ impl Context {
     /// Starts a progress display.
     pub fn progress(&self, label: &str, total: u64) -> Progress {
         Progress::new(label, total, self.progress)
-            .stopping(StopAfter::from_environment(&self.interrupted))
+            .with_hooks(TestHooks::from_environment(&self.interrupted))
     }
 
     /// Says something to the person watching, on one line; it also lands in the action's log.

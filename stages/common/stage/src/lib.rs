@@ -44,6 +44,7 @@ mod arguments;
 mod context;
 mod device;
 mod help;
+mod hooks;
 mod memory;
 #[cfg(test)]
 mod panic_tests;
@@ -57,9 +58,10 @@ mod staging;
 
 pub use context::{Context, SUMMARY_FILE};
 pub use device::{DeviceError, check_device};
+pub use hooks::{SLOW_VARIABLE, STOP_VARIABLE};
 pub use memory::{MEMORY_REMEDY, MEMORY_VARIABLE, available_memory, machine_memory, out_of_memory};
 pub use panics::install_panic_hook;
-pub use progress::{Event, Pace, Progress, ProgressMode, STOP_VARIABLE};
+pub use progress::{Event, Pace, Progress, ProgressMode};
 pub use run::{RUNNER_VARIABLE, run_stage};
 pub use signals::stop_on_signals;
 pub use stage::Stage;

@@ -1,10 +1,12 @@
 use std::io::{IsTerminal, Write};
+use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use artifact::report_line;
 use serde::{Deserialize, Serialize};
+
+use crate::hooks::TestHooks;
 
 /// How a stage shows that it is getting on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -64,10 +66,6 @@ pub(crate) fn failed_event(message: &str) -> Option<String> {
     EMITS_EVENTS.load(Ordering::SeqCst).then(event)
 }
 
-/// Environment variable of the tests: a stage whose progress comes to this count is stopped then,
-/// as if by a signal.
-pub const STOP_VARIABLE: &str = "NERF_SR_STOP_AFTER";
-
 /// Progress of one piece of long work. Cheap to call often: at most ten updates a second leave it.
 pub struct Progress {
     label: String,
@@ -75,22 +73,7 @@ pub struct Progress {
     mode: ProgressMode,
     bar: Option<indicatif::ProgressBar>,
     state: Mutex<ProgressState>,
-    stop: Option<StopAfter>,
-}
-
-/// Stops a stage at a count.
-#[derive(Debug, Clone)]
-pub(crate) struct StopAfter {
-    count: u64,
-    interrupted: Arc<AtomicBool>,
-}
-
-impl StopAfter {
-    /// What [`STOP_VARIABLE`] asks for.
-    pub(crate) fn from_environment(interrupted: &Arc<AtomicBool>) -> Option<Self> {
-        let count = std::env::var(STOP_VARIABLE).ok()?.parse().ok()?;
-        Some(Self { count, interrupted: Arc::clone(interrupted) })
-    }
+    hooks: TestHooks,
 }
 
 struct ProgressState {
@@ -120,11 +103,18 @@ impl Progress {
             shown: Instant::now(),
             is_shown: false,
         };
-        Self { label: label.to_owned(), total, mode, bar, state: Mutex::new(state), stop: None }
+        Self {
+            label: label.to_owned(),
+            total,
+            mode,
+            bar,
+            state: Mutex::new(state),
+            hooks: TestHooks::default(),
+        }
     }
 
-    pub(crate) fn stopping(mut self, stop: Option<StopAfter>) -> Self {
-        self.stop = stop;
+    pub(crate) fn with_hooks(mut self, hooks: TestHooks) -> Self {
+        self.hooks = hooks;
         self
     }
 
@@ -145,9 +135,7 @@ impl Progress {
         let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         change(&mut state);
         let done = state.done;
-        if let Some(stop) = self.stop.as_ref().filter(|stop| done >= stop.count) {
-            stop.interrupted.store(true, Ordering::Relaxed);
-        }
+        self.hooks.progress(done);
         state.pace.begin(done);
         let interval =
             if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };
