@@ -142,14 +142,16 @@ impl HrCache {
         let view = &self.views[view];
         let (operator, inverse) = (&view.kernel.operator, &view.kernel.inverse);
         let (xs, ys) = (near(x, operator.x.outputs()), near(y, operator.y.outputs()));
+        let target_rows = ys.clone().map(|qy| {
+            let start = qy * targets.width();
+            start + xs.start..start + xs.end
+        });
+        target_rows.clone().for_each(|row| targets.touch(&row));
         // What the kernel makes of it, and then the residuals.
         let mut residuals = view.projected(&block, xs.clone(), ys.clone());
-        for (qy, row) in ys.clone().zip(&mut residuals) {
+        for (pixels, row) in target_rows.zip(&mut residuals) {
             let mut target = [[0.0; 4]; LR_PIXELS_NEAR];
-            targets.row(
-                qy * targets.width() + xs.start..qy * targets.width() + xs.end,
-                &mut target[..xs.len()],
-            );
+            targets.row(pixels, &mut target[..xs.len()]);
             for (residual, target) in row.iter_mut().zip(&target) {
                 *residual = std::array::from_fn(|c| judge(c, residual[c], target[c]));
             }
@@ -234,12 +236,14 @@ impl CachedView {
         let (columns, lines) = (footprint(across, xs.clone()), footprint(down, ys.clone()));
         let [left, top] = block.at;
         let mut projected = [[[0.0f32; 3]; LR_PIXELS_NEAR]; LR_PIXELS_NEAR];
+        let bytes_of = |line: usize| {
+            let start = line * self.width;
+            3 * (start + columns.start)..3 * (start + columns.end)
+        };
+        lines.clone().for_each(|line| self.rendered.touch(&bytes_of(line)));
         ROWS.with_borrow_mut(|rows| {
             for line in lines {
-                let start = line * self.width;
-                let read = self
-                    .rendered
-                    .read(3 * (start + columns.start)..3 * (start + columns.end), &mut rows.read);
+                let read = self.rendered.read(bytes_of(line), &mut rows.read);
                 rows.levels.clear();
                 rows.levels.extend(
                     read.as_chunks::<3>().0.iter().map(|pixel| pixel.map(|v| f32::from(v) / 255.0)),

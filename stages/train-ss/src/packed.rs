@@ -1,4 +1,5 @@
 use std::fs::File;
+use std::hint::black_box;
 use std::io;
 use std::ops::Range;
 use std::os::unix::fs::FileExt as _;
@@ -116,6 +117,15 @@ impl Bytes {
                 file.note(file.file.read_exact_at(buffer, start + range.start as u64));
                 buffer
             }
+        }
+    }
+
+    /// Begins to load bytes that are soon read, if they are in memory. Calls that follow each other
+    /// wait for memory together; reads with work between them would wait one by one.
+    pub(crate) fn touch(&self, range: &Range<usize>) {
+        if let Self::Memory(bytes) = self {
+            black_box(bytes.get(range.start).copied());
+            black_box(bytes.get(range.end - 1).copied());
         }
     }
 
@@ -246,6 +256,12 @@ impl PackedPhotograph {
                 *out = [f32::NAN; 4];
             }
         }
+    }
+
+    /// Begins to load neighbouring pixels, see [`Bytes::touch`].
+    pub(crate) fn touch(&self, pixels: &Range<usize>) {
+        let size = self.samples.size();
+        self.bytes.touch(&(size * pixels.start..size * pixels.end));
     }
 
     /// Neighbouring pixels, whether they count or not.
