@@ -3,13 +3,14 @@
 
 use crate::aligned::Aligned;
 use crate::field::Field;
-use crate::march::{March, Strides};
+use crate::march::March;
 use crate::occupancy::Met;
 use crate::ray::NormalizedRay;
 use crate::samples::{Counted, RaySum, Round, Samples, gather, rounds_of};
 use crate::shading::{LayerInput, NetworkGradients, RayGradients, Shading, dot};
 use crate::simd::{LANES, kernel};
 use crate::spec::{DENSITY_OUTPUTS, FEATURES};
+use crate::strides::Strides;
 
 /// Rays in one chunk: enough samples to fill the vectors, few enough to stay in the cache.
 pub(crate) const CHUNK_RAYS: usize = 64;

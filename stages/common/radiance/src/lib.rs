@@ -68,6 +68,7 @@ mod shading;
 mod simd;
 pub mod spec;
 mod spherical;
+mod strides;
 mod supervisor;
 mod tally;
 mod tensors;
@@ -78,7 +79,6 @@ pub use field::Field;
 pub use field_file::{
     FIELD_FILE, FIELD_FORMAT, FieldFile, FieldFileError, FieldModel, MlpArchitecture,
 };
-pub use march::Strides;
 pub use occupancy::{Met, Occupancy};
 pub use passes::Passes;
 pub use points::PointSample;
@@ -88,6 +88,7 @@ pub use regularisers::Regularisers;
 pub use render::{Pixel, RayField, RenderError};
 pub use simd::{Family, set_family};
 pub use spherical::spherical_harmonics;
+pub use strides::Strides;
 pub use supervisor::Supervisor;
 pub use tally::Tally;
 pub use tensors::FieldError;

@@ -4,9 +4,9 @@
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
-use crate::march::Strides;
 use crate::ray::NormalizedRay;
 use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
+use crate::strides::Strides;
 
 /// Cells in all.
 pub(crate) const CELLS: usize = GRID * GRID * GRID;
@@ -18,9 +18,17 @@ const BLOCKS: usize = BRICKS / SIDE;
 
 /// Which word of a level and which bit in it belong to a place.
 #[inline(always)]
-fn place([x, y, z]: [usize; 3], words: usize) -> (usize, usize) {
-    let word = x / SIDE + words * (y / SIDE + words * (z / SIDE));
-    (word, x % SIDE + SIDE * (y % SIDE + SIDE * (z % SIDE)))
+fn place(at: [usize; 3], words: usize) -> (usize, u32) {
+    let (word, bit) = place_of_lane(at.map(|c| c as u32), words);
+    (word as usize, bit)
+}
+
+/// The same in 32 bits, so that it vectorises.
+#[inline(always)]
+fn place_of_lane([x, y, z]: [u32; 3], words: usize) -> (u32, u32) {
+    let (words, side) = (words as u32, SIDE as u32);
+    let word = x / side + words * (y / side + words * (z / side));
+    (word, x % side + side * (y % side + side * (z % side)))
 }
 
 /// Steps of a training between updates of the occupancy.
@@ -329,26 +337,13 @@ impl Occupancy {
     }
 }
 
-/// A cube of empty cells: a cell, a brick, a block, or an eighth of a brick or block.
-#[derive(Clone, Copy)]
-pub(crate) struct EmptyCube {
-    /// Its first cell along each axis.
-    pub(crate) low: [usize; 3],
-    /// Cells along each axis.
-    pub(crate) side: usize,
-}
-
-/// What lies around a place: a [`Cell`], and of empty ones how many are empty together.
-pub(crate) enum Held {
-    Empty(EmptyCube),
-    Thin,
-    Dense,
-}
+/// Stands for a cell that isn't empty, where [`Occupancy::empty_around`] gives a size.
+pub(crate) const OCCUPIED: u32 = 8;
 
 /// The first 2³ bits of a word's 4³. The other mask keeps, of a bit's number, what says in which
 /// eighth the bit is.
 const EIGHTH: u64 = 0x33_0033;
-const FIRST_OF_EIGHTH: usize = 0b10_1010;
+const FIRST_OF_EIGHTH: u32 = 0b10_1010;
 /// How far outside the extent a ray may pass and still march, for an origin within the unit cube:
 /// more than positions are rounded by.
 const MARGIN: f32 = 1e-5;
@@ -376,30 +371,43 @@ impl Occupancy {
         (from < to).then_some([from, to])
     }
 
-    /// What a cell holds; of empty ones, as many around it as are empty together.
+    /// The size of the largest empty cube around each of some cells, given by an array an axis: of
+    /// 2^size cells a side, a cell, a brick, a block, or an eighth of a brick or block.
+    /// [`OCCUPIED`] where a cell isn't empty.
+    ///
+    /// Written so that all but the loads vectorises.
     #[inline(always)]
-    pub(crate) fn held(&self, cell: [usize; 3]) -> Held {
-        let brick = cell.map(|c| c / SIDE);
-        let (block_word, brick_bit) = place(brick, BLOCKS);
-        let (brick_word, cell_bit) = place(cell, BRICKS);
-        let bricks = self.blocks[block_word];
-        if bricks == 0 {
-            let low = brick.map(|b| b / SIDE * (SIDE * SIDE));
-            Held::Empty(EmptyCube { low, side: SIDE * SIDE })
-        } else if bricks & EIGHTH << (brick_bit & FIRST_OF_EIGHTH) == 0 {
-            let low = brick.map(|b| b / 2 * (2 * SIDE));
-            Held::Empty(EmptyCube { low, side: 2 * SIDE })
-        } else if bricks >> brick_bit & 1 == 0 {
-            Held::Empty(EmptyCube { low: brick.map(|b| b * SIDE), side: SIDE })
-        } else if self.bricks[brick_word] & EIGHTH << (cell_bit & FIRST_OF_EIGHTH) == 0 {
-            Held::Empty(EmptyCube { low: cell.map(|c| c / 2 * 2), side: 2 })
-        } else if self.bricks[brick_word] >> cell_bit & 1 == 0 {
-            Held::Empty(EmptyCube { low: cell, side: 1 })
-        } else if self.dense[brick_word] >> cell_bit & 1 == 1 {
-            Held::Dense
-        } else {
-            Held::Thin
+    pub(crate) fn empty_around<const N: usize>(&self, cells: &[[u32; N]; 3]) -> [u32; N] {
+        let [xs, ys, zs] = cells;
+        let (mut bricks, mut cell_bits) = ([0; N], [0; N]);
+        let (mut blocks, mut brick_bits) = ([0; N], [0; N]);
+        let (mut words, mut sizes) = ([[0; N]; 2], [0; N]);
+        for i in 0..N {
+            let cell = [xs[i], ys[i], zs[i]];
+            (bricks[i], cell_bits[i]) = place_of_lane(cell, BRICKS);
+            (blocks[i], brick_bits[i]) = place_of_lane(cell.map(|c| c / SIDE as u32), BLOCKS);
         }
+        for i in 0..N {
+            words[0][i] = self.bricks[bricks[i] as usize];
+            words[1][i] = self.blocks[blocks[i] as usize];
+        }
+        // No branches: which size comes next can't be predicted.
+        for i in 0..N {
+            let [cells, bricks] = [words[0][i], words[1][i]];
+            let size = u32::from(cells & EIGHTH << (cell_bits[i] & FIRST_OF_EIGHTH) == 0)
+                + u32::from(cells == 0)
+                + u32::from(bricks & EIGHTH << (brick_bits[i] & FIRST_OF_EIGHTH) == 0)
+                + u32::from(bricks == 0);
+            sizes[i] = if cells >> cell_bits[i] & 1 == 1 { OCCUPIED } else { size };
+        }
+        sizes
+    }
+
+    /// Whether an occupied cell is thin.
+    #[inline(always)]
+    pub(crate) fn is_thin(&self, cell: [usize; 3]) -> bool {
+        let (word, bit) = place(cell, BRICKS);
+        self.dense[word] >> bit & 1 == 0
     }
 }
 

@@ -1,10 +1,10 @@
 use crate::aligned::Aligned;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
-use crate::march::Strides;
 use crate::ray::{Ray, clip};
 use crate::regularisers::Regularisers;
 use crate::shading::{NetworkGradients, RayGradients};
+use crate::strides::Strides;
 
 /// One worker's forward and backward pass without an optimiser: what benchmarks measure, and what
 /// another reading of the field is compared with.

@@ -7,7 +7,7 @@ use crate::architecture::Architecture;
 use crate::chunk::{Chunk, FeatureGradients, Roulette};
 use crate::field::Field;
 use crate::grid::{Level, scatter};
-use crate::march::{March, Marched, Strides, march};
+use crate::march::{March, Marched, march};
 use crate::mlp::Layer;
 use crate::occupancy::Cell;
 use crate::ray::{NormalizedRay, Ray, clip};
@@ -17,6 +17,7 @@ use crate::spec::{
     BRICK, DENSITY_OUTPUTS, FEATURES, HASH_FACTORS, RAW_COLOUR, VIEW_FEATURE, VIEW_INPUTS,
 };
 use crate::spherical::spherical_harmonics;
+use crate::strides::Strides;
 
 /// Parameters in f64.
 struct Judge<'a> {

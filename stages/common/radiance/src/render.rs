@@ -4,10 +4,10 @@ use rayon::prelude::*;
 
 use crate::chunk::{CHUNK_RAYS, Chunk};
 use crate::field::Field;
-use crate::march::Strides;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::samples::RaySum;
 use crate::spec::UNSEEN;
+use crate::strides::Strides;
 
 /// What a ray sees.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

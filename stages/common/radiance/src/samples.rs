@@ -4,12 +4,13 @@ use crate::aligned::Aligned;
 use crate::composite::{optical_depths, weights};
 use crate::field::Field;
 use crate::grid::encode;
-use crate::march::{DONE, March, Marched, Strides, march};
+use crate::march::{DONE, March, Marched, march};
 use crate::math::exp;
 use crate::mlp::{After, multiply};
 use crate::occupancy::Met;
 use crate::simd::LANES;
 use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY, MET};
+use crate::strides::Strides;
 
 /// What one ray adds up to.
 #[derive(Clone, Copy, Debug, Default)]

@@ -3,10 +3,10 @@ use std::ops::Range;
 use super::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
-use crate::march::Strides;
 use crate::occupancy::Met;
 use crate::ray::{NormalizedRay, Ray, clip};
 use crate::shading::{NetworkGradients, RayGradients};
+use crate::strides::Strides;
 use crate::supervisor::Supervisor;
 
 /// What all shards of a step read.

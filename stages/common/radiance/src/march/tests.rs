@@ -1,0 +1,236 @@
+use counter_rng::CounterRng;
+use scene::{Bounds, Space};
+
+use super::bent::EmptyCube;
+use super::{DONE, March, Marched, march};
+use crate::occupancy::{Cell, Occupancy, SIDE, cell_of, corner};
+use crate::ray::{NormalizedRay, Ray, RayMap, clip};
+use crate::spec::OCCUPANCY_CELLS as GRID;
+use crate::strides::Strides;
+
+/// What step k of a ray gives, without leaps: a sample's t and its length.
+fn sample(march: &March<'_>, k: u32) -> Option<(f32, f32)> {
+    let March { occupancy, rays: &[ray], step, strides, .. } = *march else {
+        panic!("one ray at a time");
+    };
+    let t = (k as f32 + 0.3).mul_add(step, ray.enter);
+    let middle = (k as f32 + 0.3 + 0.5).mul_add(step, ray.enter);
+    let c = cell_of(ray.position(t));
+    let held = occupancy.cell(c[0] + GRID * (c[1] + GRID * c[2]));
+    if held == Cell::Empty || t >= ray.leave {
+        None
+    } else if strides.are_double_in(held == Cell::Thin) {
+        (k.is_multiple_of(2) && middle < ray.leave).then_some((middle, 2.0))
+    } else {
+        Some((t, 1.0))
+    }
+}
+
+const STRIDES: [Strides; 3] = [Strides::Even, Strides::ByCell, Strides::Double];
+
+/// All samples of a ray without leaps, and those found by marching in parts, as the renderer
+/// does.
+fn both(occupancy: &Occupancy, ray: NormalizedRay, strides: Strides) -> [Vec<(f32, f32)>; 2] {
+    let (mut next, mut found) = ([0], Marched::default());
+    let step = 3.0f32.sqrt() / 512.0;
+    let march_on = March { occupancy, rays: &[ray], offsets: &[0.3], step, strides };
+    while next[0] != DONE {
+        march(&march_on, 5, &[0], &mut next, &mut found);
+    }
+    let expected = (0..2000).filter_map(|k| sample(&march_on, k)).collect();
+    [expected, found.t.into_iter().zip(found.lengths).collect()]
+}
+
+/// A ray of a scene in the cube [-1, 1]³ from anywhere in [-3, 3]³: towards a place in the cube,
+/// inside of it or past it; some are parallel to an axis or two.
+fn straight_ray(seed: u64) -> NormalizedRay {
+    let mut rng = CounterRng::new(1, 2, seed);
+    let mut draw = || 2.0 * rng.uniform() - 1.0;
+    let far = if seed.is_multiple_of(3) { 1.0 } else { 3.0 };
+    let origin = [draw(), draw(), draw()].map(|x| far * x);
+    let mut d: [f32; 3] = std::array::from_fn(|i| 1.2 * draw() - origin[i]);
+    d.iter_mut().take(seed as usize / 2 % 3).for_each(|x| *x = 0.0);
+    let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
+    let cube = Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, ..Bounds::default() };
+    let direction = d.map(|x| x / length);
+    clip(&cube, &Ray { origin, direction, background: [0.0; 3] })
+}
+
+/// Cells in planes across x, thin and dense ones.
+fn planes() -> Occupancy {
+    let mut occupancy = Occupancy::full();
+    occupancy.set(|cell| match cell {
+        _ if (cell / 7) % 11 != 0 || cell % GRID <= 40 => Cell::Empty,
+        _ if (cell / GRID).is_multiple_of(2) => Cell::Thin,
+        _ => Cell::Dense,
+    });
+    occupancy
+}
+
+/// A plate at a face, a cell thick: little lies between the extent's faces.
+fn plate() -> Occupancy {
+    let mut occupancy = Occupancy::full();
+    occupancy.set(|cell| match corner(cell, GRID) {
+        [x, _, 0] if x > 70 => Cell::Dense,
+        _ => Cell::Empty,
+    });
+    occupancy
+}
+
+#[test]
+fn skipping_loses_no_sample() {
+    for (occupancy, rays, least) in
+        [(planes(), 600, 1000), (plate(), 2000, 200), (Occupancy::full(), 60, 1000)]
+    {
+        let (mut samples, mut lost) = (0, 0);
+        for seed in 0..rays {
+            let [expected, found] =
+                both(&occupancy, straight_ray(seed), STRIDES[seed as usize % 3]);
+            samples += expected.len();
+            lost += expected.iter().filter(|t| !found.contains(t)).count();
+            assert!(found.iter().all(|t| expected.contains(t)), "ray {seed}");
+        }
+        assert!(samples > least, "{samples} samples");
+        // Rounding at a face may move a sample across it.
+        assert!(lost * 1000 <= samples, "{lost} of {samples} lost");
+    }
+}
+
+#[test]
+fn nothing_gives_no_sample() {
+    let mut occupancy = Occupancy::full();
+    occupancy.set(|_| Cell::Empty);
+    for seed in 0..100 {
+        assert_eq!(both(&occupancy, straight_ray(seed), Strides::Even), [vec![], vec![]]);
+        assert_eq!(both(&occupancy, bent_ray(seed, 1.5), Strides::Even), [vec![], vec![]]);
+    }
+}
+
+/// What each ray finds doesn't depend on the rays beside it, of which some miss.
+#[test]
+fn rays_march_together_as_each_alone() {
+    let misses = Ray { origin: [9.0; 3], direction: [1.0, 0.0, 0.0], background: [0.0; 3] };
+    let occupancy = planes();
+    for of_scene in [straight_ray, |seed| bent_ray(seed, 1.5)] {
+        let mut rays: Vec<NormalizedRay> = (0..100).map(of_scene).collect();
+        for at in [0, 7, 99] {
+            rays[at] = clip(&Bounds::default(), &misses);
+            assert!(rays[at].enter >= rays[at].leave);
+        }
+        let offsets: Vec<f32> = (0..100).map(|i| i as f32 / 100.0).collect();
+        for strides in STRIDES {
+            let step = 3.0f32.sqrt() / 512.0;
+            let all =
+                March { occupancy: &occupancy, rays: &rays, offsets: &offsets, step, strides };
+            let (mut next, mut together) = ([0; 100], vec![Vec::new(); 100]);
+            let mut found = Marched::default();
+            let mut active: Vec<u32> = (0..100).collect();
+            while !active.is_empty() {
+                found.starts.clear();
+                march(&all, 5, &active, &mut next, &mut found);
+                for (&r, range) in active.iter().zip(found.starts.windows(2)) {
+                    let samples = range[0]..range[1];
+                    let lengths = found.lengths[samples.clone()].iter();
+                    let places = found.positions[samples.clone()].iter();
+                    together[r as usize].extend(
+                        found.t[samples]
+                            .iter()
+                            .zip(lengths)
+                            .zip(places)
+                            .map(|((&t, &length), &place)| (t, length, place)),
+                    );
+                }
+                active.retain(|&r| next[r as usize] != DONE);
+            }
+            for (r, together) in together.iter().enumerate() {
+                let one = March { rays: &rays[r..=r], offsets: &offsets[r..=r], ..all };
+                let (mut next, mut found) = ([0], Marched::default());
+                while next[0] != DONE {
+                    march(&one, 9, &[0], &mut next, &mut found);
+                }
+                let alone =
+                    (0..found.t.len()).map(|i| (found.t[i], found.lengths[i], found.positions[i]));
+                assert!(together.iter().copied().eq(alone), "ray {r}");
+            }
+        }
+    }
+}
+
+/// Bent rays leap over empty cells, bricks and blocks of all sizes, and lose no sample.
+#[test]
+fn bent_rays_lose_no_sample() {
+    let mut occupancy = Occupancy::full();
+    let middle = |cell: usize| corner(cell, GRID).map(|c| (c as f32 + 0.5) / GRID as f32);
+    let mut rng = CounterRng::new(3, 0, 0);
+    let balls: Vec<[f32; 4]> = (0..40).map(|_| [(); 4].map(|()| rng.uniform())).collect();
+    let is_inside = |p: [f32; 3], [x, y, z, size]: [f32; 4]| {
+        let away = (p[0] - x).powi(2) + (p[1] - y).powi(2) + (p[2] - z).powi(2);
+        away < (0.12 * size).powi(2)
+    };
+    occupancy.set(|cell| match balls.iter().position(|&b| is_inside(middle(cell), b)) {
+        None => Cell::Empty,
+        Some(ball) if ball % 3 == 0 => Cell::Thin,
+        Some(_) => Cell::Dense,
+    });
+    let mut samples = 0;
+    for seed in 0..600 {
+        let ray = bent_ray(seed, [0.5, 1.5, 8.0][seed as usize % 3]);
+        let [expected, found] = both(&occupancy, ray, STRIDES[seed as usize % 3]);
+        samples += expected.len();
+        assert!(expected == found, "{ray:?}: {} and {}", expected.len(), found.len());
+    }
+    assert!(samples > 5_000, "{samples} samples");
+}
+
+const AROUND: Bounds =
+    Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.01, far: 500.0, space: Space::Contraction };
+
+/// A ray that passes the centre at a distance of up to `wide` radii; one in four moves along
+/// an axis in planes that bound blocks.
+fn bent_ray(seed: u64, wide: f32) -> NormalizedRay {
+    let mut rng = CounterRng::new(4, 0, seed);
+    let mut draw = || 2.0 * rng.uniform() - 1.0;
+    let (mut origin, mut d) = ([draw(), draw(), draw()].map(|x| wide * x), [draw(); 3]);
+    if seed % 4 == 3 {
+        (origin, d) = (origin.map(|x| (8.0 * x).round() / 8.0), [0.0; 3]);
+        (origin[0], d[0]) = (-3.0, 1.0);
+    } else {
+        d = [d[0], draw(), draw()];
+    }
+    let length = d.iter().map(|x| x * x).sum::<f32>().sqrt();
+    let direction = d.map(|x| x / length);
+    clip(&AROUND, &Ray { origin, direction, background: [0.0; 3] })
+}
+
+/// Bent rays leap far through empty cubes, and never out of them: as far as cells tell.
+#[test]
+fn bent_rays_leap_within_a_cube() {
+    let (mut leaps, mut far) = (0, 0);
+    for seed in 0..4000 {
+        let ray = bent_ray(seed, [0.02, 0.5, 1.5, 8.0][seed as usize / 4 % 4]);
+        let RayMap::Contracted { radii, .. } = ray.map else { panic!("{ray:?}") };
+        let mut rng = CounterRng::new(5, 0, seed);
+        for side in [SIDE, SIDE * SIDE] {
+            let at = (ray.leave - ray.enter).mul_add(rng.uniform(), ray.enter);
+            let position = ray.position(at);
+            let cube = EmptyCube { low: cell_of(position).map(|c| c / side * side), side };
+            let exit = cube.exit(&ray, radii, at, &position).min(ray.leave);
+            assert!(exit >= at);
+            for i in 0..64 {
+                let t = (exit - at).mul_add(i as f32 / 64.0, at);
+                let cell = cell_of(ray.position(t));
+                let is_inside = (0..3)
+                    .all(|axis| (cube.low[axis]..cube.low[axis] + side).contains(&cell[axis]));
+                // A place at a face may lie in either cell, by rounding.
+                let is_at_face = ray.position(t).iter().any(|x| {
+                    let cells = x * GRID as f32;
+                    (cells - cells.round()).abs() < 1e-4
+                });
+                assert!(is_inside || is_at_face, "{ray:?}: {cell:?} at {t}, not in {:?}", cube.low);
+            }
+            leaps += 1;
+            far += usize::from(exit - at > 0.2 * side as f32 / GRID as f32);
+        }
+    }
+    assert!(3 * far > leaps, "{far} of {leaps} leaps go far");
+}
