@@ -1,6 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use pixels::psnr_of;
 use radiance::StepReport;
 use serde::{Deserialize, Serialize};
@@ -68,29 +69,35 @@ impl Checkpoints {
         }
     }
 
-    /// Loads what an earlier run left. What can't be read is said and left out: the training starts
-    /// over.
+    /// Loads what an earlier run left. A checkpoint that isn't whole is said and left out: the
+    /// training starts over. Fails where the system can't read the file of a whole one.
     pub(crate) fn resume(
         &self,
         trainer: &mut dyn FieldTrainer,
         supervision: &mut Supersampling,
         say: impl Fn(&str),
-    ) -> Curve {
-        let Some(folder) = &self.folder else { return Curve::default() };
+    ) -> anyhow::Result<Curve> {
+        let Some(folder) = &self.folder else { return Ok(Curve::default()) };
         let path = folder.join(CHECKPOINT);
         if !path.exists() {
-            return Curve::default();
+            return Ok(Curve::default());
         }
-        match restored(folder, &path, trainer, Some(supervision)) {
-            Some(curve) => {
-                say(&format!("going on from step {}", trainer.steps()));
-                curve
-            }
-            None => {
-                say(&format!("{}: not a whole checkpoint; starting over", path.display()));
-                Curve::default()
-            }
-        }
+        let found = whole_checkpoint(folder, &path, trainer).and_then(|(step, curve)| {
+            let kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
+            let is_whole = kept.metadata().ok()?.len() == supervision.learnt.written_len() as u64;
+            // A trainer that can't resume is as it was.
+            (is_whole && trainer.resume(&path)).then_some((kept, curve))
+        });
+        let Some((mut kept, curve)) = found else {
+            say(&format!("{}: not a whole checkpoint; starting over", path.display()));
+            return Ok(Curve::default());
+        };
+        // Half of it would be neither the earlier training nor a new one.
+        supervision.restore(&mut kept).with_context(|| {
+            format!("cannot read {}", folder.join(kept_name(trainer.steps())).display())
+        })?;
+        say(&format!("going on from step {}", trainer.steps()));
+        Ok(curve)
     }
 
     /// Writes a checkpoint when writing costs at most a fiftieth of the time.
@@ -143,7 +150,8 @@ pub(crate) fn read_latest(work: &Path, trainer: &mut dyn FieldTrainer) -> Option
     let latest = files
         .filter(|entry| entry.file_name() == CHECKPOINT)
         .max_by_key(|entry| entry.metadata().ok().and_then(|metadata| metadata.modified().ok()))?;
-    restored(latest.path().parent()?, latest.path(), trainer, None)
+    let (_, curve) = whole_checkpoint(latest.path().parent()?, latest.path(), trainer)?;
+    trainer.resume(latest.path()).then_some(curve)
 }
 
 fn curve_name(step: u64) -> String {
@@ -154,22 +162,13 @@ fn kept_name(step: u64) -> String {
     format!("kept-{step}.bin")
 }
 
-/// The curve of a checkpoint's step, with trainer and, where it is wanted, supervision as they were
-/// then, where all of it is there.
-fn restored(
+/// A checkpoint's step and the curve that belongs to it.
+fn whole_checkpoint(
     folder: &Path,
     checkpoint: &Path,
-    trainer: &mut dyn FieldTrainer,
-    supervision: Option<&mut Supersampling>,
-) -> Option<Curve> {
+    trainer: &dyn FieldTrainer,
+) -> Option<(u64, Curve)> {
     let step = trainer.checkpoint_step(checkpoint)?;
     let curve = serde_json::from_slice(&std::fs::read(folder.join(curve_name(step))).ok()?).ok()?;
-    let Some(supervision) = supervision else {
-        return trainer.resume(checkpoint).then_some(curve);
-    };
-    let mut kept = std::fs::File::open(folder.join(kept_name(step))).ok()?;
-    let is_whole = kept.metadata().ok()?.len() == supervision.learnt.written_len() as u64;
-    // A trainer that can't resume is as it was.
-    (is_whole && trainer.resume(checkpoint) && supervision.restore(&mut kept).is_ok())
-        .then_some(curve)
+    Some((step, curve))
 }

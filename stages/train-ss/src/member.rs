@@ -201,7 +201,7 @@ impl<'a> Member<'a> {
         let mut trainer = self.start(params, views.bounds)?;
         let checkpoints = Checkpoints::new(work);
         let curve =
-            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text));
+            checkpoints.resume(&mut *trainer, &mut supervision, |text| self.context.say(text))?;
         Ok(Training { trainer, supervision, checkpoints, curve })
     }
 

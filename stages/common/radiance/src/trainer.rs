@@ -332,7 +332,9 @@ mod tests {
     use crate::ray::Ray;
     use crate::regularisers::Regularisers;
     use counter_rng::CounterRng;
-    use scene::Bounds;
+    use scene::{Bounds, Space};
+
+    use crate::simd::by_every_family;
 
     /// Rays through the cube, before black or white, that should all be white.
     struct White {
@@ -365,8 +367,8 @@ mod tests {
         }
     }
 
-    fn trained(field: Field, background: f32, floater_loss: f32, steps: u64) -> (Field, f32) {
-        let options = TrainingOptions {
+    fn options(steps: u64) -> TrainingOptions {
+        TrainingOptions {
             rays: steps * 256,
             max_rays_per_step: 256,
             samples_per_step: 1 << 20,
@@ -376,11 +378,16 @@ mod tests {
             learning_rate_decay: 0.25,
             warm_up: 5,
             ema_decay: 0.0,
-            regularisers: Regularisers { floater_loss, ..Regularisers::default() },
+            regularisers: Regularisers::default(),
             network_decay: 0.0,
             roulette: 1.0,
             seed: 9,
-        };
+        }
+    }
+
+    fn trained(field: Field, background: f32, floater_loss: f32, steps: u64) -> (Field, f32) {
+        let regularisers = Regularisers { floater_loss, ..Regularisers::default() };
+        let options = TrainingOptions { regularisers, ..options(steps) };
         let (mut trainer, mut white) = (Trainer::new(field, options), White { background });
         while trainer.step(&mut white).unwrap().is_some() {}
         let mut rays = [Ray::default(); 64];
@@ -392,21 +399,68 @@ mod tests {
         (field, opacity)
     }
 
+    const SMALL: Architecture = Architecture {
+        levels: 4,
+        coarsest: 4,
+        finest: 32,
+        finest_z: 32,
+        log2_entries: 10,
+        hidden: 16,
+        steps: 64,
+    };
+
+    fn cube(space: Space) -> Bounds {
+        Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, space }
+    }
+
+    /// All numbers of a trained field, in bits.
+    fn bits(field: &Field) -> Vec<u32> {
+        field.grid.iter().chain(field.network.iter()).map(|x| x.to_bits()).collect()
+    }
+
+    /// A trainer that can't resume trains on as if it hadn't tried.
+    #[test]
+    fn a_failed_resume_leaves_no_trace() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint");
+        let averaged = TrainingOptions { ema_decay: 0.9, ..options(30) };
+        let mut white = White { background: 0.0 };
+        let larger = Architecture { log2_entries: 11, ..SMALL };
+        let mut other = Trainer::new(Field::new(larger, cube(Space::Box), 5), averaged);
+        (0..20).for_each(|_| assert!(other.step(&mut white).unwrap().is_some()));
+        other.write_checkpoint(&path).unwrap();
+        let finish = |mut trainer: Trainer, white: &mut White| {
+            while trainer.step(white).unwrap().is_some() {}
+            bits(&trainer.finish())
+        };
+        let new = || Trainer::new(Field::new(SMALL, cube(Space::Box), 5), averaged);
+        let mut tried = new();
+        assert!(tried.resume(&path).is_err());
+        assert!(finish(tried, &mut white) == finish(new(), &mut white));
+    }
+
+    /// Some steps of a training give equal bits by every SIMD family: in a box by double strides,
+    /// and through the contraction by strides that depend on the cell.
+    #[test]
+    fn every_family_trains_to_equal_bits() {
+        for (space, is_known) in [(Space::Box, false), (Space::Contraction, true)] {
+            let train = || {
+                let mut field = Field::new(SMALL, cube(space.clone()), 5);
+                if is_known {
+                    field.limit_to_occupied();
+                }
+                bits(&trained(field, 0.0, 1e-3, 40).0)
+            };
+            let best = train();
+            by_every_family(|family| assert!(train() == best, "{family:?} in {space:?}"));
+        }
+    }
+
     /// A white floater before white is as good as nothing to the images, and stays; by the floater
     /// loss it goes.
     #[test]
     fn what_passes_for_the_background_goes() {
-        let architecture = Architecture {
-            finest: 32,
-            levels: 4,
-            log2_entries: 10,
-            hidden: 16,
-            steps: 64,
-            ..Architecture::default()
-        };
-        let bounds =
-            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.5, far: 9.0, ..Bounds::default() };
-        let (floater, opacity) = trained(Field::new(architecture, bounds, 5), 0.0, 0.0, 40);
+        let (floater, opacity) = trained(Field::new(SMALL, cube(Space::Box), 5), 0.0, 0.0, 40);
         let ((_, without), (_, with)) =
             (trained(floater.clone(), 1.0, 0.0, 200), trained(floater, 1.0, 1e-3, 200));
         println!(

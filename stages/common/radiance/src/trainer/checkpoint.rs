@@ -39,29 +39,27 @@ impl Trainer {
         read_counters(path, |_, counters| Ok(counters[0]))
     }
 
-    /// Goes on from a checkpoint of a trainer made with the same field and options.
+    /// Goes on from a checkpoint of a trainer made with the same field and options. After an error
+    /// the trainer is as it was.
     pub fn resume(&mut self, path: &Path) -> Result<(), FieldError> {
         read_counters(path, |tensors, counters| {
             let field = &mut self.field;
-            let averaged = tensors.names().contains(&"average.grid");
-            self.average = averaged.then(|| Moments::zeros(field));
-            if let Some(average) = &mut self.average {
-                read_f32(tensors, "average.grid", &mut average.grid)?;
-                read_f32(tensors, "average.network", &mut average.network)?;
-            }
-            for (name, into) in [
-                ("first.grid", &mut self.first.grid),
-                ("first.network", &mut self.first.network),
-                ("grid", &mut field.grid),
-                ("network", &mut field.network),
-                ("second.grid", &mut self.second.grid),
-                ("second.network", &mut self.second.network),
-            ] {
-                read_f32(tensors, name, into)?;
-            }
+            let moments = |name: &str| {
+                let mut moments = Moments::zeros(field);
+                read_f32(tensors, &format!("{name}grid"), &mut moments.grid)?;
+                read_f32(tensors, &format!("{name}network"), &mut moments.network)?;
+                Ok::<_, String>(moments)
+            };
+            let (first, second, weights) = (moments("first.")?, moments("second.")?, moments("")?);
+            let is_averaged = tensors.names().contains(&"average.grid");
+            let average = is_averaged.then(|| moments("average.")).transpose()?;
             let mut density = vec![0.0; CELLS];
             read_f32(tensors, "density", &mut density)?;
-            field.occupancy.restore(density, &read_u8(tensors, "occupied", CELLS)?);
+            let occupied = read_u8(tensors, "occupied", CELLS)?;
+            // Nothing fails from here on.
+            (self.first, self.second, self.average) = (first, second, average);
+            (field.grid, field.network) = (weights.grid, weights.network);
+            field.occupancy.restore(density, &occupied);
             let [tally @ .., samples_per_ray] = counters;
             self.tally = Tally::from_counters(tally);
             self.samples_per_ray = f64::from_bits(samples_per_ray);
