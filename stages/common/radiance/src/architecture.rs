@@ -42,6 +42,11 @@ impl Default for Architecture {
 }
 
 impl Architecture {
+    /// Distance between samples, in cube sides.
+    pub fn step(&self) -> f32 {
+        3.0f32.sqrt() / self.steps as f32
+    }
+
     /// Says which number can't be.
     pub fn check(&self) -> Result<(), OutOfRange> {
         let ranges = [

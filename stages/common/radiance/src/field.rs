@@ -56,7 +56,7 @@ impl Field {
 
     /// Distance between samples, in cube sides.
     pub fn step(&self) -> f32 {
-        3.0f32.sqrt() / self.architecture.steps as f32
+        self.architecture.step()
     }
 
     /// Share of the cells that may hold something.

@@ -9,7 +9,7 @@ use crate::math::exp;
 use crate::mlp::{After, multiply};
 use crate::occupancy::Met;
 use crate::simd::LANES;
-use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY, MET};
+use crate::spec::{DARK, DENSITY_OUTPUTS, FAINT, FEATURES, MAX_RAW_DENSITY, MET, TRAINING_ROUNDS};
 use crate::strides::Strides;
 
 /// What one ray adds up to.
@@ -25,9 +25,6 @@ pub(crate) struct RaySum {
     pub(crate) median: Option<f32>,
 }
 
-/// Samples of each ray in the first rounds of a training and in all later ones: few while a surface
-/// may stop the ray, then more.
-const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
 /// Samples of each ray in a round of rendering: a trained field's surfaces stop rays within few.
 const RENDERING_ROUND: usize = 8;
 

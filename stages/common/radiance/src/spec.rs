@@ -30,6 +30,9 @@ pub const FAINT: f32 = 1e-4;
 pub const UNSEEN: f32 = 1e-4;
 /// Optical depth at which a ray ends: -ln([`FAINT`]).
 pub const DARK: f32 = 9.210_34;
+/// Samples of each ray in the first rounds of a training and in all later ones: few while a surface
+/// may stop the ray, then more. A ray that is dark ([`DARK`]) takes no further round.
+pub const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
 
 /// Cells of the occupancy along each axis of the unit cube.
 pub const OCCUPANCY_CELLS: usize = 128;

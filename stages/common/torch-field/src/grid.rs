@@ -1,6 +1,6 @@
 use radiance::spec::{
-    BASIS, BRICK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, MET,
-    OCCUPANCY_CELLS, RAW_COLOUR, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
+    BASIS, BRICK, DARK, DENSITY_OUTPUTS, FAINT, FEATURES, HASH_FACTORS, MAX_RAW_DENSITY, MET,
+    OCCUPANCY_CELLS, RAW_COLOUR, TRAINING_ROUNDS, UNSEEN, VIEW_FEATURE, VIEW_FEATURES,
 };
 use radiance::{Architecture, Field, Met, Occupancy, Pixel, Ray, RayField, RenderError, Strides};
 use scene::Bounds;
@@ -175,6 +175,27 @@ fn optical(
     Ok([through, transmittance, weights])
 }
 
+/// How many of the samples `kept` a training marches to: a ray takes no further round once its
+/// optical depth `through` says that it is dark.
+fn marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
+    let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
+    let exists = exists.f_reshape_as(through)?;
+    let number = exists.f_cumsum(1, None::<Kind>)?;
+    let [first @ .., later] = TRAINING_ROUNDS.map(|samples| samples as i64);
+    let mut end = 0;
+    let mut is_end = exists.f_lt(0.0)?;
+    for samples in first {
+        end += samples;
+        is_end = is_end.f_logical_or(&number.f_eq(end)?)?;
+    }
+    let is_later = number.f_sub_scalar(end)?.f_remainder(later)?.f_eq(0)?;
+    is_end = is_end.f_logical_or(&is_later.f_logical_and(&number.f_gt(end)?)?)?;
+    let is_dark = through.f_ge(f64::from(DARK))?.f_logical_and(&is_end)?.f_mul(&exists)?;
+    let is_over = is_dark.f_cumsum(1, None::<Kind>)?.f_sub(&is_dark)?.f_gt(0.0)?;
+    let marched = exists.f_logical_and(&is_over.f_logical_not()?)?;
+    Ok(marched.f_sum(Kind::Int64)?.f_int64_value(&[])? as usize)
+}
+
 impl TorchGrid {
     /// A field's numbers on a device.
     pub fn new(field: &Field, device: Device) -> Result<Self, TorchFieldError> {
@@ -214,7 +235,7 @@ impl TorchGrid {
 
     /// Distance between samples, in cube sides.
     pub(crate) fn step(&self) -> f64 {
-        3f64.sqrt() / f64::from(self.architecture.steps)
+        f64::from(self.architecture.step())
     }
 
     /// Density for a cube side at positions in the unit cube (n × 3).
@@ -329,7 +350,7 @@ impl TorchGrid {
             shaded_weight: weight,
             shaded_ray: ray,
             met,
-            samples: kept.numel(),
+            samples: no_grad(|| marched(&through, &kept))?,
             maps,
         })
     }

@@ -480,6 +480,31 @@ mod tests {
         }
     }
 
+    /// Steps have as many rays as the hand-written trainer's where their number follows from the
+    /// samples: before walls, where a ray ends after a round of eight, in fog, where it ends after
+    /// some rounds, and in mist, where it doesn't.
+    #[test]
+    fn steps_have_as_many_rays_as_the_hand_written_trainer_s() {
+        for (weight, samples) in [(0.5, 8.0..8.1), (0.12, 9.0..30.0), (-0.1, 34.0..64.0)] {
+            let mut start = new_field(Space::Box);
+            start.limit_to_occupied();
+            let (grid, network, _) = start.parts_mut();
+            (grid.fill(1.0), network.fill(weight));
+            let options =
+                TrainingOptions { max_rays_per_step: 4096, samples_per_step: 8000, ..options() };
+            let mut ours = Trainer::new(start.clone(), options);
+            let mut judge = GridTrainer::new(&start, options, Device::Cpu).unwrap();
+            let [mut mine, mut its] = [(); 2].map(|()| Painted { seen: Vec::new() });
+            for _ in 0..3 {
+                let report = ours.step(&mut mine).unwrap().unwrap();
+                let other = judge.step(&mut its).unwrap().unwrap();
+                assert_eq!((report.rays, report.samples), (other.rays, other.samples));
+                let mean = report.samples as f64 / report.rays as f64;
+                assert!(samples.contains(&mean), "{weight}: {mean} samples a ray");
+            }
+        }
+    }
+
     /// Step by step the same losses as the hand-written trainer's, through an update of the
     /// occupancy and into the average of the weights, in every space; in the end the same densities
     /// of cells, also where rays met something, and the same field.
