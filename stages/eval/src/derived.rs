@@ -117,6 +117,7 @@ mod tests {
         let metrics = Metrics {
             conventions: BTreeMap::new(),
             figures: Vec::new(),
+            picture_titles: BTreeMap::new(),
             mean: Scores::new(),
             least_gain: None,
             near_references: None,

@@ -117,6 +117,7 @@ impl Stage for Eval {
         let found = Metrics {
             conventions: conventions(params, &scene, &metrics),
             figures: metrics.iter().flat_map(|metric| metric.figures()).collect(),
+            picture_titles: picture_titles(&metrics),
             mean: mean_of(scored.iter().map(|view| &view.scores)),
             least_gain: least_gain.flatten(),
             near_references: near,
@@ -127,6 +128,13 @@ impl Stage for Eval {
         let views = artifact::counted(found.views.len(), "view");
         context.write_summary(&words.chain([views]).collect::<Vec<_>>().join(" · "))
     }
+}
+
+fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
+    let of = |metric: &Box<dyn Metric>| {
+        Some((metric.name().to_owned(), metric.picture_title()?.to_owned()))
+    };
+    metrics.iter().filter_map(of).collect()
 }
 
 /// Scores a view by every metric, and writes its error map and what pictures they made.

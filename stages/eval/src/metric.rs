@@ -8,7 +8,7 @@ use crate::scored_view::{ScoredScene, ScoredView};
 /// Something that views are scored by. A new one is a type in `scoring/mod.rs`, and its line in the
 /// list there: `metrics.json`, the page and the summary follow from what it says of itself.
 pub(crate) trait Metric: Sync {
-    /// Its key among the conventions, and its pictures' folder.
+    /// Its key among the conventions, and the name of its pictures.
     fn name(&self) -> &'static str;
     /// Its figures, the most important first.
     fn figures(&self) -> Vec<Figure>;
@@ -18,6 +18,10 @@ pub(crate) trait Metric: Sync {
     /// are equal in both images, so their error is 0: divide a mean error over all pixels by
     /// [`ScoredView::counted_share`], at LR by that of its `lr`.
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
+    /// Title of its pictures on the page; a metric that makes pictures has one.
+    fn picture_title(&self) -> Option<&'static str> {
+        None
+    }
     /// What a line for people says of means over all views.
     fn in_words(&self, _mean: &Scores) -> Option<String> {
         None

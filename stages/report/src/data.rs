@@ -63,8 +63,8 @@ struct RowData {
 #[derive(Serialize)]
 struct LayerData {
     label: String,
-    group: &'static str,
-    kind: &'static str,
+    group: String,
+    kind: String,
     scene: usize,
     row: Option<usize>,
     scale: Option<usize>,
@@ -199,7 +199,7 @@ impl Scales {
         depths: (f32, f32),
     ) {
         for (index, layer) in layers.iter().enumerate().filter(|(_, layer)| layer.scene == scene) {
-            let scale = match (layer.group, layer.row.map(|row| &report.rows[row])) {
+            let scale = match (&layer.group, layer.row.map(|row| &report.rows[row])) {
                 (Group::Depth, _) => Scale::depth(depths),
                 (Group::Error, Some(row)) => error_scale(row),
                 _ => continue,
@@ -215,8 +215,8 @@ impl Scales {
     fn layer_data(&self, layers: &[Layer<'_>]) -> Vec<LayerData> {
         let data = layers.iter().enumerate().map(|(index, layer)| LayerData {
             label: layer.label.clone(),
-            group: layer.group.heading(),
-            kind: layer.group.file_name(),
+            group: layer.group.heading().to_owned(),
+            kind: layer.group.file_name().to_owned(),
             scene: layer.scene,
             row: layer.row,
             scale: self.of_layer.get(&index).copied(),
@@ -228,7 +228,7 @@ impl Scales {
 /// Without HR truth, error maps show errors at LR.
 fn error_scale(row: &Row<'_>) -> Scale {
     let range = row.node.parameters.get("error_range").and_then(Value::as_f64);
-    Scale::error(range.unwrap_or(0.25), !row.metrics.mean()["psnr"].is_number())
+    Scale::error(range.unwrap_or(0.25), !row.metrics.has_hr_truth())
 }
 
 fn figures(report: &Report<'_>) -> Vec<FigureData> {

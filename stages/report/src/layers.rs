@@ -23,14 +23,18 @@ pub(crate) struct Layer<'a> {
 pub(crate) const ONLY_RENDER: &str = "Render";
 
 /// Kinds of pictures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) enum Group {
     LowResolution,
     Truth,
     Render,
     Error,
     Depth,
-    Warp,
+    /// Pictures that a metric made.
+    Metric {
+        name: String,
+        title: String,
+    },
 }
 
 /// Where a layer's pictures lie.
@@ -39,7 +43,7 @@ enum Source<'a> {
     LowResolution(Arc<Folder>),
     Depth(Arc<Folder>),
     /// Files that a result names: the pointer of their names among a view's scores.
-    Scored(&'a Row<'a>, &'static str),
+    Scored(&'a Row<'a>, String),
 }
 
 /// A folder of views.
@@ -183,8 +187,13 @@ fn add_method<'a>(
             layers.push(of_method(report, index, Group::Depth, Source::Depth(folder)));
         }
     }
-    for (group, pointer) in [(Group::Error, "/error_map"), (Group::Warp, "/pictures/warp")] {
-        if names_files(row, pointer) {
+    let of_metrics = row.metrics.picture_titles().into_iter().map(|(name, title)| {
+        let pointer = format!("/pictures/{name}");
+        (Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer)
+    });
+    for (group, pointer) in [(Group::Error, "/error_map".to_owned())].into_iter().chain(of_metrics)
+    {
+        if names_files(row, &pointer) {
             layers.push(of_method(report, index, group, Source::Scored(row, pointer)));
         }
     }
@@ -226,25 +235,25 @@ fn users(report: &Report<'_>, truth: &Path) -> String {
 
 impl Group {
     /// Heading of its layers in lists.
-    pub(crate) fn heading(self) -> &'static str {
+    pub(crate) fn heading(&self) -> &str {
         match self {
             Self::LowResolution | Self::Truth => "Observations",
             Self::Render => "Renders",
             Self::Error => "Error maps",
             Self::Depth => "Depth maps",
-            Self::Warp => "Neighbours by depth (red: not seen)",
+            Self::Metric { title, .. } => title,
         }
     }
 
     /// Stem of its originals' names.
-    pub(crate) fn file_name(self) -> &'static str {
+    pub(crate) fn file_name(&self) -> &str {
         match self {
             Self::LowResolution => "low-resolution",
             Self::Truth => "ground-truth",
             Self::Render => "render",
             Self::Error => "error",
             Self::Depth => "depth",
-            Self::Warp => "neighbour",
+            Self::Metric { name, .. } => name,
         }
     }
 }

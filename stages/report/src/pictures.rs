@@ -133,7 +133,7 @@ fn write_original(
     Ok(Some(Original {
         view: wanted.view,
         layer: wanted.layer,
-        group: layer.group,
+        group: layer.group.clone(),
         width: image.width,
         height: image.height,
         file,
@@ -170,7 +170,7 @@ fn base64_length(bytes: usize) -> usize {
 /// The copy of an original.
 fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
     let is_small = original.width.max(original.height) <= LOSSLESS_SIDE;
-    let quality = match original.group {
+    let quality = match &original.group {
         Group::LowResolution if is_small => Quality::Lossless,
         _ => quality,
     };
@@ -178,7 +178,7 @@ fn copy(original: &Original, quality: Quality) -> anyhow::Result<Picture> {
         Quality::Lossless => ("png", std::fs::read(&original.path)?, original.width),
         Quality::Jpeg { side, quality } => {
             let small = at_most(&read_png(&original.path)?, side);
-            ("jpeg", encode_jpeg(&small, quality, original.group)?, small.width)
+            ("jpeg", encode_jpeg(&small, quality, &original.group)?, small.width)
         }
     };
     Ok(Picture {
@@ -202,7 +202,7 @@ fn at_most(image: &Rgba8, side: usize) -> Rgba8 {
     resize_pillow(image, less(image.width), less(image.height), Filter::Bicubic)
 }
 
-fn encode_jpeg(image: &Rgba8, quality: u8, group: Group) -> anyhow::Result<Vec<u8>> {
+fn encode_jpeg(image: &Rgba8, quality: u8, group: &Group) -> anyhow::Result<Vec<u8>> {
     let rgb: Vec<u8> =
         image.data.as_chunks::<4>().0.iter().flat_map(|p| [p[0], p[1], p[2]]).collect();
     // A pixel of an LR photograph covers several of the screen's.
@@ -237,7 +237,7 @@ fn file_names(layers: &[Layer<'_>], wanted: &[Wanted<'_>]) -> Vec<String> {
 
 /// Path of a view's original without its ending; other originals may have the same.
 fn stem(layer: &Layer<'_>, view: &str) -> String {
-    let whose = match (layer.row, layer.group) {
+    let whose = match (layer.row, &layer.group) {
         (None, _) => String::new(),
         (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
         (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),

@@ -90,7 +90,7 @@ pub(crate) fn scores(report: &Report<'_>) -> Markup {
 fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
     let Some(value) = row.mean(figure) else {
         // Without HR truth no weights would help.
-        let has_truth = row.metrics.mean()["psnr"].is_number();
+        let has_truth = row.metrics.has_hr_truth();
         let missing = figure.missing.as_deref().filter(|_| has_truth);
         return html! { td class="n" { (missing.unwrap_or("–")) } };
     };
@@ -107,7 +107,7 @@ fn mean(figure: &Figure, row: &Row<'_>, rows: &[Row<'_>]) -> Markup {
 
 /// Figures that no result has, and why.
 fn missing(report: &Report<'_>) -> Markup {
-    let has_truth = report.rows.iter().any(|row| row.metrics.mean()["psnr"].is_number());
+    let has_truth = report.rows.iter().any(|row| row.metrics.has_hr_truth());
     let unknown = report.figures.iter().filter(|figure| !is_known(figure, &report.rows));
     let unknown: Vec<_> = unknown.filter_map(|f| Some((f, f.missing.as_ref()?))).collect();
     html! {

@@ -90,9 +90,9 @@ class Viewer {
   }
 
   /** A layer in words, by itself. */
-  name({ kind, label }) {
-    const words = { error: "Error", depth: "Depth", neighbour: "Neighbour by depth" }[kind];
-    if (!words) return label;
+  name({ kind, group, label }) {
+    if (["low-resolution", "ground-truth", "render"].includes(kind)) return label;
+    const words = { error: "Error", depth: "Depth" }[kind] ?? group.split(" (")[0];
     return label === "Render" ? words : `${words}: ${label}`;
   }
 

@@ -51,6 +51,17 @@ impl AnyMetrics {
         serde_json::from_value(self.0["figures"].clone()).ok()
     }
 
+    /// Names and titles of the pictures that metrics made, by name.
+    pub fn picture_titles(&self) -> Vec<(&str, &str)> {
+        let titles = self.0["picture_titles"].as_object().into_iter().flatten();
+        titles.filter_map(|(name, title)| Some((name.as_str(), title.as_str()?))).collect()
+    }
+
+    /// Whether views have HR truth: without it `eval` scores them at LR alone.
+    pub fn has_hr_truth(&self) -> bool {
+        self.mean()["psnr"].is_number()
+    }
+
     /// Means over the views; null where there are none.
     pub fn mean(&self) -> &Value {
         &self.0["mean"]
@@ -96,6 +107,7 @@ mod tests {
             let metrics = AnyMetrics::from(value.clone());
             assert_eq!(metrics.mean(), &value["mean"], "{value}");
             assert_eq!((metrics.figures(), metrics.views().len()), (None, 0), "{value}");
+            assert!(metrics.picture_titles().is_empty() && !metrics.has_hr_truth(), "{value}");
             assert!(metrics.conventions().is_null() && metrics.least_gain().is_null(), "{value}");
             assert!(metrics.near_references()["psnr"].is_null(), "{value}");
         }

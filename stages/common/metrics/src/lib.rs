@@ -15,6 +15,7 @@
 //! let written = Metrics {
 //!     conventions: Default::default(),
 //!     figures: vec![Figure::new("psnr", "PSNR ↑ dB", 2, true)],
+//!     picture_titles: Default::default(),
 //!     mean: Scores::from([("psnr".to_owned(), Score::One(31.25))]),
 //!     least_gain: None,
 //!     near_references: None,
@@ -53,6 +54,9 @@ pub struct Metrics {
     pub conventions: BTreeMap<String, String>,
     /// The figures, and how they are shown, the most important first.
     pub figures: Vec<Figure>,
+    /// Titles of the pictures that metrics made, by metric.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub picture_titles: BTreeMap<String, String>,
     /// Means of the per-view values.
     pub mean: Scores,
     /// Gain in dB of the view that fares worst over input `baseline`.

@@ -172,6 +172,10 @@ impl Metric for WarpMetric {
             .to_owned()
     }
 
+    fn picture_title(&self) -> Option<&'static str> {
+        Some("Neighbours by depth (red: not seen)")
+    }
+
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured> {
         let Some((score, picture)) = warp::warped(view)? else { return Ok(Measured::default()) };
         let score = Score::several([("psnr", score.psnr), ("seen", score.seen)]);
