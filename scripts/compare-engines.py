@@ -3,9 +3,11 @@
 
 compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ...] [--seeds N] [--picture FILE.svg]
 
-OLD and NEW are work trees, each built by `make build`. OLD prepares each scene and scores the views of both. With several
-factors of the rays, --picture draws PSNR against training time. Times are by the clock; processor time, which a busy machine
-changes less, stands beside them and in the picture.
+OLD and NEW are work trees, each built by `make build`. OLD prepares each scene, NEW scores the views of both; which of them trains
+first changes from seed to seed and from factor to factor. With several factors of the rays, --picture draws PSNR against training
+time. Times are by the clock; processor time, which a busy machine changes less, stands beside them and in the picture. Depth error
+is the mean of the views' median errors in scene units, where true depth is known; seen is the share of pixels whose depth agrees
+with a neighbouring view's. LPIPS needs DATA/weights.
 """
 
 import argparse
@@ -76,12 +78,16 @@ class Result(NamedTuple):
     rays: int
     psnr: float
     ssim: float
+    lpips: float | None
+    depth_error: float | None
+    seen: float | None
     training: Cost
     rendering: Cost
 
     def line(self) -> str:
         memory = max(self.training.memory, self.rendering.memory)
-        figures = f"{self.psnr:.3f} | {self.ssim:.4f} | {self.training.words()} | {self.rendering.words()} | {memory} MiB"
+        others = " | ".join("" if value is None else f"{value:.4f}" for value in (self.lpips, self.depth_error, self.seen))
+        figures = f"{self.psnr:.3f} | {self.ssim:.4f} | {others} | {self.training.words()} | {self.rendering.words()} | {memory} MiB"
         return f"| {self.scene} | {self.build} | {self.seed} | {self.rays / 1e6:g} M | {figures} | {os.getloadavg()[0]:.1f} |"
 
 
@@ -92,9 +98,12 @@ def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build:
     tree, at = getattr(options, build), f"{build}-{seed}-{rays}"
     training = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
     rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
-    run(options.old, "eval", folder, f"{at}/eval", {"views": f"{at}/views", "truth": "scene/truth"}, {})
+    weights = (options.data / "weights").resolve()
+    inputs = {"views": f"{at}/views", "truth": "scene/truth"} | ({"weights": str(weights)} if weights.is_dir() else {})
+    run(options.new, "eval", folder, f"{at}/eval", inputs, {})
     mean = json.loads((folder / at / "eval/metrics.json").read_text())["mean"]
-    return Result(name, build, seed, rays, mean["psnr"], mean["ssim"], training, rendering)
+    depth_error, seen = mean.get("depth", {}).get("median_absolute"), mean.get("warp", {}).get("seen")
+    return Result(name, build, seed, rays, mean["psnr"], mean["ssim"], mean.get("lpips"), depth_error, seen, training, rendering)
 
 
 WIDTH, HEIGHT, LEFT, TOP, BETWEEN = 420, 300, 52, 30, 30
@@ -152,14 +161,16 @@ def main() -> None:
     parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
     options = parser.parse_args()
-    print("| scene | build | seed | rays | PSNR | SSIM | training (processor) | rendering (processor) | peak memory | load |\n" + "| --- " * 10 + "|")
+    print("| scene | build | seed | rays | PSNR | SSIM | LPIPS | depth error | seen | training (processor) | rendering (processor) | peak memory | load |\n" + "| --- " * 13 + "|")
     results = []
     for name in options.only:
         with tempfile.TemporaryDirectory() as folder:
             prepare(options, pathlib.Path(folder), name)
-            for seed, factor, build in itertools.product(range(1, options.seeds + 1), options.rays, ("old", "new")):
-                results.append(measure(options, pathlib.Path(folder), name, build, seed, factor))
-                print(results[-1].line(), flush=True)
+            trainings = itertools.product(range(1, options.seeds + 1), options.rays)
+            for turn, (seed, factor) in enumerate(trainings):
+                for build in ("old", "new") if turn % 2 == 0 else ("new", "old"):
+                    results.append(measure(options, pathlib.Path(folder), name, build, seed, factor))
+                    print(results[-1].line(), flush=True)
     if options.picture:
         options.picture.write_text(picture(results))
 
