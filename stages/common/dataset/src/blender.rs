@@ -2,8 +2,12 @@ use std::path::Path;
 
 use artifact::counted;
 
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::format::Format;
+use crate::found::is_file;
+use crate::split::Split;
 use crate::transforms::{self, Missing};
-use crate::{Dataset, DatasetError, Format, Split, is_file};
 
 /// Reads `transforms_train.json` and, where it is there, `transforms_test.json`: NeRF's synthetic
 /// scenes. An image that isn't there is an error, and names may leave out `.png`. Without test

@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::DatasetError;
+use crate::error::DatasetError;
 
 /// Little-endian numbers from a binary file, with its place in every complaint. Nothing is
 /// allocated by what the file claims.

@@ -6,11 +6,13 @@ use glam::{DMat3, DQuat, DVec3};
 use scene::{Distortion, Intrinsics};
 
 use crate::bytes::Bytes;
-use crate::found::{Found, find, shown};
-use crate::frame::{names, pose_from_world_to_camera};
+use crate::dataset::Dataset;
+use crate::error::{DatasetError, shown};
+use crate::format::Format;
+use crate::found::{Found, find};
+use crate::frame::{Frame, names, pose_from_world_to_camera};
 use crate::photograph::{fitted, look};
 use crate::text::read_text;
-use crate::{Dataset, DatasetError, Format, Frame};
 
 /// A reconstruction as COLMAP writes it (its documentation, "Output format").
 #[derive(Debug, Default)]

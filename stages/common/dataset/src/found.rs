@@ -3,7 +3,7 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use artifact::printable;
+use crate::error::{DatasetError, shown};
 
 /// What stands at a place where a file is wanted.
 #[derive(Debug, PartialEq, Eq)]
@@ -66,18 +66,17 @@ fn kind(of: FileType) -> &'static str {
     }
 }
 
-/// A path for a message, on one line; bytes that aren't UTF-8 are spelled out, as in `\xFF`.
-pub(crate) fn shown(path: &Path) -> String {
-    match path.to_str() {
-        Some(text) => printable(text).into_owned(),
-        None => format!("{path:?}").trim_matches('"').to_owned(),
+/// Whether a file is there; something else in its place is refused.
+pub(crate) fn is_file(path: &Path) -> Result<bool, DatasetError> {
+    match find(path, "a file") {
+        Found::File => Ok(true),
+        Found::Nothing(_) => Ok(false),
+        Found::Other(reason) => Err(DatasetError::Place { reason }),
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::ffi::OsStr;
-    use std::os::unix::ffi::OsStrExt as _;
     use std::os::unix::fs::symlink;
     use std::os::unix::net::UnixListener;
 
@@ -117,11 +116,5 @@ mod tests {
             let Found::Nothing(text) = found(name) else { panic!("{name}: {:?}", found(name)) };
             assert!(text.contains(words), "{text}");
         }
-    }
-
-    #[test]
-    fn paths_are_shown_on_one_line() {
-        assert_eq!(shown(Path::new("a\u{1b}[31m/b\n.png")), "a\\u{1b}[31m/b\\n.png");
-        assert_eq!(shown(Path::new(OsStr::from_bytes(b"a\xff\n.png"))), "a\\xFF\\n.png");
     }
 }

@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
 
-use crate::DatasetError;
-use crate::found::shown;
+use crate::error::{DatasetError, shown};
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]

@@ -4,11 +4,14 @@ use artifact::counted;
 use glam::{DMat3, DVec3};
 use scene::{Distortion, Intrinsics, pose_of};
 
+use crate::colmap;
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::format::Format;
 use crate::found::{Found, find};
-use crate::frame::names;
+use crate::frame::{Frame, names};
 use crate::npy::read_matrix;
 use crate::photograph::{Stored, fitted, is_image_name, look};
-use crate::{Dataset, DatasetError, Format, Frame, colmap};
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal
 /// length), near and far.

@@ -10,7 +10,8 @@ use pixels::{
 };
 use scene::Intrinsics;
 
-use crate::{DatasetError, Frame};
+use crate::error::DatasetError;
+use crate::frame::Frame;
 
 /// Whether a file's name is that of an image.
 pub(crate) fn is_image_name(path: &Path) -> bool {

@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::DatasetError;
+use crate::error::DatasetError;
 
 /// A whole text file: UTF-8, with or without a byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {

@@ -4,12 +4,15 @@ use artifact::{counted, relative_path};
 use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
+use crate::dataset::Dataset;
+use crate::error::DatasetError;
+use crate::format::Format;
 use crate::found::{Found, find};
-use crate::frame::names;
+use crate::frame::{Frame, names};
 use crate::number::{Number, words_as_text};
 use crate::photograph::{Stored, fitted, image_file, is_exr, look};
+use crate::split::Split;
 use crate::text::read_text;
-use crate::{Dataset, DatasetError, Format, Frame, Split};
 
 /// `transforms.json`. What a frame doesn't say for itself holds for all.
 #[derive(Deserialize)]
