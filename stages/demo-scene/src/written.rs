@@ -11,8 +11,8 @@ use pixels::{Channel, PixelError, Rgba8, SampleType, write_exr, write_png};
 use serde_json::{Value, json};
 use stage::Context;
 
+use crate::params::{Form, Params};
 use crate::render::RenderedImage;
-use crate::{Form, Params};
 
 /// JPEG's quality: that of a careful camera.
 const QUALITY: u8 = 95;
