@@ -4,6 +4,7 @@ use glam::Vec3;
 use pixels::linear_from_srgb;
 use serde_json::{Value, json};
 
+use crate::coordinates::COORDINATES;
 use crate::mesh::Mesh;
 
 /// glTF's numbers for kinds of components and of buffers.
@@ -54,7 +55,7 @@ fn description(mesh: &Mesh) -> Value {
     let length = 12 * vertices;
     json!({
         "asset": {"version": "2.0", "generator": "nerf-sr export",
-            "extras": {"coordinates": crate::COORDINATES}},
+            "extras": {"coordinates": COORDINATES}},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],

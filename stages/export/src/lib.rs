@@ -15,6 +15,7 @@
 mod cameras;
 mod colour;
 mod consensus;
+mod coordinates;
 mod fusion;
 mod glb;
 mod lattice;
@@ -41,13 +42,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use stage::{Context, Stage};
 
+use coordinates::COORDINATES;
 use lattice::Lattice;
 use mesh::Mesh;
 use seen::SeenView;
-
-/// What coordinates in all files are.
-pub(crate) const COORDINATES: &str =
-    "coordinates, scale and orientation are those of the input's cameras";
 
 /// Name of the summary in the artifact.
 pub const EXPORT_FILE: &str = "export.json";

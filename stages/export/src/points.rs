@@ -1,5 +1,6 @@
 use std::io::{self, Write};
 
+use crate::coordinates::COORDINATES;
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
@@ -22,7 +23,7 @@ pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()>
         named(["red", "green", "blue"], Kind::Byte),
     ]
     .concat();
-    write_header(file, &[crate::COORDINATES.to_owned()], surfels.len(), &properties)?;
+    write_header(file, &[COORDINATES.to_owned()], surfels.len(), &properties)?;
     for surfel in surfels {
         write_floats(file, &surfel.position.as_vec3().to_array())?;
         write_floats(file, &surfel.normal.as_vec3().to_array())?;

@@ -2,6 +2,7 @@ use std::io::{self, Write};
 
 use glam::{DQuat, DVec3};
 
+use crate::coordinates::COORDINATES;
 use crate::ply::{Kind, write_floats, write_header};
 use crate::surfel::Surfel;
 
@@ -27,7 +28,7 @@ pub(crate) fn write(file: &mut impl Write, surfels: &[Surfel]) -> io::Result<()>
         rot_2 rot_3";
     let properties: Vec<_> =
         names.split_whitespace().map(|name| (name.to_owned(), Kind::Float)).collect();
-    write_header(file, &[crate::COORDINATES.to_owned()], surfels.len(), &properties)?;
+    write_header(file, &[COORDINATES.to_owned()], surfels.len(), &properties)?;
     surfels.iter().try_for_each(|surfel| write_floats(file, &splat(surfel)))
 }
 
