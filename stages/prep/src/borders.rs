@@ -8,7 +8,7 @@ use pixels::Rgba8;
 use rayon::prelude::*;
 use scene::Background;
 
-use crate::frame_name;
+use crate::frame_name::frame_name;
 
 /// Views that are looked at, spread evenly: enough to tell nine of ten.
 pub(crate) const MOST_VIEWS: usize = 20;

@@ -19,6 +19,7 @@
 mod borders;
 mod bounds;
 mod degrade;
+mod frame_name;
 mod image_plan;
 mod params;
 mod pose_warnings;
@@ -39,6 +40,7 @@ use stage::{Context, Stage};
 use borders::{Behind, borders};
 pub use bounds::{SeenDepths, SpaceError, SpaceKind, place};
 pub use degrade::{LrImage, degrade};
+use frame_name::frame_name;
 use image_plan::ImagePlan;
 pub use params::{LensHandling, LrSource, Params, SplitKind};
 use scene_plan::{ScenePlan, space_note, warnings_of_poses};
@@ -141,9 +143,4 @@ fn background(params: &Params, train: &[&Frame]) -> anyhow::Result<(Background, 
     let borders = borders(train)?;
     let sign = (borders.behind != Behind::Transparent).then(|| borders.to_string());
     Ok((borders.background(), sign))
-}
-
-/// Where in the data set a complaint belongs.
-fn frame_name(frame: &Frame) -> String {
-    format!("frame {}", frame.name)
 }

@@ -12,7 +12,7 @@ use scene::{VIEWS_FILE, View, Views, mask_file};
 use stage::{Context, Progress};
 
 use crate::degrade::{self, LrImage, degrade};
-use crate::frame_name;
+use crate::frame_name::frame_name;
 use crate::scene_plan::ScenePlan;
 
 /// Writes a scene's subtrees. No more images than threads are held at once.
