@@ -6,7 +6,7 @@ use refinement::{
     with_references,
 };
 
-use crate::Params;
+use crate::params::Params;
 
 /// A trained network of either kind.
 pub(crate) enum AnyRefiner {
