@@ -5,10 +5,10 @@ use serde::Serialize;
 use serde_json::Value;
 use stage::Context;
 
-use crate::Params;
 use crate::figures::is_known;
 use crate::gather::Report;
 use crate::layers::{Group, Layer, layers, pixels_of};
+use crate::params::Params;
 use crate::pictures::{Picture, Wanted, pictures};
 use crate::row::Row;
 use crate::scale::Scale;
