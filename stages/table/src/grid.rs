@@ -3,9 +3,9 @@
 use serde_json::Value;
 
 use crate::figures::Figures;
+use crate::params::Params;
 use crate::rows::MISSING;
-use crate::values::{distinct, mean, of, plain, together};
-use crate::{Params, Row};
+use crate::values::{Row, distinct, mean, of, plain, together};
 
 /// Names that aren't keys: what a result has, not what it is of.
 pub(crate) const PLACES: [&str; 2] = ["commit", "machine"];

@@ -4,9 +4,9 @@ use artifact::{FailedPoint, label};
 
 use crate::figures::Figures;
 use crate::grid::{NOTHING, PLACES, Shape, grid};
+use crate::params::Params;
 use crate::rows::MISSING;
-use crate::values::{distinct, mean, of};
-use crate::{Params, Row};
+use crate::values::{Row, distinct, mean, of};
 
 /// The tables, and the points that failed.
 pub(crate) fn markdown(

@@ -1,7 +1,7 @@
 //! Rows to Markdown.
 
 use super::*;
-use crate::{Gain, Group};
+use crate::params::{Gain, Group};
 use metrics::AnyMetrics;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;

@@ -4,16 +4,14 @@ use std::path::Path;
 use anyhow::Context as _;
 use artifact::{RunNode, RunRecord};
 use metrics::AnyMetrics;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 
-use crate::Params;
 use crate::figures::Figures;
+use crate::params::Params;
+use crate::values::Row;
 
 /// Why a row has no values.
 pub(crate) const MISSING: &str = "missing";
-
-/// A result: its keys (axes of the run, `method`), then its values, by name.
-pub type Row = Map<String, Value>;
 
 /// A row for every result of a run, and for what was left out of it: in the order of the groups,
 /// and otherwise of the run.

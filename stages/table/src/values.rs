@@ -1,8 +1,9 @@
 //! Values of rows by their names: means, combinations, and how they are shown.
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
-use crate::Row;
+/// A result: its keys (axes of the run, `method`), then its values, by name.
+pub type Row = Map<String, Value>;
 
 /// Combinations of values that keys have, in the order of the rows; a single empty one without
 /// keys.
