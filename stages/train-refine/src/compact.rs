@@ -7,8 +7,9 @@ use refinement::{
 use stage::Context;
 
 use crate::examples::{Examples, lr_observations};
+use crate::params::CompactParams;
+use crate::said::say;
 use crate::steps::train;
-use crate::{CompactParams, say};
 
 /// Trains our network by internal learning.
 pub(crate) fn run(context: &Context, net: &CompactParams, seed: u64) -> anyhow::Result<()> {

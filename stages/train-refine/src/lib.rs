@@ -21,10 +21,10 @@ mod compact;
 mod examples;
 mod paper;
 mod params;
+mod said;
 mod steps;
 
 use contract::{Input, Output};
-use refinement::RefinerFile;
 use stage::{Context, Stage};
 
 pub use params::{CompactParams, Net, PaperParams, Params};
@@ -87,15 +87,4 @@ impl Stage for TrainRefine {
             Net::Paper(net) => paper::run(context, net, params.seed),
         }
     }
-}
-
-/// What training brought to some views.
-fn say(context: &Context, views: &str, file: &RefinerFile) -> anyhow::Result<()> {
-    let RefinerFile { rendered_psnr, refined_psnr, strength, .. } = file;
-    let summary = format!(
-        "{views}: {rendered_psnr:.2} dB rendered, {refined_psnr:.2} dB refined (residual weight \
-        {strength:.2})"
-    );
-    context.say(&summary);
-    context.write_summary(&summary)
 }

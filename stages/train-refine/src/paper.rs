@@ -5,8 +5,9 @@ use refinement::{Network, REFINER_FILE, RefinerFile, WEIGHTS_FILE};
 use stage::Context;
 
 use crate::examples::Examples;
+use crate::params::PaperParams;
+use crate::said::say;
 use crate::steps::train;
-use crate::{PaperParams, say};
 
 /// Files with VGG-19's weights: all of them as torchvision names them, or the first blocks in
 /// Caffe's scaling.
