@@ -7,10 +7,11 @@ use nets::Weights;
 use pixels::{Filter, Image, psnr_of, read_png, resize_pillow};
 use tch::{Kind, Tensor, no_grad};
 
+use crate::fit;
 use crate::imdn::Imdn;
 use crate::liif::Liif;
+use crate::network::Network;
 use crate::swinir::SwinIr;
-use crate::{Network, fit};
 
 const FILES: [&str; 7] = [
     "imdn",

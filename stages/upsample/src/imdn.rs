@@ -1,8 +1,8 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{TchError, Tensor};
 
-use crate::Network;
 use crate::layers::{contrast, count, leaky, root};
+use crate::network::Network;
 
 /// IMDN (Hui et al. 2019, "Lightweight Image Super-Resolution with Information Multi-distillation
 /// Network"), by the names of its released weights. Width and scale are what the file says.

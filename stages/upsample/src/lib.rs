@@ -20,6 +20,7 @@ mod goldens;
 mod imdn;
 mod layers;
 mod liif;
+mod network;
 mod swinir;
 
 use anyhow::Context as _;
@@ -36,7 +37,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use stage::{Context, Stage};
-use tch::{TchError, Tensor, no_grad};
+use tch::no_grad;
+
+use network::Network;
 
 /// Parameters of `upsample`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -159,16 +162,6 @@ impl Stage for Upsample {
         let name = format!("{:?}", params.method).to_lowercase();
         context.write_summary(&format!("{}, by {name}", artifact::counted(hr.views.len(), "view")))
     }
-}
-
-/// A network that enlarges images.
-trait Network: Send {
-    /// Times that it enlarges; `None`: any.
-    fn scale(&self) -> Option<i64>;
-
-    /// An image (1 × 3 × rows × columns, 0..1) at that many rows and columns; a network of one
-    /// scale enlarges by that.
-    fn enlarge(&self, image: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError>;
 }
 
 /// How a network is made of its weights.

@@ -1,8 +1,8 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{TchError, Tensor};
 
-use crate::Network;
 use crate::layers::{Linear, count};
+use crate::network::Network;
 
 /// LIIF (Chen et al. 2021, "Learning Continuous Image Representation with Local Implicit Image
 /// Function") behind EDSR's baseline encoder, by the names of its released weights: unfolded

@@ -1,8 +1,8 @@
 use nets::{Conv, Weights, WeightsError};
 use tch::{Kind, TchError, Tensor};
 
-use crate::Network;
 use crate::layers::{LayerNorm, Linear, count, leaky, root};
+use crate::network::Network;
 
 /// SwinIR (Liang et al. 2021, "SwinIR: Image Restoration Using Swin Transformer") for
 /// super-resolution, by the names of its released weights: the classical, the lightweight and the
