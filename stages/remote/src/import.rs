@@ -6,12 +6,11 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, print_line, sized};
-use store::{Arrival, Record, Store};
+use store::{Arrival, Record, Store, is_hash};
 
 use crate::archive::{EXPORT, INDEX, Index, action_entry, object_entry};
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
 use crate::progress::Progress;
-use crate::selection::is_hash;
 use crate::transfer::Checked;
 
 /// A longer path is no path.

@@ -4,9 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use artifact::{Damage, Failure, FileEntry, MANIFEST_FILE, Manifest, relative_path, report_line};
-use store::{Arrival, Entered, Locked, Record, RunFile, Store};
-
-use crate::selection::is_hash;
+use store::{Arrival, Entered, Locked, Record, RunFile, Store, is_hash};
 
 /// A record is a few kilobytes.
 pub(crate) const RECORD_LIMIT: u64 = 4 << 20;

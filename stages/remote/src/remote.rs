@@ -12,7 +12,7 @@ use object_store::path::Path;
 use object_store::{
     ClientOptions, GetResult, ObjectStore, ObjectStoreExt as _, PutPayload, RetryConfig,
 };
-use store::FORMAT;
+use store::{FORMAT, is_hash};
 
 /// A server that says nothing for so long is given up.
 const LONGEST_SILENCE: Duration = Duration::from_secs(60);
@@ -189,7 +189,7 @@ impl Remote {
         let keys = files
             .keys()
             .filter_map(|path| Some(path.filename()?.strip_suffix(".json")?.to_owned()));
-        Ok(keys.filter(|key| crate::selection::is_hash(key)).collect())
+        Ok(keys.filter(|key| is_hash(key)).collect())
     }
 
     /// Refuses a remote of a newer form, and for reading one that isn't marked; marks it for

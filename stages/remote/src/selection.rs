@@ -80,11 +80,6 @@ pub(crate) fn one<'a>(
     Err(Failure::Usage(problem).into())
 }
 
-/// Whether a name can be a key or an identity: no other becomes part of a path.
-pub(crate) fn is_hash(name: &str) -> bool {
-    name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -130,14 +125,6 @@ mod tests {
                 }
                 (found, expected) => panic!("{found:?} where {expected:?}"),
             }
-        }
-    }
-
-    #[test]
-    fn names_that_no_path_is_made_of() {
-        assert!(is_hash(&"0a".repeat(32)));
-        for name in ["", "..", &"0A".repeat(32), &"g".repeat(64), &"0".repeat(63), "/etc/passwd"] {
-            assert!(!is_hash(name), "{name}");
         }
     }
 }

@@ -4,6 +4,7 @@
 //! * [`Record`], [`Unfinished`]: an action that is done, and one that was begun, by the key.
 //! * [`Attempt`], [`Checked`]: from a stage's output to an object and its record.
 //! * [`Arrival`]: an artifact that comes from another store.
+//! * [`is_hash`]: which names can be keys or identities.
 //! * [`KeyLock`]: one OS lock a key. [`Entered`] and [`Closed`]: runs and garbage collection keep
 //!   clear of each other.
 //! * [`RunFile`], [`Run`], [`Waiting`]: what runs and pins need.
@@ -48,4 +49,5 @@ pub use error::StoreError;
 pub use folder::Store;
 pub use format::FORMAT;
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
+pub use objects::is_hash;
 pub use runs::{Run, RunFile, Waiting};

@@ -11,7 +11,7 @@ impl Store {
     /// Identities of all objects, sorted. Names that can't be an identity are somebody else's.
     pub fn objects(&self) -> Result<Vec<String>, StoreError> {
         let mut names = self.names("objects")?;
-        names.retain(|name| is_identity(name));
+        names.retain(|name| is_hash(name));
         Ok(names)
     }
 
@@ -21,7 +21,7 @@ impl Store {
         let mut foreign = Vec::new();
         for entry in at(&folder, fs::read_dir(&folder))? {
             let entry = at(&folder, entry)?;
-            if !entry.file_name().to_str().is_some_and(is_identity) {
+            if !entry.file_name().to_str().is_some_and(is_hash) {
                 foreign.push(entry.path());
             }
         }
@@ -92,8 +92,9 @@ impl Store {
     }
 }
 
-/// Whether a name is a hash as the store writes it: in lower case.
-fn is_identity(name: &str) -> bool {
+/// Whether a name can be a key or an identity, in lower case as the store writes them: no other
+/// becomes part of a path.
+pub fn is_hash(name: &str) -> bool {
     name.len() == 64 && name.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'))
 }
 
@@ -123,6 +124,14 @@ mod tests {
         }
         assert_eq!(store.objects().unwrap(), [object]);
         assert_eq!(store.foreign_entries().unwrap(), others.map(|name| store.object(&name)));
+    }
+
+    #[test]
+    fn names_that_no_path_is_made_of() {
+        assert!(is_hash(&"0a".repeat(32)));
+        for name in ["", "..", &"0A".repeat(32), &"g".repeat(64), &"0".repeat(63), "/etc/passwd"] {
+            assert!(!is_hash(name), "{name}");
+        }
     }
 
     /// Actions with different keys mend one damaged object at once, again and again.
