@@ -124,7 +124,7 @@ impl File {
     /// line.
     pub fn parse(bytes: &[u8], path: &Path) -> Result<Self, PipelineError> {
         let fail = |line, problem| PipelineError { place: place(path, line), problem };
-        let text = yaml_lines::decode(bytes).map_err(|(line, problem)| fail(line, problem))?;
+        let text = yaml_lines::decode(bytes).map_err(|e| fail(e.line, e.problem.to_owned()))?;
         let located =
             |e: serde_yaml::Error| fail(e.location().map(|at| at.line()), without_line(&e));
         // serde_yaml takes duplicate keys of maps silently; its own `Mapping` refuses them.

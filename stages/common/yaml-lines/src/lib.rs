@@ -6,22 +6,30 @@ use std::fmt;
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_yaml::Value;
 
-/// The text of a file in UTF-8, without its byte order mark; else the line, where it is known, and
-/// what to do.
-pub fn decode(bytes: &[u8]) -> Result<&str, (Option<usize>, String)> {
+/// A file whose bytes are no text in UTF-8.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{problem}")]
+pub struct DecodeError {
+    /// Its line, where that is known.
+    pub line: Option<usize>,
+    /// What is wrong and what to do.
+    pub problem: &'static str,
+}
+
+/// The text of a file in UTF-8, without its byte order mark.
+pub fn decode(bytes: &[u8]) -> Result<&str, DecodeError> {
     let is_utf16 = bytes.starts_with(&[0xff, 0xfe])
         || bytes.starts_with(&[0xfe, 0xff])
         || bytes.iter().take(2).any(|b| *b == 0);
     if is_utf16 {
-        return Err((
-            None,
-            "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)".to_owned(),
-        ));
+        let problem = "the text is UTF-16; save it as UTF-8 (iconv -f UTF-16 -t UTF-8)";
+        return Err(DecodeError { line: None, problem });
     }
     let bytes = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
     std::str::from_utf8(bytes).map_err(|e| {
         let line = 1 + bytes[..e.valid_up_to()].iter().filter(|b| **b == b'\n').count();
-        (Some(line), "the text isn't UTF-8; save the file as UTF-8".to_owned())
+        let problem = "the text isn't UTF-8; save the file as UTF-8";
+        DecodeError { line: Some(line), problem }
     })
 }
 
@@ -264,14 +272,14 @@ mod tests {
         assert_eq!(decode(b"\xef\xbb\xbfa: 1"), Ok("a: 1"));
         assert_eq!(decode("ä: 1\r\n".as_bytes()), Ok("ä: 1\r\n"));
         let utf16 =
-            |bytes: &[u8]| decode(bytes).unwrap_err().1.contains("UTF-16; save it as UTF-8");
+            |bytes: &[u8]| decode(bytes).unwrap_err().problem.contains("UTF-16; save it as UTF-8");
         assert!(
             utf16(b"\xff\xfea\0:\0")
                 && utf16(b"\xfe\xff\0a\0:")
                 && utf16(b"a\0:\0")
                 && utf16(b"\0a\0:")
         );
-        let (line, problem) = decode(b"a: 1\nb: \xe4\n").unwrap_err();
+        let DecodeError { line, problem } = decode(b"a: 1\nb: \xe4\n").unwrap_err();
         assert!(line == Some(2) && problem.contains("save the file as UTF-8"), "{problem}");
     }
 
