@@ -1,10 +1,30 @@
 //! Garbage collection by reachability: what roots reach stays, everything else goes.
 //!
-//! * `roots`: pins, held locks, unfinished actions with a checkpoint, the plan, runs in progress
-//!   and recent runs.
-//! * Submissions with jobs are roots, too; where a cluster can't be asked, all of them are.
+//! * [`judge`]: decides, by a [`Choice`] of how long things stay. [`Verdict`]: what it decided;
+//!   [`Verdict::carry_out`] removes what goes.
+//! * [`Fate`]: what becomes of one artifact or unfinished action.
+//! * [`Root`]: what is needed, and why. `roots`: pins, held locks, unfinished actions with a
+//!   checkpoint, the plan, runs in progress and recent runs. Submissions with jobs are roots, too;
+//!   where a cluster can't be asked, all of them are.
 //! * `contents`: what lies in the store.
 //! * `reach`: from the roots to what they name, and to what that was made of.
+//!
+//! ```
+//! use garbage::{Choice, Root, judge};
+//! use store::{Locked, Store};
+//!
+//! let folder = tempfile::tempdir()?;
+//! let store = Store::open(folder.path())?;
+//! let plan = Root { why: "the pipeline needs it".to_owned(), ..Root::default() };
+//! let choice = Choice { keep_days: 30, drop_unfinished: false, drop_old: false };
+//! if let Locked::Held(closed) = store.try_close()? {
+//!     let verdict = judge(&store, plan, choice)?;
+//!     verdict.fates().iter().for_each(|fate| println!("{fate}"));
+//!     assert_eq!(verdict.bytes(), (0, 0));
+//!     verdict.carry_out(&store, &closed)?;
+//! }
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 mod contents;
 mod reach;

@@ -1,4 +1,17 @@
 //! YAML as people write it: encodings, merge keys, and the lines on which keys stand.
+//!
+//! * [`decode`]: a file's bytes as text, or the [`DecodeError`] that says what to do.
+//! * [`merge`]: replaces merge keys. [`not_finite`]: finds a number that JSON doesn't have.
+//! * [`line_of`]: the line of a key. [`line_of_duplicate`]: the line of a key that stands twice.
+//!
+//! serde_yaml reads the values; this crate finds the lines, so that complaints can name them.
+//!
+//! ```
+//! let text = yaml_lines::decode(b"stages:\n  train:\n    run: train-ss\n")?;
+//! assert_eq!(yaml_lines::line_of(text, &["stages", "train", "run"]), Some(3));
+//! assert_eq!(yaml_lines::line_of_duplicate("a: 1\nb: 2\na: 3\n"), Some(3));
+//! # Ok::<(), yaml_lines::DecodeError>(())
+//! ```
 
 use std::collections::BTreeSet;
 use std::fmt;
