@@ -52,3 +52,16 @@ impl CounterRng {
         ((u128::from(self.next()) * u128::from(bound)) >> 64) as u64
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::CounterRng;
+
+    /// Results that are made anew must be those made before.
+    #[test]
+    fn draws_stay_as_they_are() {
+        let mut rng = CounterRng::new(7, 1, 3);
+        assert_eq!(rng.uniform(), 16_024_985.0 / 16_777_216.0);
+        assert_eq!(rng.below(1000), 106);
+    }
+}
