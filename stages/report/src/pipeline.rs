@@ -2,6 +2,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use artifact::{RunInput, RunNode, RunRecord, UnfinishedNode, counted, sized};
+use contract::plain;
 use maud::{Markup, html};
 use serde_json::Value;
 use stage_call::{seconds, utc};
@@ -313,14 +314,13 @@ fn parameters(given: &Values, resolved: &Values) -> Markup {
 
 /// A parameter's value; where that was left to the scene, the one in use.
 fn parameter(given: &Value, resolved: Option<&Value>) -> Markup {
-    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
     html! {
         @match resolved {
             Some(value) if given.is_null() && !value.is_null() => {
-                (text(value)) " " small { "by scene" }
+                (plain(value)) " " small { "by scene" }
             }
             _ if given.is_null() => small { "default" },
-            _ => (text(given)),
+            _ => (plain(given)),
         }
     }
 }

@@ -1,11 +1,12 @@
 //! One table: a line for each combination of the rows' keys, the best of each group marked.
 
+use contract::plain;
 use serde_json::Value;
 
 use crate::figures::Figures;
 use crate::params::Params;
 use crate::rows::MISSING;
-use crate::values::{Row, distinct, mean, of, plain, together};
+use crate::values::{Row, distinct, mean, of, together};
 
 /// Names that aren't keys: what a result has, not what it is of.
 pub(crate) const PLACES: [&str; 2] = ["commit", "machine"];

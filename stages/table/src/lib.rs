@@ -4,7 +4,7 @@
 //! * `rows`: a row for every result of a run, with its scores, its times, and where it was made.
 //! * `markdown`: these rows as tables for people.
 //! * `grid`: one of them, means where several results fall into one cell, the best marked.
-//! * `values`: values by their names, and how they are shown.
+//! * `values`: a row, and values of rows by their names.
 //!
 //! A sink: it gets the run's record and is never cached. What a failed point would have shown is
 //! named; what was left out says why.
@@ -18,7 +18,7 @@ mod values;
 
 use anyhow::Context as _;
 use artifact::{Failure, RunRecord};
-use contract::{Input, Output};
+use contract::{Input, Output, plain};
 use stage::{Context, Stage};
 
 use figures::Figures;
@@ -77,7 +77,7 @@ fn write_csv(context: &Context, rows: &[Row]) -> anyhow::Result<()> {
     let mut writer = csv::Writer::from_path(&path).with_context(place)?;
     writer.write_record(&names).with_context(place)?;
     for row in rows {
-        let cells = names.iter().map(|name| row.get(*name).map(values::plain).unwrap_or_default());
+        let cells = names.iter().map(|name| row.get(*name).map(plain).unwrap_or_default());
         writer.write_record(cells).with_context(place)?;
     }
     writer.flush().with_context(place)

@@ -1,5 +1,6 @@
-//! Values of rows by their names: means, combinations, and how they are shown.
+//! Values of rows by their names: means, combinations, and what rows have in common.
 
+use contract::plain;
 use serde_json::{Map, Value};
 
 /// A result: its keys (axes of the run, `method`), then its values, by name.
@@ -38,9 +39,4 @@ pub(crate) fn mean(rows: &[Row], name: &str) -> Option<f64> {
 pub(crate) fn together(rows: &[Row], name: &str) -> String {
     let with: Vec<Row> = rows.iter().filter(|row| row.contains_key(name)).cloned().collect();
     distinct(&with, &[name.to_owned()]).concat().join(", ")
-}
-
-/// A value as text, without quotes.
-pub(crate) fn plain(value: &Value) -> String {
-    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }

@@ -107,8 +107,8 @@ fn choice((word, meaning): (&Value, &str)) -> (String, String) {
     (plain(word), meaning.replace('\n', " "))
 }
 
-/// A value without quotes.
-fn plain(value: &Value) -> String {
+/// A value as text, without quotes.
+pub fn plain(value: &Value) -> String {
     value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 

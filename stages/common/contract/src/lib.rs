@@ -6,7 +6,7 @@
 //!   are hashed.
 //! * [`Rule`]: what parameters and inputs must be together.
 //! * [`RENAMES`]: names that parameters and inputs had once.
-//! * [`ParameterSection`]: parameters as people read them.
+//! * [`ParameterSection`]: parameters as people read them. [`plain`]: a value as they read it.
 //!
 //! The runner checks values by this crate before it starts a stage. The stage checks them again.
 //!
@@ -39,7 +39,7 @@ mod values;
 mod variant_tests;
 
 pub use describe::{Description, DescriptionError};
-pub use documented::{GROUPS, ParameterSection, ParameterText, by_group};
+pub use documented::{GROUPS, ParameterSection, ParameterText, by_group, plain};
 pub use input::Input;
 pub use output::Output;
 pub use parameters::{ParameterProblem, Schema, SchemaError};

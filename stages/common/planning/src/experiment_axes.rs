@@ -1,6 +1,7 @@
 use std::collections::BTreeMap;
 
 use artifact::known_names;
+use contract::plain;
 use serde_json::{Map, Value};
 
 use crate::axes::{Axis, AxisValue, Kind, Scope, Setting, folder};
@@ -183,7 +184,7 @@ impl Asked<'_> {
     /// A parameter with several values.
     fn sweep(&self, name: &str, values: &[Value]) -> Result<Axis, PlanError> {
         let values = values.iter().map(|value| {
-            let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            let text = plain(value);
             Ok(AxisValue {
                 text,
                 settings: vec![self.scope.setting(Kind::Parameter, name, value)?],

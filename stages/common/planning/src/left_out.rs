@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use artifact::known_names;
+use contract::plain;
 use serde_json::Value;
 
 use crate::check::needs;
@@ -89,7 +90,7 @@ impl Files {
     pub(crate) fn missing(&self, stage: &str, parameters: &Value) -> Option<String> {
         let mut path = self.of.get(stage)?.clone();
         for (name, value) in parameters.as_object().into_iter().flatten() {
-            let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+            let text = plain(value);
             path = path.replace(&format!("{{{name}}}"), &text);
         }
         (!self.data.join(&path).is_file()).then(|| format!("no {path}"))
