@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 
 use crate::params::{Combine, FieldParams, GridParams, MlpParams, Params};
 use crate::pixel_sampler::Order;
-use crate::sub_pixel_rays::warmup_stages;
+use crate::sub_pixel_rays::{rays_per_side, warmup_stages};
 use crate::supervision::Supervision;
 
 /// Epochs of the published trainings: for Blender's scenes, and for photographs in NDC.
@@ -178,7 +178,7 @@ impl Params {
 
     /// Sub-pixel rays along each side of an LR pixel, once all are cast.
     fn side(&self) -> u64 {
-        (self.supersample - 1e-6).ceil() as u64
+        rays_per_side(self.supersample)
     }
 
     /// Decides every default for a scene.
@@ -391,8 +391,7 @@ impl Resolved {
     /// Bundles of rays that are drawn from the middle of the images: those of the first
     /// `precrop_steps` steps.
     pub fn precrop_bundles(&self) -> u64 {
-        let (batch, side) =
-            (u64::from(self.max_rays_per_step), (self.supersample - 1e-6).ceil() as u64);
+        let (batch, side) = (u64::from(self.max_rays_per_step), rays_per_side(self.supersample));
         let doublings = warmup_stages(side);
         let steps_of_stage = (self.supersample_warmup * self.rays as f64
             / f64::from(doublings.max(1))) as u64

@@ -36,6 +36,12 @@ impl SubPixelRays {
     }
 }
 
+/// Sub-pixel rays along a side of an LR pixel, for a scale: a scale that isn't whole takes one more.
+/// A scale that is whole but for rounding is whole.
+pub(crate) fn rays_per_side(scale: f64) -> u64 {
+    (scale - 1e-6).ceil() as u64
+}
+
 /// How often the sub-pixel rays along a side double before all are cast: as many stages has the
 /// warm-up.
 pub(crate) fn warmup_stages(side: u64) -> u32 {

@@ -3,6 +3,7 @@ use pixels::Filter;
 use crate::hr_cache::HrCache;
 use crate::photographs::Photographs;
 use crate::pixel_sampler::Order;
+use crate::sub_pixel_rays::rays_per_side;
 use crate::supervision::Supervision;
 
 /// How to supersample.
@@ -56,7 +57,7 @@ impl SupersamplingOptions {
         let hr =
             references.iter().flat_map(|r| &r.images).map(|image| (image.width(), image.height()));
         let smallest = lr.chain(hr).reduce(|a, b| (a.0.min(b.0), a.1.min(b.1))).unwrap_or((1, 1));
-        let side = |scale: f64, most: usize| ((scale - 1e-6).ceil() as usize).clamp(1, most);
+        let side = |scale: f64, most: usize| (rays_per_side(scale) as usize).clamp(1, most);
         [side(self.scale[0], smallest.0), side(self.scale[1], smallest.1)]
     }
 }
