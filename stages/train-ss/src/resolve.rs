@@ -23,6 +23,8 @@ const DISTORTION_IN_CONTRACTION: f64 = 0.002;
 const FLOATER_LOSS: f64 = 0.001;
 /// How much more often detail is drawn, in random order.
 const PIXEL_IMPORTANCE: f64 = 10.0;
+/// Steps in which the learning rates of a grid rise.
+const WARM_UP_STEPS: u64 = 100;
 /// Gradients shorter than so many times the mean are drawn at random.
 const ROULETTE: f32 = 0.25;
 /// Cells of the finest level for each LR pixel across the field.
@@ -421,7 +423,7 @@ impl Resolved {
             level_rate: grid.level_rate,
             mlp_learning_rate: grid.mlp_learning_rate,
             learning_rate_decay: grid.learning_rate_decay,
-            warm_up: 100,
+            warm_up: WARM_UP_STEPS,
             ema_decay: grid.ema_decay as f32,
             regularisers: Regularisers {
                 distortion: regularisers.distortion as f32,

@@ -15,6 +15,11 @@ pub(crate) struct Perspective {
 /// How far corners move, at most, as a share of the half width and height.
 const MOST_CORNER_SHIFT_SHARE: f64 = 0.3;
 
+/// How far a corner moves along a side of that size.
+fn corner_shift(size: usize, rng: &mut CounterRng) -> f64 {
+    rng.below((MOST_CORNER_SHIFT_SHARE * (size / 2) as f64) as u64 + 1) as f64
+}
+
 impl Perspective {
     /// No change.
     pub(crate) fn identity(width: usize, height: usize) -> Self {
@@ -23,13 +28,10 @@ impl Perspective {
 
     /// A random one.
     pub(crate) fn draw(width: usize, height: usize, rng: &mut CounterRng) -> Self {
-        let mut inwards = |size: usize| {
-            rng.below((MOST_CORNER_SHIFT_SHARE * (size / 2) as f64) as u64 + 1) as f64
-        };
         let (right, bottom) = (width as f64 - 1.0, height as f64 - 1.0);
         let corners = [(0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)];
         let moved = corners.map(|(x, y)| {
-            let (dx, dy) = (inwards(width), inwards(height));
+            let (dx, dy) = (corner_shift(width, rng), corner_shift(height, rng));
             (if x > 0.0 { x - dx } else { dx }, if y > 0.0 { y - dy } else { dy })
         });
         let Some(map) = homography(moved, corners) else { return Self::identity(width, height) };

@@ -2,6 +2,8 @@
 //! function that adds the loss's gradient to the ray's gradients. `torch-field` computes the losses
 //! for autograd. The distortion loss is checked in f64 here, the floater loss in `reference.rs`.
 
+use crate::spec::LIKE_BACKGROUND;
+
 /// Weights of what is asked of rays beside their colours; 0 asks for nothing.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Regularisers {
@@ -66,9 +68,6 @@ impl ShadedRay<'_> {
         self.places.iter().map(move |&k| self.channels.map(|channel| channel[k as usize]))
     }
 }
-
-/// How far apart colours at most are for matter to pass for the background.
-pub const LIKE_BACKGROUND: f32 = 0.1;
 
 /// How much matter passes for the background it lies before: 1 where it has its colour, 0 from
 /// [`LIKE_BACKGROUND`] on. Whether it is there no image tells that sees it before the background

@@ -34,6 +34,9 @@ pub const DARK: f32 = 9.210_34;
 /// may stop the ray, then more. A ray that is dark ([`DARK`]) takes no further round.
 pub const TRAINING_ROUNDS: [usize; 4] = [8, 8, 16, 32];
 
+/// How far apart colours at most are for matter to pass for the background.
+pub const LIKE_BACKGROUND: f32 = 0.1;
+
 /// Cells of the occupancy along each axis of the unit cube.
 pub const OCCUPANCY_CELLS: usize = 128;
 /// Optical depth of a step below which a cell is thin: in training, rays take a sample of double

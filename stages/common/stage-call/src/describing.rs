@@ -117,10 +117,7 @@ fn ask(
     is_stopped: &dyn Fn() -> bool,
 ) -> Result<Description, DescribeError> {
     let program = || path.to_path_buf();
-    let fail = |problem: std::io::Error| DescribeError::Start {
-        program: program(),
-        problem: problem.to_string(),
-    };
+    let fail = |problem| cannot_start(path, &problem);
     // A group of its own: Ctrl-C reaches the runner alone, which then ends it, and with it whatever
     // it has started.
     let mut child = Command::new(path)
@@ -150,6 +147,10 @@ fn ask(
     }
     serde_json::from_slice(&stdout)
         .map_err(|e| DescribeError::Form { program: program(), problem: e.to_string() })
+}
+
+fn cannot_start(program: &Path, problem: &std::io::Error) -> DescribeError {
+    DescribeError::Start { program: program.to_path_buf(), problem: problem.to_string() }
 }
 
 /// Waits for a program to end; `None` where it is too late or nobody waits any more.

@@ -1,5 +1,5 @@
 use radiance::Regularisers;
-use radiance::regularisers::LIKE_BACKGROUND;
+use radiance::spec::LIKE_BACKGROUND;
 use tch::{Kind, TchError, Tensor};
 
 use crate::grid::GridSeen;
