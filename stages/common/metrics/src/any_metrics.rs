@@ -2,7 +2,10 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::{Figure, METRICS_FILE};
+use crate::figure::Figure;
+
+/// The file's name in an artifact of kind `metrics`.
+pub const METRICS_FILE: &str = "metrics.json";
 
 /// `metrics.json` of any stage. A stage of somebody's own may leave out any field, or write others.
 #[derive(Clone, Debug, Default, PartialEq)]

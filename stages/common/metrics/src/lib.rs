@@ -38,12 +38,9 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-pub use any_metrics::{AnyMetrics, MetricsError};
+pub use any_metrics::{AnyMetrics, METRICS_FILE, MetricsError};
 pub use figure::Figure;
 pub use score::{Score, Scores};
-
-/// The file's name in an artifact of kind `metrics`.
-pub const METRICS_FILE: &str = "metrics.json";
 
 /// `metrics.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
