@@ -3,7 +3,9 @@ use pixels::Image;
 use radiance::{RayField, RenderError};
 use scene::Camera;
 
-use crate::{PyramidLevel, cast, huber};
+use crate::cast::cast;
+use crate::huber::huber;
+use crate::pyramid::PyramidLevel;
 
 /// A photograph, and the camera that took it.
 #[derive(Clone, Copy, Debug)]

@@ -1,3 +1,4 @@
+use pixels::Image;
 use radiance::{Pixel, RenderError};
 use scene::{Distortion, Intrinsics};
 
