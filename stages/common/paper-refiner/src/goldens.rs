@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use nets::Weights;
 use tch::{Kind, Tensor};
 
-use crate::PerceptualLoss;
+use crate::loss::PerceptualLoss;
 use crate::network::PaperRefiner;
 use crate::trainer::loss;
 

@@ -6,8 +6,7 @@ use refinement::{KnownView, RefinementError, Rendered};
 use scene::Surface;
 use tch::{TchError, Tensor, no_grad};
 
-use crate::PaperRefiner;
-use crate::network::COLOURS;
+use crate::network::{COLOURS, PaperRefiner};
 
 /// Pixels along a patch's side, as published.
 pub(crate) const PATCH: usize = 64;

@@ -5,9 +5,9 @@ use nets::Adam;
 use refinement::{KnownView, RefinementError, Training};
 use tch::{Kind, TchError, Tensor};
 
-use crate::network::{COLOURS, PATCH_MULTIPLE};
+use crate::loss::PerceptualLoss;
+use crate::network::{COLOURS, PATCH_MULTIPLE, PaperRefiner};
 use crate::perspective::Perspective;
-use crate::{PaperRefiner, PerceptualLoss};
 
 /// How to train a [`PaperRefiner`].
 #[derive(Clone, Copy, Debug, PartialEq)]
