@@ -2,7 +2,7 @@ use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{DEGRADATION_FILE, Degradation, Filter, Image, Resampling};
 use scene::{Camera, Photograph, Views};
 
-use crate::Rendered;
+use crate::view::Rendered;
 
 /// LR observations by the views' own cameras, those that a field was trained on: refined views are
 /// made consistent with them.

@@ -7,8 +7,8 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::{TchError, Tensor, no_grad};
 
-use crate::RefinementError;
 use crate::channels::{INPUTS, OUTPUTS, REFERENCE_INPUTS};
+use crate::error::RefinementError;
 use crate::folded::{FOLD, Square, Turn, samples};
 use crate::guidance::Guidance;
 

@@ -7,8 +7,8 @@ use pixels::{Image, psnr_of};
 use rayon::prelude::*;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::RefinementError;
 use crate::channels::{OUTPUTS, REFERENCE_INPUTS};
+use crate::error::RefinementError;
 use crate::folded::{FOLD, Square, Turn};
 use crate::guidance::Guidance;
 use crate::refiner::Refiner;
@@ -407,7 +407,8 @@ mod tests {
     use scene::{Camera, Intrinsics};
 
     use super::*;
-    use crate::{RefinerArchitecture, Rendered};
+    use crate::refiner::RefinerArchitecture;
+    use crate::view::Rendered;
 
     fn level(phase: usize, i: usize, blur: bool) -> f32 {
         let at = |x: usize| if ((x + phase) / 4).is_multiple_of(2) { 0.2 } else { 0.8f32 };

@@ -2,7 +2,7 @@ use artifact::{Failure, FailureExt as _, GivenInput};
 use pixels::{Exposure, ExrImage, Image, read_exr};
 use scene::{Camera, Photograph, Surface, View};
 
-use crate::RefinementError;
+use crate::error::RefinementError;
 
 /// A view as a field rendered it.
 #[derive(Clone, Debug)]
