@@ -15,9 +15,9 @@ use stage::SUMMARY_FILE;
 use stage_call::{Display, StageFailure};
 use store::Record;
 
-use super::node::{Action, Found, folder_of};
+use super::node::{Action, Found, NodeJob, folder_of};
 use super::places::{Budget, Need, Place, Places};
-use super::{Executor, NodeJob, Work};
+use super::work::{Executor, Work};
 use crate::counts;
 use crate::recorded::Course;
 use crate::remedy::Remedy;

@@ -12,7 +12,7 @@ use serde_json::json;
 use slurm::{Site, Slurm, Submission, Submitted, Task, Terms};
 use store::{Record, Store};
 
-use super::{Executor, Work};
+use super::work::{Executor, Work};
 use crate::counts;
 use crate::identities::identities;
 use crate::sink::is_shown;

@@ -3,6 +3,7 @@ use std::process::ExitCode;
 use artifact::{Failure, print_line};
 use planning::{Change, PlanError, Request, State};
 
+use super::print::print_json;
 use crate::lineage::{Lineage, StageDifference};
 use crate::session::{Session, of_stage};
 
@@ -21,7 +22,7 @@ pub(crate) fn diff(
     let (before, now) = (side(session, before)?, side(session, now)?);
     let differences = now.differences(&before, &session.store);
     if json {
-        return super::print_json(&differences);
+        return print_json(&differences);
     }
     differences.iter().flat_map(lines).for_each(|line| print_line!("{line}"));
     if differences.is_empty() {

@@ -8,6 +8,7 @@ use serde_json::json;
 use stage::stop_on_signals;
 use stage_call::seconds;
 
+use super::print::print_json;
 use crate::session::Session;
 use crate::waiting::until_held;
 
@@ -58,7 +59,7 @@ impl Style {
         if self.json {
             let told = json!({"dry_run": self.dry_run, "bytes_gone": goes, "bytes_left": stays,
                 "items": verdict.fates()});
-            return super::print_json(&told);
+            return print_json(&told);
         }
         verdict.fates().iter().for_each(|fate| print_line!("{fate}"));
         let verbs = if self.dry_run { ("would go", "would stay") } else { ("freed", "stay") };

@@ -1,9 +1,5 @@
 //! What the command line can ask for, a file each.
 
-use std::process::ExitCode;
-
-use serde::Serialize;
-
 mod cancel;
 mod completions;
 mod describe;
@@ -17,6 +13,7 @@ mod man;
 mod path;
 mod pin;
 mod plan;
+mod print;
 mod run;
 mod status;
 mod verify;
@@ -39,9 +36,3 @@ pub(crate) use run::run;
 pub(crate) use status::status;
 pub(crate) use verify::verify;
 pub(crate) use why::why;
-
-/// Prints something for programs.
-fn print_json(told: &impl Serialize) -> anyhow::Result<ExitCode> {
-    artifact::print_lines(&serde_json::to_string_pretty(told)?);
-    Ok(ExitCode::SUCCESS)
-}

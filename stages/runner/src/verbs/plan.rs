@@ -3,6 +3,7 @@ use std::process::ExitCode;
 use artifact::print_line;
 use planning::Request;
 
+use super::print::print_json;
 use crate::node_report::PlanReport;
 use crate::session::Session;
 use crate::words::{by_scene, shown, words};
@@ -12,7 +13,7 @@ pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Res
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     if json {
-        return super::print_json(&PlanReport::new(session, &plan, &states, &[]));
+        return print_json(&PlanReport::new(session, &plan, &states, &[]));
     }
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, None));

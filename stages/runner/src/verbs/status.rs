@@ -4,6 +4,7 @@ use artifact::{counted, hash_json, print_line, sized};
 use planning::{Request, State};
 use stage_call::seconds;
 
+use super::print::print_json;
 use crate::node_report::PlanReport;
 use crate::session::Session;
 use crate::words::age;
@@ -16,7 +17,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
     if json {
         let mut report = PlanReport::new(session, &plan, &states, &[]);
         report.nodes.iter_mut().zip(jobs).for_each(|(node, job)| node.job = job);
-        return super::print_json(&report);
+        return print_json(&report);
     }
     let mut jobs = jobs.into_iter();
     for (node, state) in plan.nodes.iter().zip(states) {

@@ -4,6 +4,7 @@ use artifact::print_line;
 use planning::{Plan, Request, State};
 use store::Record;
 
+use super::print::print_json;
 use crate::node_report::PlanReport;
 use crate::session::{Session, of_stage};
 use crate::words::{by_scene, causes, shown, words};
@@ -19,7 +20,7 @@ pub(crate) fn why(
     let states = session.states(&plan)?;
     let records = session.store.records()?;
     if json {
-        return super::print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
+        return print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
     }
     let line = |index: usize| explained(session, &plan, &states, &records, index);
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
