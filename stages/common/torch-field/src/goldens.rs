@@ -9,9 +9,10 @@ use tch::{Device, Kind, Tensor};
 
 use crate::encoding::encode;
 use crate::mlp::{Batch, Mlp, SampleDraws};
+use crate::mlp_trainer::{MlpTrainer, MlpTraining};
 use crate::network::MlpNetwork;
 use crate::sampling::{importance, middles, stratified};
-use crate::{MlpTrainer, MlpTraining, Schedule};
+use crate::schedule::Schedule;
 
 const GOLDENS: &[u8] = include_bytes!("../tests/goldens/mlp.safetensors");
 

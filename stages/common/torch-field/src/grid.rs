@@ -6,7 +6,7 @@ use radiance::{Architecture, Field, Met, Occupancy, Pixel, Ray, RayField, Render
 use scene::Bounds;
 use tch::{Device, IndexOp as _, Kind, TchError, Tensor, no_grad};
 
-use crate::TorchFieldError;
+use crate::error::TorchFieldError;
 use crate::ray_maps::{RayMaps, fused};
 use crate::transfer::{host, matrix};
 

@@ -5,7 +5,7 @@ use radiance::spec::{ADAM_BETA, ADAM_EPSILON};
 use radiance::{Field, Met, Occupancy, StepReport, Supervisor, Tally, TrainingOptions};
 use tch::{Device, TchError, Tensor, no_grad};
 
-use crate::TorchFieldError;
+use crate::error::TorchFieldError;
 use crate::grid::TorchGrid;
 use crate::regularisers::add_regularisers;
 use crate::step::Step;

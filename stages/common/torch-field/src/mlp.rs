@@ -8,9 +8,9 @@ use rayon::prelude::*;
 use scene::{Bounds, Space};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
-use crate::TorchFieldError;
 use crate::composite::{Composite, composite};
 use crate::encoding::encode;
+use crate::error::TorchFieldError;
 use crate::network::{MlpNetwork, normal};
 use crate::ray_maps::RayMaps;
 use crate::sampling::{importance, middles, stratified};

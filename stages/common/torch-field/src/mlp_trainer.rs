@@ -5,9 +5,10 @@ use radiance::{StepReport, Supervisor, Tally};
 use rayon::prelude::*;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use crate::error::TorchFieldError;
 use crate::mlp::{Batch, Mlp, SampleDraws};
+use crate::schedule::Schedule;
 use crate::step::Step;
-use crate::{Schedule, TorchFieldError};
 
 /// How to train an [`Mlp`].
 #[derive(Clone, Copy, Debug, PartialEq)]

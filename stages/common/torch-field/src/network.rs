@@ -4,8 +4,8 @@ use counter_rng::CounterRng;
 use radiance::MlpArchitecture;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::TorchFieldError;
 use crate::encoding::encoded;
+use crate::error::TorchFieldError;
 
 /// One of the two networks: position → density and a feature, that and direction → colour.
 /// Parameters are weight and bias of each layer, in the order of [`MlpNetwork::layers`].

@@ -3,7 +3,7 @@ use std::ops::Range;
 use radiance::{Ray, Supervisor, Tally};
 use tch::{TchError, Tensor};
 
-use crate::TorchFieldError;
+use crate::error::TorchFieldError;
 use crate::transfer::host;
 
 /// A step of a training: so many bundles of rays, counted on from what was cast before.
