@@ -2,7 +2,7 @@ use std::path::Path;
 
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::{Weights, WeightsError};
+use crate::weights::{Weights, WeightsError, write};
 
 /// Adam as PyTorch has it (Kingma and Ba 2015): β 0.9 and 0.999, ε 1e-8. Gradients are given, not
 /// kept by the parameters, so that whoever makes them in parts can add them in an order of its own.
@@ -68,7 +68,7 @@ impl Adam {
             .chain(second)
             .chain([(COUNTS.to_owned(), Tensor::from_slice(&counts))])
             .collect();
-        crate::write(path, &all)
+        write(path, &all)
     }
 
     /// Goes on from such a checkpoint: the network's tensors get its values; returned are the

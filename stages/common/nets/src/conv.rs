@@ -1,6 +1,6 @@
 use tch::{TchError, Tensor};
 
-use crate::{Weights, WeightsError};
+use crate::weights::{Weights, WeightsError};
 
 /// A convolution with zeros beyond the border, as PyTorch names and lays it out: `NAME.weight`
 /// (outputs × inputs × rows × columns) and `NAME.bias`.
