@@ -87,7 +87,7 @@ impl Field {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Architecture;
+    use crate::architecture::Architecture;
     use crate::math::sigmoid;
     use crate::ray::{Ray, clip};
     use scene::Bounds;

@@ -1,6 +1,6 @@
 use std::ops::Range;
 
-use super::TrainingOptions;
+use super::options::TrainingOptions;
 use crate::chunk::{CHUNK_RAYS, Chunk, FeatureGradients};
 use crate::field::Field;
 use crate::occupancy::Met;
