@@ -1,4 +1,4 @@
-use crate::Image;
+use crate::image_buffer::Image;
 
 /// What an image of that size (columns, rows) shows at a position in pixels from its top left
 /// corner: cubic interpolation (Catmull and Rom 1974) of its pixels, whose centres lie at halves;

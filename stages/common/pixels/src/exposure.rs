@@ -1,4 +1,4 @@
-use crate::Image;
+use crate::image_buffer::Image;
 
 /// How another exposure made an image from what it should be, channel by channel: v ↦ gain · v +
 /// offset.

@@ -9,7 +9,8 @@ use exr::meta::attribute::{AttributeValue, ChannelDescription, ChannelList, Line
 use exr::meta::header::Header;
 use exr::prelude::{Compression, ReadChannels as _, ReadLayers as _};
 
-use crate::{Image, MAX_PIXELS, PixelError};
+use crate::error::{MAX_PIXELS, PixelError};
+use crate::image_buffer::Image;
 
 /// Precision of an EXR channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,6 +1,9 @@
 use std::path::Path;
 
-use crate::{Image, PixelError, read_exr, read_png};
+use crate::error::PixelError;
+use crate::exr_file::read_exr;
+use crate::image_buffer::Image;
+use crate::png_file::read_png;
 
 /// Reads a view's image as RGBA with premultiplied alpha: a PNG has straight alpha or none, an EXR
 /// premultiplied alpha in its channels R, G, B, A.

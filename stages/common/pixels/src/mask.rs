@@ -1,7 +1,9 @@
 use std::ops::Range;
 use std::path::Path;
 
-use crate::{Image, PixelError, Rgba8, read_png};
+use crate::error::PixelError;
+use crate::image_buffer::{Image, Rgba8};
+use crate::png_file::read_png;
 
 /// Which pixels of an image count, row by row; the others show what doesn't belong to the scene,
 /// people who walked by for example.

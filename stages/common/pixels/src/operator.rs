@@ -1,4 +1,4 @@
-use crate::Image;
+use crate::image_buffer::Image;
 use crate::pillow_resample::{Filter, coefficients};
 
 /// A resampling along one axis as a linear map in floats: output `i` is Σ weight·input over a run
@@ -219,7 +219,8 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::{Rgba8, resize_pillow};
+    use crate::image_buffer::Rgba8;
+    use crate::pillow_resample::resize_pillow;
 
     fn image(width: usize, height: usize, seed: u64) -> Image {
         let mut x = seed;

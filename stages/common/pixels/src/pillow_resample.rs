@@ -4,7 +4,7 @@
 //! and is clipped to 8 bits before the vertical one; weights are computed in f64, normalised, and
 //! rounded to 22 bits.
 
-use crate::Rgba8;
+use crate::image_buffer::Rgba8;
 
 /// A resampling kernel, widened by the scale when shrinking (so it is an anti-aliasing filter).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

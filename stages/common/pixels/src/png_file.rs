@@ -2,7 +2,8 @@ use std::fs::File;
 use std::io::{BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-use crate::{MAX_PIXELS, PixelError, Rgba8};
+use crate::error::{MAX_PIXELS, PixelError};
+use crate::image_buffer::Rgba8;
 
 /// Reads any PNG as 8-bit RGBA; one without alpha is opaque.
 pub fn read_png(path: &Path) -> Result<Rgba8, PixelError> {

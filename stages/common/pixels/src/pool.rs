@@ -1,4 +1,4 @@
-use crate::{Image, Rgba8};
+use crate::image_buffer::{Image, Rgba8};
 
 /// Mean of s×s blocks of 8-bit RGBA, colour and alpha apart and nothing rounded: the paper code's
 /// `--ds_method avg`.
