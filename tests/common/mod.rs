@@ -281,16 +281,6 @@ impl Project {
         std::os::unix::fs::symlink(&dataset, self.path("data").join(name)).unwrap();
     }
 
-    /// Calls one of the measuring scripts on `data`.
-    pub fn script(&self, script: &str, arguments: &[&str]) -> Finished {
-        let mut command = Command::new("python3");
-        command.arg(root().join("scripts").join(script)).args(arguments);
-        command
-            .args(["--data", "data", "--nerf-sr", bin("nerf-sr").to_str().unwrap()])
-            .current_dir(self.path("."));
-        Finished::of(command.output().unwrap())
-    }
-
     /// Every object and record of the store, sorted.
     pub fn store_listing(&self) -> Vec<String> {
         let mut names: Vec<String> = ["objects", "actions"]
