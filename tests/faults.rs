@@ -39,7 +39,7 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     let train = demo_train(&project, 8);
     let inputs = [("scene", train.as_path())];
     let (output, work) = (project.path("out"), project.path("work"));
-    let more = ["--work", work.to_str().unwrap()];
+    let more = ["--work", work.to_str().unwrap(), "--progress", "plain"];
     let stopped = stage_command("train-ss", PARAMS, &inputs, &output, &more)
         .env("NERF_SR_STOP_AFTER", "20000")
         .output()
@@ -56,7 +56,13 @@ fn an_interrupted_stage_leaves_a_checkpoint_and_says_130() {
     // A checkpoint cut short is said and left out, not trusted.
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-    assert_eq!(stage("train-ss", PARAMS, &inputs, &output, &more).code, 0);
+    let again = stage("train-ss", PARAMS, &inputs, &output, &more);
+    assert_eq!(again.code, 0, "{}", again.stderr);
+    assert!(
+        again.stderr.contains("checkpoint.safetensors: not a whole checkpoint; starting over"),
+        "{}",
+        again.stderr
+    );
     let whole = project.path("whole");
     assert_eq!(stage("train-ss", PARAMS, &inputs, &whole, &[]).code, 0);
     assert_eq!(manifest(&output), manifest(&whole));

@@ -332,7 +332,8 @@ pub fn stage(
     Finished::of(stage_command(name, params, inputs, output, more).output().unwrap())
 }
 
-/// The command of a stage by the contract; its parameters lie beside the output.
+/// The command of a stage by the contract; its parameters lie beside the output. It says nothing
+/// unless `more` has `--progress`.
 pub fn stage_command(
     name: &str,
     params: &str,
@@ -344,14 +345,9 @@ pub fn stage_command(
     if let Some(folder) = file.parent().filter(|f| f.is_dir()) {
         std::fs::write(folder.join(file.file_name().unwrap()), params).ok();
     }
+    let silent: &[&str] = if more.contains(&"--progress") { &[] } else { &["--progress", "none"] };
     let mut command = Command::new(bin(name));
-    command
-        .arg("--params")
-        .arg(&file)
-        .arg("--output")
-        .arg(output)
-        .args(["--progress", "none"])
-        .args(more);
+    command.arg("--params").arg(&file).arg("--output").arg(output).args(silent).args(more);
     for (name, folder) in inputs {
         command.arg("--input").arg(format!("{name}={}", folder.display()));
     }
