@@ -417,24 +417,26 @@ pub fn is_running(process: &str) -> bool {
 }
 
 /// Kills a stage so many milliseconds after its start, and then each time so long after another
-/// checkpoint was written. How often there was one to go on from; the output may be there, if the
-/// stage was faster.
+/// checkpoint was written. There is one to go on from in the end.
 ///
-/// Which moment a kill meets is left to chance: any may come. Tests that need a certain step set
-/// `NERF_SR_STOP_AFTER`.
+/// Which moment a kill meets is left to chance: any may come. From the count `slow_from` of its
+/// progress on the stage takes its time, so that no machine ends it before the last kill. Tests
+/// that need a certain step set `NERF_SR_STOP_AFTER`.
 pub fn kill_again_and_again(
     name: &str,
     params: &str,
     inputs: &[(&str, &Path)],
     output: &Path,
     work: &Path,
+    slow_from: u64,
     milliseconds: &[u64],
-) -> usize {
-    let mut resumed = 0;
+) {
+    let never = work.with_extension("never");
     for (round, pause) in milliseconds.iter().enumerate() {
         let before = last_checkpoint(work);
         let more = ["--work", work.to_str().unwrap()];
         let mut child = stage_command(name, params, inputs, output, &more)
+            .env("NERF_SR_SLOW_UNTIL", format!("{slow_from} {}", never.display()))
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
@@ -442,18 +444,11 @@ pub fn kill_again_and_again(
             wait_until(|| last_checkpoint(work) != before || child.try_wait().unwrap().is_some());
         }
         std::thread::sleep(Duration::from_millis(*pause));
-        if child.try_wait().unwrap().is_some() {
-            break;
-        }
-        signal(&child, "-KILL");
-        child.wait().unwrap();
-        if output.exists() {
-            // The kill met the end of the stage, after the output had got its name.
-            break;
-        }
-        resumed += usize::from(last_checkpoint(work).is_some());
+        child.kill().unwrap();
+        let killed = Finished::of(child.wait_with_output().unwrap());
+        assert_eq!(killed.code, -1, "it ended before kill {round}: {}", killed.stderr);
     }
-    resumed
+    assert!(last_checkpoint(work).is_some() && !output.exists());
 }
 
 /// The data folder with real scenes and weights; without it a test says so and ends.
