@@ -59,7 +59,15 @@ fn a_checkpoint_of_the_reference_is_rendered() {
         &[],
     );
     assert_eq!(rendered.code, 0, "{}", rendered.stderr);
-    assert_eq!(views.join("images").read_dir().unwrap().count(), 1);
+    // Where all weights are this large and none is negative, space is opaque and white.
+    let image = pixels::read_exr(&views.join("images/r_0.exr")).unwrap();
+    assert_eq!((image.width, image.height), (8, 8));
+    for name in ["R", "G", "B", "A"] {
+        assert_eq!(image.channel(name).unwrap(), [1.0; 64], "channel {name}");
+    }
+    // Its border is seen, about where the scene begins.
+    let depths = image.channel("Z").unwrap();
+    assert!(depths.iter().all(|depth| (1.5..3.5).contains(depth)), "{depths:?}");
 }
 
 #[track_caller]

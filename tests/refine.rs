@@ -794,6 +794,10 @@ fn fails_to_train(project: &Project, inputs: &[(&str, &Path)], params: &str, wor
     stage("train-refine", params, inputs, &project.path("failed"), &[]).fails(3, words);
 }
 
+fn mean_difference(one: &[f32], other: &[f32]) -> f32 {
+    one.iter().zip(other).map(|(a, b)| (a - b).abs()).sum::<f32>() / one.len() as f32
+}
+
 /// The published network goes through the same stages; what it can't do is said.
 #[test]
 fn the_paper_s_network_refines_by_references() {
@@ -813,6 +817,21 @@ fn the_paper_s_network_refines_by_references() {
     let none = project.path("none");
     let done = stage("refine", "{}", &[("views", &views), ("refiner", &refiner)], &none, &[]);
     assert_eq!(done.code, 0, "{}", done.stderr);
+    for file in std::fs::read_dir(views.join("images")).unwrap() {
+        let image = Path::new("images").join(file.unwrap().file_name());
+        let [rendered, refined, alone] = [&views, &folder("refine-paper"), &none]
+            .map(|folder| pixels::read_exr(&folder.join(&image)).unwrap());
+        assert_eq!((refined.width, refined.height), (72, 72));
+        for kept in ["A", "Z"] {
+            assert_eq!(rendered.channel(kept), refined.channel(kept));
+        }
+        let [rendered, refined, alone] =
+            [&rendered, &refined, &alone].map(|image| image.channel("G").unwrap());
+        assert!(refined.iter().all(|sample| sample.is_finite()));
+        let change = mean_difference(rendered, refined);
+        assert!((0.01..0.5).contains(&change), "{change}");
+        assert!(mean_difference(alone, refined) > 0.001, "the reference changes nothing");
+    }
     // Weights of no network, and patches that fit nowhere.
     let (scene, own) = (folder("prep").join("references"), folder("reference-views"));
     let inputs = [("views", own.as_path()), ("truth", scene.as_path())];

@@ -155,7 +155,7 @@ fn the_table_has_every_method_side_by_side() {
     let project = Project::experiments();
     let methods = ["nerf", "nerf-epochs", "bicubic", "swinir", "ss", "kernel", "hr"];
     let shown = methods.join(",");
-    let rays = ["-p", "train-ss.rays=40000", "-p", "field-nerf-epochs.rays=10000"];
+    let rays = ["-p", "train-ss.rays=160000", "-p", "field-nerf-epochs.rays=40000"];
     let of = ["--scene", "demo", "--protocol", "24x2", "--data", "data", "--show", &shown];
     let arguments = [&["run", "paper-table", "paper-times", "paper-page"], &of[..], &rays].concat();
     project.ok(&arguments);
@@ -174,8 +174,13 @@ fn the_table_has_every_method_side_by_side() {
     assert_eq!(rows.len(), methods.len());
     let psnr = |method: &str| rows.iter().find(|r| r["method"] == method).unwrap()["psnr"].as_f64();
     assert!(psnr("NeRF-Swin").is_none());
-    assert!(psnr("trained at HR").unwrap() > psnr("NeRF-Bi").unwrap(), "{rows:?}");
-    assert_ne!(psnr("ours, SS"), psnr("NeRF, equal rays"));
+    // Measured: 21.4 and 20.2 dB, 20.8 and 20.6 dB.
+    for (better, worse, margin) in
+        [("trained at HR", "NeRF-Bi", 0.5), ("ours, SS", "NeRF, equal rays", 0.1)]
+    {
+        let (better, worse) = (psnr(better).unwrap(), psnr(worse).unwrap());
+        assert!(better > worse + margin, "{better}, {worse}: {rows:?}");
+    }
     assert_eq!(read("out/paper-table/rows.csv").lines().count(), 1 + methods.len());
     assert!(read("out/paper-times/table.md").contains("(training / rendering)"));
     let page = read("out/paper-page/index.html");

@@ -74,6 +74,14 @@ fn psnr(look: &str) -> f64 {
     after.split_whitespace().next().unwrap().parse::<f64>().unwrap()
 }
 
+/// How near to the end a look comes, in dB. Of 21.6 dB in the end a look has 17.9 after 26,000 rays,
+/// 20.8 after 73,000 and 21.5 after 314,000. A slow machine's is an early one.
+fn nearness(look: &str) -> f64 {
+    let (_, after) = look.split_once(" view (").unwrap();
+    let rays = after.split_whitespace().next().unwrap().replace(',', "");
+    if rays.parse::<u64>().unwrap() < 70_000 { 8.0 } else { 1.5 }
+}
+
 #[test]
 fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let project = Project::tiny();
@@ -90,8 +98,7 @@ fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let start = format!("train-ss: view {second}: ");
     let looks: Vec<&str> = watched.stderr.lines().filter(|l| l.starts_with(&start)).collect();
     assert!(!looks.is_empty(), "no look in:\n{}", watched.stderr);
-    let last = psnr(looks[looks.len() - 1]);
-    assert!(last > 12.0, "{looks:?}");
+    let last = looks[looks.len() - 1];
     assert!(looks[0].ends_with("out/watch/train-ss.png"), "{looks:?}");
     let size = pixels::read_png(&picture).unwrap();
     assert_eq!((size.width, size.height), (48, 48));
@@ -103,7 +110,7 @@ fn a_watched_training_shows_a_view_with_its_scores_and_makes_equal_bytes() {
     let of_view = |view: &&serde_json::Value| view["name"] == json!(second);
     let view = scores["views"].as_array().unwrap().iter().find(of_view).unwrap();
     let end = view["scores"]["psnr"].as_f64().unwrap();
-    assert!((end - last).abs() < 3.0, "{end} dB in the end, {last} dB when looked at");
+    assert!((end - psnr(last)).abs() < nearness(last), "{end} dB in the end; {last}");
     let with = project.output_of("train-ss", &RAYS);
     let other = Project::tiny();
     other.ok(&arguments);
