@@ -848,4 +848,10 @@ fn the_paper_s_network_refines_by_references() {
         &["smaller than a patch of 96×96"],
     );
     fails_to_train(&project, &inputs, r#"{"net": "paper", "patch_size": 20}"#, &["multiple of 8"]);
+    fails_to_train(
+        &project,
+        &inputs,
+        r#"{"references_per_view": 1}"#,
+        &["input views: one view has no others for references"],
+    );
 }
