@@ -79,6 +79,9 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::MetadataExt as _;
+    use std::thread::ScopedJoinHandle;
+
     use super::*;
     use crate::testing::{begin, entered, make};
 
@@ -132,6 +135,13 @@ mod tests {
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
     }
 
+    /// How many wait for the lock of a store: the kernel lists them with an arrow.
+    fn waiting(store: &Store) -> usize {
+        let file = format!(":{} ", fs::metadata(store.gate_path()).unwrap().ino());
+        let locks = fs::read_to_string("/proc/locks").unwrap();
+        locks.lines().filter(|line| line.contains("->") && line.contains(&file)).count()
+    }
+
     /// Who is inside when a newer program comes is waited for. Of several newer ones the newest has
     /// the store.
     #[test]
@@ -144,7 +154,10 @@ mod tests {
             let root = dir.path();
             let openings =
                 formats.map(|format| scope.spawn(move || Store::open_as(root, format).is_ok()));
-            std::thread::sleep(std::time::Duration::from_millis(100));
+            let has_opened = || openings.iter().any(ScopedJoinHandle::is_finished);
+            while waiting(&older) < formats.len() && !has_opened() {
+                std::thread::yield_now();
+            }
             assert_eq!(
                 fs::read_to_string(dir.path().join("format")).unwrap(),
                 "1\n",
