@@ -103,7 +103,97 @@ pub(crate) fn lr_observations(context: &Context) -> Result<Option<LrObservations
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
+    use pixels::{Image, write_png};
+    use scene::{
+        Background, Bounds, Camera, Intrinsics, Space, VIEW_CHANNELS, VIEWS_FILE, write_view_image,
+    };
+
     use super::*;
+
+    const SIDE: usize = 4;
+
+    /// A view from so far to the right; its image, if any, is the file of its name.
+    fn view(name: &str, right: f64, extension: Option<&str>) -> View {
+        let camera = Camera {
+            name: name.to_owned(),
+            intrinsics: Intrinsics::from_angle_x(SIDE as u32, SIDE as u32, 1.0),
+            camera_to_world: [[1.0, 0.0, 0.0, right], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+        };
+        let image = extension.map(|extension| format!("{name}.{extension}"));
+        View { image, ..View::camera_only(camera) }
+    }
+
+    /// An input with such views: half transparent ones are rendered, photographs are grey.
+    fn input(dir: &Path, name: &str, views: Vec<View>) -> GivenInput {
+        let folder = dir.join(name);
+        std::fs::create_dir(&folder).unwrap();
+        for file in views.iter().filter_map(|view| view.image.as_ref()) {
+            let path = folder.join(file);
+            if file.ends_with("exr") {
+                write_rendered(&path);
+            } else {
+                let grey = Image::new(SIDE, SIDE, 3, vec![0.2; 3 * SIDE * SIDE]);
+                write_png(&path, &grey.to_rgba8()).unwrap();
+            }
+        }
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 0.1, far: 9.0, space: Space::default() };
+        let list = Views::new(Background::White, bounds, views);
+        artifact::write_json(&folder.join(VIEWS_FILE), &list).unwrap();
+        GivenInput::open(name, &folder).unwrap()
+    }
+
+    fn write_rendered(path: &Path) {
+        let pixel = [0.25, 0.25, 0.25, 0.5, 2.0];
+        let channels = &VIEW_CHANNELS[..pixel.len()];
+        let written = write_view_image(path, (SIDE, SIDE), channels, |_, _, samples| {
+            samples.as_chunks_mut().0.fill(pixel);
+            Ok::<(), Box<dyn std::error::Error>>(())
+        });
+        written.unwrap();
+    }
+
+    #[test]
+    fn views_stand_beside_their_truth() {
+        let dir = tempfile::tempdir().unwrap();
+        let exr = Some("exr");
+        let views = vec![
+            view("whole", 0.0, exr),
+            view("unrendered", 0.0, None),
+            view("elsewhere", 0.0, exr),
+            view("unseen", 0.0, exr),
+            view("unknown", 0.0, exr),
+        ];
+        let truth = vec![
+            view("unseen", 0.0, None),
+            view("elsewhere", 1.0, Some("png")),
+            view("unrendered", 0.0, Some("png")),
+            view("whole", 0.0, Some("png")),
+        ];
+        let [views, truth] =
+            [("views", views), ("truth", truth)].map(|(name, of)| input(dir.path(), name, of));
+        let Examples { training, left_out } = Examples::read(&views, &truth, None).unwrap();
+        assert_eq!((training.len(), left_out.len()), (1, 1));
+        let KnownView { rendered, truth } = &training[0];
+        assert_eq!(rendered.camera.name, "whole");
+        // Over white.
+        assert_eq!(rendered.colours().data, [0.75; 3 * SIDE * SIDE]);
+        assert_eq!(rendered.depth, [2.0; SIDE * SIDE]);
+        assert_eq!(truth.data, [0.2; 3 * SIDE * SIDE]);
+    }
+
+    #[test]
+    fn views_without_truth_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let [views, truth] = [("views", "one"), ("truth", "other")]
+            .map(|(input_name, name)| input(dir.path(), input_name, vec![view(name, 0.0, None)]));
+        let Err(Failure::BadInput(said)) = Examples::read(&views, &truth, None) else {
+            panic!("they have none");
+        };
+        assert!(said.starts_with("input views: none of them has an image"), "{said}");
+    }
 
     #[test]
     fn every_eighth_is_left_out_and_none_is_lost() {
