@@ -166,12 +166,13 @@ fn a_silent_stage_shows_that_it_lives() {
         said.push(line);
     }
     assert_eq!(child.wait().unwrap().code(), Some(0), "{said:?}");
-    let seconds = |line: &String| -> Option<u32> {
-        let rest = line.strip_prefix("quiet: running for ")?;
-        rest.split(|c: char| !c.is_ascii_digit()).next()?.parse().ok()
-    };
-    let first = said.iter().find_map(seconds);
+    let first = said.iter().find_map(|line| seconds_running(line));
     assert!(first.is_some_and(|seconds| (1..=10).contains(&seconds)), "{said:?}");
+}
+
+fn seconds_running(line: &str) -> Option<u32> {
+    let rest = line.strip_prefix("quiet: running for ")?;
+    rest.split(|c: char| !c.is_ascii_digit()).next()?.parse().ok()
 }
 
 /// Programs built without libtorch that are as new as the sources: `make demo` leaves them.

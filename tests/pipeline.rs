@@ -9,7 +9,7 @@ use std::process::{Child, Stdio};
 use common::{Finished, Project};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
-use scene::{View, Views};
+use scene::Views;
 
 #[test]
 fn a_second_run_runs_nothing_and_nothing_cosmetic_reruns() {
@@ -251,16 +251,20 @@ fn psnr_by_hand(project: &Project, options: &[&str]) -> f64 {
     let truth = project.artifact("prep", options).join("truth");
     let list: Views =
         serde_json::from_slice(&std::fs::read(truth.join("views.json")).unwrap()).unwrap();
-    let of_view = |view: &View| {
+    let scores = list.views.iter().map(|view| {
         let file = rendered.join(format!("images/{}.exr", view.camera.name));
-        let found = list.read_over(&file).unwrap();
-        let expected = list.read_over(&truth.join(view.image.as_ref().unwrap())).unwrap();
-        assert_eq!(found.data.len(), expected.data.len());
-        let pairs = found.data.iter().zip(&expected.data);
-        let errors = pairs.map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2));
-        pixels::psnr_of(errors.sum::<f64>() / found.data.len() as f64)
-    };
-    list.views.iter().map(of_view).sum::<f64>() / list.views.len() as f64
+        let image = truth.join(view.image.as_ref().unwrap());
+        psnr_of_files(&list, &file, &image)
+    });
+    scores.sum::<f64>() / list.views.len() as f64
+}
+
+fn psnr_of_files(list: &Views, found: &Path, expected: &Path) -> f64 {
+    let [found, expected] = [found, expected].map(|file| list.read_over(file).unwrap());
+    assert_eq!(found.data.len(), expected.data.len());
+    let pairs = found.data.iter().zip(&expected.data);
+    let errors = pairs.map(|(f, e)| f64::from(f.clamp(0.0, 1.0) - e).powi(2));
+    pixels::psnr_of(errors.sum::<f64>() / found.data.len() as f64)
 }
 
 /// Each option through the whole pipeline to the score that its images have.

@@ -326,6 +326,11 @@ fn a_failing_stage_cancels_what_needs_it_and_nothing_else() {
 const ONE: &str =
     "default: [last]\nstages:\n  first: {run: ./step}\n  last: {run: ./step, inputs: {a: first}}\n";
 
+fn shows_running(cluster: &Cluster, project: &Project, arguments: &[&str], job: &str) -> bool {
+    let status = cluster.ok(project, &[&["status"], arguments].concat());
+    status.contains(&format!("job {job} running"))
+}
+
 #[test]
 fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     let Some(cluster) = Cluster::start() else { return };
@@ -338,12 +343,7 @@ fn an_outstanding_submission_is_seen_kept_and_cancelled() {
     let held = ["-p", "first.seed=5", "-p", "last.hold=hold"];
     let jobs = cluster.submit(&project, &held);
     assert_eq!(jobs.keys().collect::<Vec<_>>(), ["last"], "what is cached is not submitted");
-    let running = || {
-        cluster
-            .ok(&project, &[&["status"][..], &held].concat())
-            .contains(&format!("job {} running", jobs["last"]))
-    };
-    wait_until(running);
+    wait_until(|| shows_running(&cluster, &project, &held, &jobs["last"]));
     let second = cluster.ok(&project, &[&["run"][..], &held].concat());
     assert!(second.contains("0 jobs submitted, 1 queued before"), "{second}");
     // What the job needs stays, though the plan without arguments doesn't name it.

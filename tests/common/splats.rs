@@ -38,8 +38,11 @@ pub fn read_ply(path: &Path) -> BTreeMap<String, Vec<f64>> {
 
 /// Three columns as vectors.
 pub fn vectors(columns: &BTreeMap<String, Vec<f64>>, names: [&str; 3]) -> Vec<DVec3> {
-    let [x, y, z] = names.map(|name| &columns[name]);
-    x.iter().zip(y).zip(z).map(|((x, y), z)| DVec3::new(*x, *y, *z)).collect()
+    (0..columns[names[0]].len()).map(|i| vector(columns, names, i)).collect()
+}
+
+fn vector(columns: &BTreeMap<String, Vec<f64>>, names: [&str; 3], i: usize) -> DVec3 {
+    DVec3::from_array(names.map(|name| columns[name][i]))
 }
 
 /// A 3D Gaussian.
@@ -58,19 +61,18 @@ fn rotation(columns: &BTreeMap<String, Vec<f64>>, i: usize) -> DMat3 {
 /// Reads a splat file by its layout alone.
 pub fn read_splats(path: &Path) -> Vec<Splat> {
     let columns = read_ply(path);
-    let positions = vectors(&columns, ["x", "y", "z"]);
-    let colours = vectors(&columns, ["f_dc_0", "f_dc_1", "f_dc_2"]);
-    let scales = vectors(&columns, ["scale_0", "scale_1", "scale_2"]);
-    let splat = |i: usize| {
-        let axes = rotation(&columns, i) * DMat3::from_diagonal(scales[i].exp());
-        Splat {
-            position: positions[i],
-            covariance: axes * axes.transpose(),
-            colour: 0.5 + 0.282_094_791_773_878_14 * colours[i],
-            opacity: 1.0 / (1.0 + (-columns["opacity"][i]).exp()),
-        }
-    };
-    (0..positions.len()).map(splat).collect()
+    (0..columns["x"].len()).map(|i| splat(&columns, i)).collect()
+}
+
+fn splat(columns: &BTreeMap<String, Vec<f64>>, i: usize) -> Splat {
+    let scale = vector(columns, ["scale_0", "scale_1", "scale_2"], i);
+    let axes = rotation(columns, i) * DMat3::from_diagonal(scale.exp());
+    Splat {
+        position: vector(columns, ["x", "y", "z"], i),
+        covariance: axes * axes.transpose(),
+        colour: 0.5 + 0.282_094_791_773_878_14 * vector(columns, ["f_dc_0", "f_dc_1", "f_dc_2"], i),
+        opacity: 1.0 / (1.0 + (-columns["opacity"][i]).exp()),
+    }
 }
 
 /// A splat in an image.

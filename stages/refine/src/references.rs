@@ -187,11 +187,12 @@ mod tests {
     /// What a camera sees of a wall from so many pixels to the right: red and blue rise, green
     /// falls.
     fn colours(right: f64) -> Vec<[f32; 3]> {
-        let colour = |i: usize| {
-            let rise = (0.0035 * ((i % WIDTH) as f64 + right)) as f32;
-            [0.1 + rise, 0.9 - rise, 0.1 + rise]
-        };
-        (0..WIDTH * HEIGHT).map(colour).collect()
+        (0..WIDTH * HEIGHT).map(|i| colour((i % WIDTH) as f64 + right)).collect()
+    }
+
+    fn colour(x: f64) -> [f32; 3] {
+        let rise = (0.0035 * x) as f32;
+        [0.1 + rise, 0.9 - rise, 0.1 + rise]
     }
 
     /// The wall as rendered from there, with a true image.
@@ -221,6 +222,21 @@ mod tests {
         KnownView { rendered, truth }
     }
 
+    /// Names of the references that are kept of four.
+    fn sorted(judge: &Judge<'_>, confidence: f64) -> anyhow::Result<Vec<String>> {
+        let right = 100.0;
+        let tinted: Vec<[f32; 3]> =
+            colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
+        let references = vec![
+            known("same", right, &colours(right)),
+            known("tinted", right, &tinted),
+            known("farther", right, &colours(right / 1.1)),
+            known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
+        ];
+        let kept = judge.sort_out(references, confidence)?;
+        Ok(kept.into_iter().map(|reference| reference.rendered.camera.name).collect())
+    }
+
     /// A doubted reference stays where another depth would fit less, here the tinted one. It goes
     /// where another depth would fit as well or better.
     #[test]
@@ -236,20 +252,6 @@ mod tests {
         let say = |note: String| said.borrow_mut().push(note);
         let guidance = Guidance::default();
         let judge = Judge { views: &views, guidance, shown: &shown, say: &say };
-        let right = 100.0;
-        let tinted: Vec<[f32; 3]> =
-            colours(right).into_iter().map(|[r, g, b]| [r + 0.04, g + 0.04, b]).collect();
-        let sorted = |judge: &Judge<'_>, confidence: f64| {
-            let references = vec![
-                known("same", right, &colours(right)),
-                known("tinted", right, &tinted),
-                known("farther", right, &colours(right / 1.1)),
-                known("other", right, &[[0.9; 3]; WIDTH * HEIGHT]),
-            ];
-            let kept = judge.sort_out(references, confidence)?;
-            let names: Vec<String> = kept.into_iter().map(|k| k.rendered.camera.name).collect();
-            anyhow::Ok(names)
-        };
         assert_eq!(sorted(&judge, 1.0).unwrap(), ["same", "tinted"]);
         // Per channel the farther wall differs by 0.0318, and (1 + 100 · 3 · 0.0318²)⁻² is 0.59.
         let starts = [
@@ -280,14 +282,15 @@ mod tests {
         assert!(notes.len() == 1 && notes[0].starts_with(starts[0]), "{notes:?}");
     }
 
+    /// A reference whose channels are so many times as bright.
+    fn seen(gain: [f32; 3]) -> KnownView {
+        let truth: Vec<[f32; 3]> =
+            colours(0.0).iter().map(|right| std::array::from_fn(|c| gain[c] * right[c])).collect();
+        known("a", 0.0, &truth)
+    }
+
     #[test]
     fn another_exposure_is_taken_back() {
-        let right = colours(0.0);
-        let seen = |gain: [f32; 3]| {
-            let truth: Vec<[f32; 3]> =
-                right.iter().map(|colour| std::array::from_fn(|c| gain[c] * colour[c])).collect();
-            known("a", 0.0, &truth)
-        };
         let (reference, note) = same_exposure(seen([0.6, 0.7, 1.0]));
         let expected =
             "reference a has another exposure (0.60, 0.70, 1.00 times as bright): taken back";
@@ -296,7 +299,7 @@ mod tests {
             .truth
             .data
             .iter()
-            .zip(right.as_flattened())
+            .zip(colours(0.0).as_flattened())
             .map(|(a, b)| (a - b).abs())
             .fold(0.0, f32::max);
         assert!(off < 1e-4, "{off}");

@@ -406,14 +406,17 @@ mod tests {
     /// Sees a wall at this z-depth. Its expected depth is twice that. Opacity grows with the depth.
     struct Wall(f32);
 
+    impl Wall {
+        fn pixel(&self, ray: &Ray) -> radiance::Pixel {
+            let median_depth = self.0 / -ray.direction[2];
+            let (depth, opacity) = (2.0 * median_depth, 0.25 * self.0);
+            radiance::Pixel { opacity, depth, median_depth, ..radiance::Pixel::default() }
+        }
+    }
+
     impl RayField for Wall {
         fn render(&self, rays: &[Ray]) -> Result<Vec<radiance::Pixel>, radiance::RenderError> {
-            let pixel = |ray: &Ray| {
-                let median_depth = self.0 / -ray.direction[2];
-                let (depth, opacity) = (2.0 * median_depth, 0.25 * self.0);
-                radiance::Pixel { opacity, depth, median_depth, ..radiance::Pixel::default() }
-            };
-            Ok(rays.iter().map(pixel).collect())
+            Ok(rays.iter().map(|ray| self.pixel(ray)).collect())
         }
     }
 
