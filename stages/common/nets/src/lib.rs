@@ -6,7 +6,7 @@
 //! * [`device`]: the device that a stage was asked to use, or why it can't be.
 //! * [`tensor_of`], [`image_of`]: images as tensors.
 //! * [`Adam`]: the optimiser, on gradients that are given.
-//! * [`Weights`], [`write`]: tensors of a safetensors file, by name, each with the shape it must
+//! * [`Weights`], [`write()`]: tensors of a safetensors file, by name, each with the shape it must
 //!   have; [`Conv`]: a layer of them.
 //!
 //! ```no_run,standalone_crate

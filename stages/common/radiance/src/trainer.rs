@@ -445,7 +445,7 @@ mod tests {
     fn every_family_trains_to_equal_bits() {
         for (space, is_known) in [(Space::Box, false), (Space::Contraction, true)] {
             let train = || {
-                let mut field = Field::new(SMALL, cube(space.clone()), 5);
+                let mut field = Field::new(SMALL, cube(space), 5);
                 if is_known {
                     field.limit_to_occupied();
                 }

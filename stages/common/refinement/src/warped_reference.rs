@@ -213,7 +213,7 @@ fn apart(own: [f32; 2], a: Option<[f32; 2]>, b: Option<[f32; 2]>) -> f32 {
 }
 
 /// A view with what references know of it, as a reference-based refiner takes it: with its
-/// [`crate::Architecture::guidance`].
+/// [`crate::RefinerArchitecture::guidance`].
 pub fn with_references(
     rendered: &Rendered,
     references: &[&KnownView],

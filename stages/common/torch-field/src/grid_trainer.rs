@@ -489,7 +489,8 @@ mod tests {
             let mut start = new_field(Space::Box);
             start.limit_to_occupied();
             let (grid, network, _) = start.parts_mut();
-            (grid.fill(1.0), network.fill(weight));
+            grid.fill(1.0);
+            network.fill(weight);
             let options =
                 TrainingOptions { max_rays_per_step: 4096, samples_per_step: 8000, ..options() };
             let mut ours = Trainer::new(start.clone(), options);
