@@ -166,9 +166,8 @@ def main() -> None:
     for name in options.only:
         with tempfile.TemporaryDirectory() as folder:
             prepare(options, pathlib.Path(folder), name)
-            trainings = itertools.product(range(1, options.seeds + 1), options.rays)
-            for turn, (seed, factor) in enumerate(trainings):
-                for build in ("old", "new") if turn % 2 == 0 else ("new", "old"):
+            for seed, (turn, factor) in itertools.product(range(1, options.seeds + 1), enumerate(options.rays, 1)):
+                for build in ("old", "new") if (seed + turn) % 2 == 0 else ("new", "old"):
                     results.append(measure(options, pathlib.Path(folder), name, build, seed, factor))
                     print(results[-1].line(), flush=True)
     if options.picture:

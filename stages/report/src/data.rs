@@ -216,7 +216,7 @@ impl Scales {
         let data = layers.iter().enumerate().map(|(index, layer)| LayerData {
             label: layer.label.clone(),
             group: layer.group.heading().to_owned(),
-            kind: layer.group.file_name().to_owned(),
+            kind: layer.group.kind(),
             scene: layer.scene,
             row: layer.row,
             scale: self.of_layer.get(&index).copied(),

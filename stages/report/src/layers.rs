@@ -188,7 +188,7 @@ fn add_method<'a>(
         }
     }
     let of_metrics = row.metrics.picture_titles().into_iter().map(|(name, title)| {
-        let pointer = format!("/pictures/{name}");
+        let pointer = format!("/pictures/{}", name.replace('~', "~0").replace('/', "~1"));
         (Group::Metric { name: name.to_owned(), title: title.to_owned() }, pointer)
     });
     for (group, pointer) in [(Group::Error, "/error_map".to_owned())].into_iter().chain(of_metrics)
@@ -242,6 +242,14 @@ impl Group {
             Self::Error => "Error maps",
             Self::Depth => "Depth maps",
             Self::Metric { title, .. } => title,
+        }
+    }
+
+    /// Which layers the page lists together.
+    pub(crate) fn kind(&self) -> String {
+        match self {
+            Self::Metric { name, .. } => format!("metric-{name}"),
+            _ => self.file_name().to_owned(),
         }
     }
 

@@ -242,7 +242,7 @@ fn stem(layer: &Layer<'_>, view: &str) -> String {
         (Some(_), Group::Render) if layer.label == ONLY_RENDER => String::new(),
         (Some(_), _) => format!("-{}", plain(&layer.label.to_lowercase())),
     };
-    format!("views/{}/{}{whose}", plain(view), layer.group.file_name())
+    format!("views/{}/{}{whose}", plain(view), plain(layer.group.file_name()))
 }
 
 /// Letters that are plain in paths and addresses, 60 at most.

@@ -89,7 +89,7 @@ class Viewer {
     this.part("kind").value = state.kind;
   }
 
-  /** A layer in words, by itself. */
+  /** A layer in words, by itself; of a metric's title, what stands before the brackets. */
   name({ kind, group, label }) {
     if (["low-resolution", "ground-truth", "render"].includes(kind)) return label;
     const words = { error: "Error", depth: "Depth" }[kind] ?? group.split(" (")[0];

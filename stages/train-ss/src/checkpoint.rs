@@ -94,7 +94,8 @@ impl Checkpoints {
         };
         // Half of it would be neither the earlier training nor a new one.
         supervision.restore(&mut kept).with_context(|| {
-            format!("cannot read {}", folder.join(kept_name(trainer.steps())).display())
+            let kept = folder.join(kept_name(trainer.steps()));
+            format!("cannot read {}; delete it to start the training over", kept.display())
         })?;
         say(&format!("going on from step {}", trainer.steps()));
         Ok(curve)

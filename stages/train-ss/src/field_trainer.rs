@@ -22,7 +22,8 @@ pub(crate) trait FieldTrainer {
     fn checkpoint_step(&self, path: &Path) -> Option<u64>;
     /// Writes all that a resumed training needs.
     fn write_checkpoint(&self, path: &Path) -> anyhow::Result<()>;
-    /// Goes on from a checkpoint; whether it could.
+    /// Goes on from a checkpoint; whether it could. A trainer that can't is as it was, unless
+    /// libtorch failed.
     fn resume(&mut self, path: &Path) -> bool;
     /// Ends the training and writes the field's weights.
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()>;

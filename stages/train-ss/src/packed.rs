@@ -120,12 +120,14 @@ impl Bytes {
         }
     }
 
-    /// Begins to load bytes that are soon read, if they are in memory. Calls that follow each other
-    /// wait for memory together; reads with work between them would wait one by one.
+    /// Loads the first and the last of some bytes that are soon read, if they are in memory: most rows
+    /// lie in two cache lines. Calls that follow each other wait for memory together; reads with
+    /// work between them would wait one by one.
     pub(crate) fn touch(&self, range: &Range<usize>) {
-        if let Self::Memory(bytes) = self {
-            black_box(bytes.get(range.start).copied());
-            black_box(bytes.get(range.end - 1).copied());
+        if let Self::Memory(bytes) = self
+            && let Some(row) = bytes.get(range.clone())
+        {
+            black_box((row.first().copied(), row.last().copied()));
         }
     }
 
@@ -258,7 +260,7 @@ impl PackedPhotograph {
         }
     }
 
-    /// Begins to load neighbouring pixels, see [`Bytes::touch`].
+    /// Loads the ends of a row of neighbouring pixels, see [`Bytes::touch`].
     pub(crate) fn touch(&self, pixels: &Range<usize>) {
         let size = self.samples.size();
         self.bytes.touch(&(size * pixels.start..size * pixels.end));

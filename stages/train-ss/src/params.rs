@@ -91,7 +91,7 @@ pub struct GridParams {
     /// Total number of rays, with every sub-pixel ray counted, over the whole ensemble.
     #[schemars(range(min = 1), extend("x-group" = "sampling"))]
     pub rays: u64,
-    /// Maximum number of rays in a step. A step has at least 256 rays, even where this is less.
+    /// Maximum number of rays in a step. Below 256 it counts as 256.
     #[schemars(range(min = 1, max = 1_048_576), extend("x-group" = "sampling"))]
     pub max_rays_per_step: u32,
     /// Number of samples that the first steps aim at. The last steps aim at 8/3 times as many.

@@ -36,8 +36,8 @@ impl SubPixelRays {
     }
 }
 
-/// Sub-pixel rays along a side of an LR pixel, for a scale: a scale that isn't whole takes one more.
-/// A scale that is whole but for rounding is whole.
+/// Sub-pixel rays along a side of an LR pixel, for a scale. A scale that isn't whole takes one
+/// more; a scale that is whole but for rounding is whole.
 pub(crate) fn rays_per_side(scale: f64) -> u64 {
     (scale - 1e-6).ceil() as u64
 }

@@ -92,8 +92,19 @@ mod tests {
 
     use super::*;
 
+    /// A new form doesn't compile here, and then needs its place in the list, too.
+    fn number(format: Format) -> usize {
+        match format {
+            Format::Blender => 0,
+            Format::Transforms => 1,
+            Format::Llff => 2,
+            Format::Colmap => 3,
+        }
+    }
+
     #[test]
     fn forms_differ_and_all_are_told() {
+        assert_eq!(Format::ALL.map(number), [0, 1, 2, 3]);
         let names: BTreeSet<String> = Format::ALL.iter().map(Format::to_string).collect();
         assert_eq!(names.len(), Format::ALL.len());
         let words = signs();

@@ -51,7 +51,7 @@ pub struct Metrics {
     pub conventions: BTreeMap<String, String>,
     /// The figures, and how they are shown, the most important first.
     pub figures: Vec<Figure>,
-    /// Titles of the pictures that metrics made, by metric.
+    /// Titles of metrics' pictures, by metric.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub picture_titles: BTreeMap<String, String>,
     /// Means of the per-view values.

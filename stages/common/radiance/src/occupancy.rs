@@ -371,9 +371,8 @@ impl Occupancy {
         (from < to).then_some([from, to])
     }
 
-    /// The size of the largest empty cube around each of some cells, given by an array an axis: of
-    /// 2^size cells a side, a cell, a brick, a block, or an eighth of a brick or block.
-    /// [`OCCUPIED`] where a cell isn't empty.
+    /// For each cell the size of the largest empty cube around it: 2^size cells a side, 0 to 4.
+    /// [`OCCUPIED`] where the cell isn't empty. Cells are given by an array an axis.
     ///
     /// Written so that all but the loads vectorises.
     #[inline(always)]
@@ -478,6 +477,33 @@ mod tests {
             occupancy.update(&all, &densities, 0.003);
         }
         assert!(occupancy.cells().eq([0, met.cell as usize]));
+    }
+
+    /// The largest cube of cells is empty that begins at a multiple of its side.
+    #[test]
+    fn cubes_are_as_large_as_what_is_empty() {
+        let mut occupancy = Occupancy::full();
+        occupancy.set(|cell| match corner(cell, GRID) {
+            [x, y, z] if x > 64 && (cell / 3) % 977 == 0 && y + z < 150 => Cell::Thin,
+            [x, _, 40] if x % 16 == 3 => Cell::Dense,
+            _ => Cell::Empty,
+        });
+        let is_empty = |low: [usize; 3], side: usize| {
+            (0..side * side * side).all(|i| {
+                let [x, y, z] = corner(i, side);
+                let cell = low[0] + x + GRID * (low[1] + y + GRID * (low[2] + z));
+                !occupancy.is_occupied(cell)
+            })
+        };
+        let (mut rng, mut seen) = (CounterRng::new(6, 0, 0), [0; 6]);
+        for _ in 0..3000 {
+            let cell = [(); 3].map(|()| rng.below(GRID as u64) as usize);
+            let largest = (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
+            let [size] = occupancy.empty_around(&cell.map(|c| [c as u32]));
+            assert_eq!(size, largest.unwrap_or(OCCUPIED), "{cell:?}");
+            seen[size.min(5) as usize] += 1;
+        }
+        assert!(seen.iter().all(|&cells| cells > 0), "{seen:?}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 use std::io::{IsTerminal, Write};
-use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use artifact::report_line;
@@ -132,10 +132,22 @@ impl Progress {
     }
 
     fn update(&self, change: impl FnOnce(&mut ProgressState)) {
-        let mut state = self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let mut state = self.lock();
         change(&mut state);
         let done = state.done;
+        drop(state);
         self.hooks.progress(done);
+        self.show();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, ProgressState> {
+        self.state.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+
+    /// Shows the count, where it is time to.
+    fn show(&self) {
+        let mut state = self.lock();
+        let done = state.done;
         state.pace.begin(done);
         let interval =
             if self.mode == ProgressMode::Plain && self.bar.is_none() { 10_000 } else { 100 };

@@ -175,9 +175,9 @@ fn optical(
     Ok([through, transmittance, weights])
 }
 
-/// How many of the samples `kept` a training marches to: a ray takes no further round once its
-/// optical depth `through` says that it is dark.
-fn marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
+/// Counts the samples that a training takes: of each ray, those of `kept` up to the end of the round
+/// in which the ray becomes dark. Its optical depth is `through`.
+fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
     let exists = exists.f_reshape_as(through)?;
     let number = exists.f_cumsum(1, None::<Kind>)?;
@@ -339,6 +339,11 @@ impl TorchGrid {
                 cells_met(&weight, &positions.f_index_select(0, &shaded)?, &outputs.i((.., 0)))
             })?,
         };
+        let samples = match strides {
+            // Nobody asks.
+            Strides::Even => 0,
+            Strides::ByCell | Strides::Double => no_grad(|| count_marched(&through, &kept))?,
+        };
         let colour = self.shade(&maps, &outputs, &weight, &ray, n)?;
         Ok(GridSeen {
             premultiplied: sum_by_ray(&weight.f_mul(&colour)?, &ray, n)?,
@@ -350,7 +355,7 @@ impl TorchGrid {
             shaded_weight: weight,
             shaded_ray: ray,
             met,
-            samples: no_grad(|| marched(&through, &kept))?,
+            samples,
             maps,
         })
     }

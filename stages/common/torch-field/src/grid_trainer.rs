@@ -544,8 +544,8 @@ mod tests {
                 let (known, other) = (ours.field().parts().2.density(), judge.occupancy.density());
                 let pairs = known.iter().zip(other).filter(|(a, _)| **a > 0.0);
                 let differ = pairs.filter(|(a, b)| (**a / **b - 1.0).abs() > 1e-3).count();
-                // Without what rays met in the last steps, 4 cells and more differ. A GPU's rounding
-                // may put samples into other cells.
+                // Without what rays met in the last steps, 4 cells and more differ. A GPU's
+                // rounding may put samples into other cells.
                 assert!(device != Device::Cpu || differ < 3, "{space:?}: {differ} cells");
                 let rays: Vec<Ray> = (0..50)
                     .flat_map(|g| {

@@ -79,8 +79,11 @@ pub(super) fn march(
             RayMap::Contracted { radii, .. } => {
                 BentRay { march, ray, offset, radii }.run(most, *next, samples)
             }
-            // A ray that misses the box has the map of a straight one.
-            RayMap::Straight { .. } => DONE,
+            // A ray that meets nothing has a straight one's map.
+            RayMap::Straight { .. } => {
+                debug_assert!(ray.enter >= ray.leave);
+                DONE
+            }
         };
     }
 }

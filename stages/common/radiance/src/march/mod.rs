@@ -20,7 +20,7 @@ kernel! {
     pub(crate) fn march<L>(march: &March<'_>, most: usize, active: &[u32], next: &mut [u32],
         samples: &mut Marched) {
         let is_bent = |r: &u32| matches!(march.rays[*r as usize].map, RayMap::Contracted { .. });
-        // Rays that miss have a straight one's map.
+        // Of a scene with bent rays, those that meet nothing have a straight one's map.
         if active.iter().any(is_bent) {
             bent::march(march, most, active, next, samples);
         } else {

@@ -7,14 +7,18 @@ use crate::occupancy::OCCUPIED;
 use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
 
-/// The bits of an empty cube's size. An occupied cell has any size.
-const MOST_SIZE: u32 = 7;
+/// The bits of an empty cube's size: shifts below 32 vectorise without a check. The exit of an
+/// occupied cell isn't used.
+const SIZE_BITS: u32 = 7;
 
 /// Rays in lanes, and where their marches stand.
 struct SideBySide<'a> {
     march: &'a March<'a>,
     /// Most samples of a ray.
     most: usize,
+    /// Rays to march, and how many of them had their turn to get a lane.
+    active: &'a [u32],
+    begun: usize,
     /// Lanes that have a ray: a bit each.
     taken: u32,
     /// Place of each lane's ray among the active ones.
@@ -71,9 +75,8 @@ pub(super) fn march(
     samples: &mut Marched,
 ) {
     samples.slots.begin(active.len(), most);
-    let mut rays = SideBySide::new(march, most);
-    let mut waiting = 0;
-    (0..LANES).for_each(|lane| rays.seat(lane, &mut waiting, active, next));
+    let mut rays = SideBySide::new(march, most, active);
+    (0..LANES).for_each(|lane| rays.seat(lane, next));
     while rays.taken != 0 {
         let (places, mut stops) = rays.advance();
         while stops != 0 {
@@ -87,7 +90,7 @@ pub(super) fn march(
             } else {
                 next[r] = rays.k[lane];
             }
-            rays.seat(lane, &mut waiting, active, next);
+            rays.seat(lane, next);
         }
     }
     samples.take_slots(march.rays, active);
@@ -95,11 +98,13 @@ pub(super) fn march(
 
 impl<'a> SideBySide<'a> {
     #[inline(always)]
-    fn new(march: &'a March<'a>, most: usize) -> Self {
+    fn new(march: &'a March<'a>, most: usize, active: &'a [u32]) -> Self {
         let (row, rows) = ([0.0; LANES], [[0.0; LANES]; 3]);
         Self {
             march,
             most,
+            active,
+            begun: 0,
             taken: 0,
             place: [0; LANES],
             origin: rows,
@@ -113,15 +118,14 @@ impl<'a> SideBySide<'a> {
         }
     }
 
-    /// Gives a lane the next of the active rays that has anything before it. `waiting` counts those
-    /// that had their turn.
+    /// Gives a lane the next of the active rays that has anything before it.
     #[inline(always)]
-    fn seat(&mut self, lane: usize, waiting: &mut usize, active: &[u32], next: &mut [u32]) {
+    fn seat(&mut self, lane: usize, next: &mut [u32]) {
         self.taken &= !(1 << lane);
-        while let Some(&r) = active.get(*waiting) {
+        while let Some(&r) = self.active.get(self.begun) {
             let (ray, offset) = (&self.march.rays[r as usize], self.march.offsets[r as usize]);
             let inverse = ray.direction.map(|d| 1.0 / d);
-            *waiting += 1;
+            self.begun += 1;
             let Some([from, until]) = self.march.occupancy.crossing(ray, &inverse) else {
                 next[r as usize] = DONE;
                 continue;
@@ -135,7 +139,7 @@ impl<'a> SideBySide<'a> {
             (self.enter[lane], self.leave[lane], self.until[lane]) = (ray.enter, ray.leave, until);
             let first = first_step((from - ray.enter).mul_add(1.0 / self.march.step, -offset));
             self.k[lane] = first.max(next[r as usize]);
-            self.place[lane] = *waiting - 1;
+            self.place[lane] = self.begun - 1;
             self.taken |= 1 << lane;
             return;
         }
@@ -148,8 +152,10 @@ impl<'a> SideBySide<'a> {
         let March { occupancy, step, .. } = *self.march;
         let mut places = Places { t: [0.0; LANES], cells: [[0; LANES]; 3] };
         for i in 0..LANES {
+            // By way of i32, since AVX2 converts no u32.
             places.t[i] = (self.k[i] as i32 as f32 + self.offset[i]).mul_add(step, self.enter[i]);
         }
+        // A call an axis: of a loop over axes the compiler makes vectors of axes.
         let [x, y, z] = &mut places.cells;
         cells_along(&self.origin[0], &self.direction[0], &places.t, x);
         cells_along(&self.origin[1], &self.direction[1], &places.t, y);
@@ -169,7 +175,8 @@ impl<'a> SideBySide<'a> {
         (places, stops & self.taken)
     }
 
-    /// Shortens `exit`, the t at which rays leave their empty cubes, to where they do along an axis.
+    /// Shortens `exit`, the t at which rays leave their empty cubes, to where they leave along an
+    /// axis.
     #[inline(always)]
     fn leave_along(
         &self,
@@ -181,7 +188,7 @@ impl<'a> SideBySide<'a> {
         let (origin, direction) = (&self.origin[axis], &self.direction[axis]);
         let (inverse, cells) = (&self.inverse[axis], &places.cells[axis]);
         for i in 0..LANES {
-            let size = sizes[i] & MOST_SIZE;
+            let size = sizes[i] & SIZE_BITS;
             let side = if direction[i] > 0.0 { 1 << size } else { 0 };
             let face = ((cells[i] >> size << size) + side) as i32 as f32 / GRID as f32;
             let until = (face - origin[i]) * inverse[i];

@@ -8,8 +8,8 @@ use crate::tally::Tally;
 const AVERAGE_EVERY: u64 = 4;
 const AVERAGE_FROM: f64 = 0.7;
 
-/// Samples of the last step over those of the first. Small steps find the shape early; later, larger
-/// steps have less noise.
+/// Samples of the last step over those of the first. Small steps find the shape early; later,
+/// larger steps have less noise.
 const STEP_GROWTH: f64 = 8.0 / 3.0;
 
 /// How to train.
