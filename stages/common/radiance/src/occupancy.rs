@@ -484,7 +484,7 @@ mod tests {
     fn cubes_are_as_large_as_what_is_empty() {
         let mut occupancy = Occupancy::full();
         occupancy.set(|cell| match corner(cell, GRID) {
-            [x, y, z] if x > 64 && (cell / 3) % 977 == 0 && y + z < 150 => Cell::Thin,
+            [x, y, z] if x > 64 && (cell / 3) % 67 == 0 && y + z < 150 => Cell::Thin,
             [x, _, 40] if x % 16 == 3 => Cell::Dense,
             _ => Cell::Empty,
         });
@@ -498,7 +498,8 @@ mod tests {
         let (mut rng, mut seen) = (CounterRng::new(6, 0, 0), [0; 6]);
         for _ in 0..3000 {
             let cell = [(); 3].map(|()| rng.below(GRID as u64) as usize);
-            let largest = (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
+            let largest =
+                (0..=4).rev().find(|size| is_empty(cell.map(|c| c >> size << size), 1 << size));
             let [size] = occupancy.empty_around(&cell.map(|c| [c as u32]));
             assert_eq!(size, largest.unwrap_or(OCCUPIED), "{cell:?}");
             seen[size.min(5) as usize] += 1;

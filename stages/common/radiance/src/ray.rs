@@ -92,6 +92,51 @@ fn sinh4(t: f32) -> f32 {
     0.5 * (e - 1.0 / e)
 }
 
+/// A contracted ray's point `along` from the one nearest to the centre, and its distance from the
+/// centre, all in ball radii.
+#[inline(always)]
+fn before_contraction(origin: [f32; 3], direction: [f32; 3], along: f32) -> ([f32; 3], f32) {
+    let u: [f32; 3] = std::array::from_fn(|i| direction[i].mul_add(along, origin[i]));
+    (u, u.iter().map(|x| x * x).sum::<f32>().sqrt())
+}
+
+/// The place of a contracted ray in the unit cube at t.
+#[inline(always)]
+pub(crate) fn contracted_place(
+    origin: [f32; 3],
+    direction: [f32; 3],
+    radii: f32,
+    t: f32,
+) -> [f32; 3] {
+    let (u, length) = before_contraction(origin, direction, radii * sinh4(t));
+    let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
+    u.map(|x| (0.25 * factor).mul_add(x, 0.5))
+}
+
+/// How fast the place of a contracted ray moves in the unit cube at t, for each unit of t. Both
+/// sides of the ball's surface are computed, so that a loop vectorises.
+#[inline(always)]
+pub(crate) fn contracted_velocity(
+    origin: [f32; 3],
+    direction: [f32; 3],
+    radii: f32,
+    t: f32,
+) -> [f32; 3] {
+    let e = exp(4.0 * t);
+    let half = 0.5 * radii;
+    // A quarter of how fast `along` grows: the cube is four radii wide.
+    let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
+    let (u, length) = before_contraction(origin, direction, along);
+    // The contraction is h(r)·u with h = (2 - 1/r) / r, and dr/d(along) = along / r.
+    let inverse = 1.0 / length;
+    let factor = (2.0 - inverse) * inverse;
+    let change = 2.0 * (inverse - 1.0) * inverse * inverse * (along * inverse);
+    std::array::from_fn(|i| {
+        let outside = speed * change.mul_add(u[i], factor * direction[i]);
+        if length <= 1.0 { speed * direction[i] } else { outside }
+    })
+}
+
 impl NormalizedRay {
     /// The place in the unit cube at t.
     #[inline(always)]
@@ -101,49 +146,18 @@ impl NormalizedRay {
                 std::array::from_fn(|i| self.direction[i].mul_add(t, self.origin[i]))
             }
             RayMap::Contracted { radii, .. } => {
-                let (u, length) = self.before_contraction(radii * sinh4(t));
-                let factor = if length > 1.0 { (2.0 - 1.0 / length) / length } else { 1.0 };
-                u.map(|x| (0.25 * factor).mul_add(x, 0.5))
+                contracted_place(self.origin, self.direction, radii, t)
             }
         }
     }
 
-    /// The places in the unit cube at several t, an array an axis: written so that it vectorises.
+    /// Ball radii of a contracted ray's map; 0 of a straight ray.
     #[inline(always)]
-    pub(crate) fn positions<const N: usize>(&self, t: &[f32; N]) -> [[f32; N]; 3] {
-        let mut places = [[0.0; N]; 3];
-        for (i, &t) in t.iter().enumerate() {
-            for (axis, x) in places.iter_mut().zip(self.position(t)) {
-                axis[i] = x;
-            }
+    pub(crate) fn radii(&self) -> f32 {
+        match self.map {
+            RayMap::Straight { .. } => 0.0,
+            RayMap::Contracted { radii, .. } => radii,
         }
-        places
-    }
-
-    /// A contracted ray's point `along` from the one nearest to the centre, and its distance from
-    /// the centre, all in ball radii.
-    #[inline(always)]
-    fn before_contraction(&self, along: f32) -> ([f32; 3], f32) {
-        let u: [f32; 3] = std::array::from_fn(|i| self.direction[i].mul_add(along, self.origin[i]));
-        (u, u.iter().map(|x| x * x).sum::<f32>().sqrt())
-    }
-
-    /// How fast the place of a contracted ray moves in the unit cube at t, for each unit of t.
-    #[inline(always)]
-    pub(crate) fn contracted_velocity(&self, radii: f32, t: f32) -> [f32; 3] {
-        let e = exp(4.0 * t);
-        let half = 0.5 * radii;
-        // A quarter of how fast `along` grows: the cube is four radii wide.
-        let (along, speed) = (half * (e - 1.0 / e), half * (e + 1.0 / e));
-        let (u, length) = self.before_contraction(along);
-        if length <= 1.0 {
-            return self.direction.map(|d| speed * d);
-        }
-        // The contraction is h(r)·u with h = (2 - 1/r) / r, and dr/d(along) = along / r.
-        let inverse = 1.0 / length;
-        let factor = (2.0 - inverse) * inverse;
-        let change = 2.0 * (inverse - 1.0) * inverse * inverse * (along * inverse);
-        std::array::from_fn(|i| speed * change.mul_add(u[i], factor * self.direction[i]))
     }
 
     /// The distance in scene units at t.
@@ -411,7 +425,8 @@ mod tests {
             while t + step < seen.leave {
                 let [a, b] = [t, t + step].map(|t| seen.position(t));
                 assert!(length(a, b) < FASTEST * step + 1e-6, "at {t} of {seen:?}");
-                let [before, after] = [t, t + step].map(|t| seen.contracted_velocity(radii, t));
+                let [before, after] = [t, t + step]
+                    .map(|t| contracted_velocity(seen.origin, seen.direction, radii, t));
                 let measured: [f32; 3] = std::array::from_fn(|i| (b[i] - a[i]) / step);
                 let middle = std::array::from_fn(|i| 0.5 * (before[i] + after[i]));
                 assert!(length(measured, middle) < 0.01, "{measured:?} {middle:?} at {t}");

@@ -430,7 +430,8 @@ mod tests {
     fn a_failed_resume_leaves_no_trace() {
         let folder = tempfile::tempdir().unwrap();
         let options = TrainingOptions { ema_decay: 0.9, ..options(30) };
-        let new = |architecture| Trainer::new(Field::new(architecture, cube(Space::Box), 5), options);
+        let new =
+            |architecture| Trainer::new(Field::new(architecture, cube(Space::Box), 5), options);
         let larger = Architecture { log2_entries: 11, ..SMALL };
         for (name, architecture) in [("size", larger), ("cells", SMALL)] {
             let path = folder.path().join(name);

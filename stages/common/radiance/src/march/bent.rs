@@ -1,45 +1,93 @@
-//! A bent ray's march: through the contraction a ray is a curve.
+//! Bent rays: through the contraction a ray is a curve.
 
-use super::marched::{DONE, March, Marched};
-use super::steps::first_step;
-use crate::occupancy::{OCCUPIED, cell_of};
-use crate::ray::{FASTEST, MOST_BENT, NormalizedRay, RayMap};
+use super::side_by_side::{Course, LaneRays, Places};
+use crate::occupancy::Occupancy;
+use crate::ray::{
+    FASTEST, MOST_BENT, NormalizedRay, RayMap, contracted_place, contracted_velocity,
+};
+use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
+
+/// The course of bent rays.
+pub(super) struct Bent;
+
+impl Course for Bent {
+    #[inline(always)]
+    fn crossing(_: &Occupancy, ray: &NormalizedRay, _: &[f32; 3]) -> Option<[f32; 2]> {
+        match ray.map {
+            RayMap::Contracted { .. } => Some([ray.enter, ray.leave]),
+            // A ray that meets nothing has a straight one's map.
+            RayMap::Straight { .. } => {
+                debug_assert!(ray.enter >= ray.leave);
+                None
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn position(ray: &NormalizedRay, t: f32) -> [f32; 3] {
+        ray.position(t)
+    }
+
+    #[inline(always)]
+    fn positions(rays: &LaneRays, t: &[f32; LANES]) -> [[f32; LANES]; 3] {
+        let (mut xs, mut ys, mut zs) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+        for i in 0..LANES {
+            let (origin, direction) = (of_lane(&rays.origin, i), of_lane(&rays.direction, i));
+            [xs[i], ys[i], zs[i]] = contracted_place(origin, direction, rays.radii[i], t[i]);
+        }
+        [xs, ys, zs]
+    }
+
+    #[inline(always)]
+    fn exits(rays: &LaneRays, places: &Places, sizes: &[u32; LANES]) -> [f32; LANES] {
+        let (mut xs, mut ys, mut zs) = ([0.0; LANES], [0.0; LANES], [0.0; LANES]);
+        for i in 0..LANES {
+            let (origin, direction) = (of_lane(&rays.origin, i), of_lane(&rays.direction, i));
+            [xs[i], ys[i], zs[i]] =
+                contracted_velocity(origin, direction, rays.radii[i], places.t[i]);
+        }
+        let velocities = [xs, ys, zs];
+        let mut exits = [0.0; LANES];
+        for i in 0..LANES {
+            let cube = EmptyCube::around(of_lane(&places.cells, i), sizes[i]);
+            let inside = cube.time_inside(&of_lane(&places.positions, i), &of_lane(&velocities, i));
+            // A ray takes about a step through half a cell, and goes on by a step anyway.
+            exits[i] = if sizes[i] == 0 { places.t[i] } else { inside + places.t[i] };
+        }
+        exits
+    }
+}
+
+/// A lane's part of three rows.
+#[inline(always)]
+fn of_lane<T: Copy>(rows: &[[T; LANES]; 3], lane: usize) -> [T; 3] {
+    [rows[0][lane], rows[1][lane], rows[2][lane]]
+}
 
 /// A cube of empty cells.
 pub(super) struct EmptyCube {
     /// Its first cell along each axis.
-    pub(super) low: [usize; 3],
+    low: [u32; 3],
     /// Cells along each axis.
-    pub(super) side: usize,
+    side: u32,
 }
 
 impl EmptyCube {
     /// The cube of 2^`size` cells a side that a cell lies in.
     #[inline(always)]
-    fn around(cell: [usize; 3], size: u32) -> Self {
+    pub(super) fn around(cell: [u32; 3], size: u32) -> Self {
         Self { low: cell.map(|c| c >> size << size), side: 1 << size }
     }
 
-    /// A t at which a ray is still inside: bounded by its greatest speed, and by its velocity at
-    /// `at` with the most that this changes. At t = `at` the ray is at `position`.
+    /// How far in t a ray goes and is still inside, from a position with a velocity: bounded by its
+    /// greatest speed, and by its velocity with the most that this changes.
     #[inline(always)]
-    pub(super) fn exit(
-        &self,
-        ray: &NormalizedRay,
-        radii: f32,
-        at: f32,
-        position: &[f32; 3],
-    ) -> f32 {
-        // A ray takes about a step through half a cell, and goes on by a step anyway.
-        if self.side == 1 {
-            return at;
-        }
-        let velocity = ray.contracted_velocity(radii, at);
+    pub(super) fn time_inside(&self, position: &[f32; 3], velocity: &[f32; 3]) -> f32 {
         let (mut nearest, mut stay) = (f32::INFINITY, f32::INFINITY);
         for i in 0..3 {
-            let low = self.low[i] as f32 / GRID as f32;
-            let high = (self.low[i] + self.side) as f32 / GRID as f32;
+            let low = self.low[i] as i32 as f32 / GRID as f32;
+            let high = (self.low[i] + self.side) as i32 as f32 / GRID as f32;
             // Rounding may put a place outside of the unit cube.
             let (below, above) = ((position[i] - low).max(0.0), (high - position[i]).max(0.0));
             nearest = nearest.min(below.min(above));
@@ -54,96 +102,6 @@ impl EmptyCube {
             stay = stay.min(to_ahead.max(0.0)).min(to_behind);
         }
         // Rounding of the velocity is less than a thousandth.
-        (nearest * (1.0 / FASTEST)).max(stay * 0.999) + at
-    }
-}
-
-/// Steps whose places are found together, in one vector: their exponentials cost more than all
-/// else.
-const STEPS_AHEAD: usize = 8;
-
-/// Marches bent rays on, see [`super::march`].
-#[inline(always)]
-pub(super) fn march(
-    march: &March<'_>,
-    most: usize,
-    active: &[u32],
-    next: &mut [u32],
-    samples: &mut Marched,
-) {
-    for &r in active {
-        samples.starts.push(samples.t.len());
-        let (ray, offset) = (&march.rays[r as usize], march.offsets[r as usize]);
-        let next = &mut next[r as usize];
-        *next = match ray.map {
-            RayMap::Contracted { radii, .. } => {
-                BentRay { march, ray, offset, radii }.run(most, *next, samples)
-            }
-            // A ray that meets nothing has a straight one's map.
-            RayMap::Straight { .. } => {
-                debug_assert!(ray.enter >= ray.leave);
-                DONE
-            }
-        };
-    }
-}
-
-/// One ray's march.
-struct BentRay<'a> {
-    march: &'a March<'a>,
-    ray: &'a NormalizedRay,
-    offset: f32,
-    /// Ball radii of the ray's map.
-    radii: f32,
-}
-
-impl BentRay<'_> {
-    /// The first step at t or behind it.
-    #[inline(always)]
-    fn step_at(&self, t: f32) -> u32 {
-        let steps = (t - self.ray.enter).mul_add(1.0 / self.march.step, -self.offset);
-        first_step(steps)
-    }
-
-    /// Marches on from step `k`; gives the next step.
-    #[inline(always)]
-    fn run(&self, most: usize, mut k: u32, samples: &mut Marched) -> u32 {
-        let March { occupancy, step, strides, .. } = *self.march;
-        let (ray, offset) = (self.ray, self.offset);
-        let mut left = most;
-        while left > 0 {
-            let first = k;
-            let ahead: [f32; STEPS_AHEAD] = std::array::from_fn(|i| {
-                (first as f32 + i as f32 + offset).mul_add(step, ray.enter)
-            });
-            let places = ray.positions(&ahead);
-            while left > 0 && ((k - first) as usize) < STEPS_AHEAD {
-                let at = ahead[(k - first) as usize];
-                if at >= ray.leave {
-                    return DONE;
-                }
-                let p = places.map(|axis| axis[(k - first) as usize]);
-                let cell = cell_of(p);
-                let [size] = occupancy.empty_around(&cell.map(|c| [c as u32]));
-                if size != OCCUPIED {
-                    // Where the ray leaves what is empty; at least one step on.
-                    let exit = EmptyCube::around(cell, size).exit(ray, self.radii, at, &p);
-                    k = (k + 1).max(self.step_at(exit));
-                    continue;
-                }
-                if !strides.are_double_in(occupancy.is_thin(cell)) {
-                    samples.push(at, 1.0, p);
-                    left -= 1;
-                } else {
-                    let middle = (k as f32 + offset + 0.5).mul_add(step, ray.enter);
-                    if k & 1 == 0 && middle < ray.leave {
-                        samples.push(middle, 2.0, ray.position(middle));
-                        left -= 1;
-                    }
-                }
-                k += 1;
-            }
-        }
-        k
+        (nearest * (1.0 / FASTEST)).max(stay * 0.999)
     }
 }

@@ -53,6 +53,12 @@ impl Slots {
         self.samples.resize(rays * most, [0.0; 2]);
     }
 
+    /// t and length of an active ray's sample.
+    #[inline(always)]
+    pub(super) fn sample(&self, place: usize, slot: usize) -> [f32; 2] {
+        self.samples[place * self.most + slot]
+    }
+
     /// Puts a sample into the next slot of an active ray.
     #[inline(always)]
     pub(super) fn put(&mut self, place: usize, t: f32, length: f32) {
@@ -68,19 +74,5 @@ impl Marched {
         self.t.push(t);
         self.lengths.push(length);
         self.positions.push(position);
-    }
-
-    /// Appends what the slots hold, ray by ray.
-    #[inline(always)]
-    pub(super) fn take_slots(&mut self, rays: &[NormalizedRay], active: &[u32]) {
-        for (place, &r) in active.iter().enumerate() {
-            self.starts.push(self.t.len());
-            let ray = &rays[r as usize];
-            for slot in 0..self.slots.counts[place] {
-                let [t, length] = self.slots.samples[place * self.slots.most + slot];
-                let position = std::array::from_fn(|i| ray.direction[i].mul_add(t, ray.origin[i]));
-                self.push(t, length, position);
-            }
-        }
     }
 }

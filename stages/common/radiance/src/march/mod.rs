@@ -2,6 +2,7 @@
 
 mod bent;
 mod marched;
+mod side_by_side;
 mod steps;
 mod straight;
 #[cfg(test)]
@@ -10,7 +11,9 @@ mod tests;
 use crate::ray::RayMap;
 use crate::simd::kernel;
 
+use bent::Bent;
 pub(crate) use marched::{DONE, March, Marched};
+use straight::Straight;
 
 kernel! {
     /// Marches on: at most `most` more samples of each of the `active` rays, all of one scene. Step
@@ -22,9 +25,9 @@ kernel! {
         let is_bent = |r: &u32| matches!(march.rays[*r as usize].map, RayMap::Contracted { .. });
         // Of a scene with bent rays, those that meet nothing have a straight one's map.
         if active.iter().any(is_bent) {
-            bent::march(march, most, active, next, samples);
+            side_by_side::march::<Bent>(march, most, active, next, samples);
         } else {
-            straight::march(march, most, active, next, samples);
+            side_by_side::march::<Straight>(march, most, active, next, samples);
         }
         samples.starts.push(samples.t.len());
     }

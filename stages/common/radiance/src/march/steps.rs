@@ -1,4 +1,7 @@
-//! Numbers of steps.
+//! Numbers of steps and cells.
+
+use crate::math::floor;
+use crate::spec::OCCUPANCY_CELLS as GRID;
 
 /// Steps of a ray are counted to here: many times as many as a ray has.
 const MOST_STEPS: f32 = 4_194_304.0;
@@ -6,22 +9,21 @@ const MOST_STEPS: f32 = 4_194_304.0;
 /// The first step at a number of steps or behind it; of NaN the first of all.
 #[inline(always)]
 pub(super) fn first_step(steps: f32) -> u32 {
-    whole(steps.ceil(), MOST_STEPS)
+    let steps = steps.max(0.0).min(MOST_STEPS);
+    let (below, step) = floor(steps);
+    step + u32::from(steps > below)
 }
 
-/// A number, at least 0 and at most `most`, without its fraction. Written so that it vectorises,
-/// which `as u32` doesn't; exact below 2^23.
+/// The cell along an axis that a coordinate of the unit cube lies in.
 #[inline(always)]
-pub(super) fn whole(number: f32, most: f32) -> u32 {
-    // From 2^23 to 2^24 numbers are whole, and are their last bits.
-    const WHOLE_FROM: f32 = 8_388_608.0;
-    let number = number.max(0.0).min(most).floor();
-    (number + WHOLE_FROM).to_bits() - WHOLE_FROM.to_bits()
+pub(super) fn cell(coordinate: f32) -> u32 {
+    floor((coordinate * GRID as f32).max(0.0).min(GRID as f32 - 1.0)).1
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::occupancy::cell_of;
 
     #[test]
     fn steps_are_counted_exactly() {
@@ -39,9 +41,8 @@ mod tests {
         ] {
             assert_eq!(first_step(number), step, "{number}");
         }
-        for number in (0..400_000).map(|i| i as f32 * 0.37) {
-            assert_eq!(whole(number, MOST_STEPS), number as u32);
+        for place in (0..40_000).map(|i| [i as f32 * 3e-5 - 0.1, 0.5, 0.5]) {
+            assert_eq!(cell(place[0]) as usize, cell_of(place)[0], "{place:?}");
         }
-        assert_eq!(whole(128.0, 127.0), 127);
     }
 }
