@@ -131,10 +131,8 @@ impl Stage for Eval {
 }
 
 fn picture_titles(metrics: &[Box<dyn Metric>]) -> BTreeMap<String, String> {
-    let of = |metric: &Box<dyn Metric>| {
-        Some((metric.name().to_owned(), metric.picture_title()?.to_owned()))
-    };
-    metrics.iter().filter_map(of).collect()
+    let titled = metrics.iter().filter_map(|metric| Some((metric.name(), metric.picture_title()?)));
+    titled.map(|(name, title)| (name.to_owned(), title.to_owned())).collect()
 }
 
 /// Scores a view by every metric, and writes its error map and what pictures they made.

@@ -227,7 +227,7 @@ fn bent_rays_leap_within_a_cube() {
                     let cells = x * GRID as f32;
                     (cells - cells.round()).abs() < 1e-4
                 });
-                assert!(is_inside || is_at_face, "{ray:?}: {cell:?} at {t}, not in {:?}", low);
+                assert!(is_inside || is_at_face, "{ray:?}: {cell:?} at {t}, not in {low:?}");
             }
             leaps += 1;
             far += usize::from(exit - at > 0.2 * side as f32 / GRID as f32);
