@@ -18,8 +18,8 @@ pub(crate) trait Metric: Sync {
     /// are equal in both images, so their error is 0: divide a mean error over all pixels by
     /// [`ScoredView::counted_share`], at LR by that of its `lr`.
     fn score(&self, view: &ScoredView<'_>) -> anyhow::Result<Measured>;
-    /// Title of its pictures on the page: a caption, and a note in brackets. Pictures without a title
-    /// aren't shown.
+    /// Title of its pictures on the page: a caption, and a note in brackets. Pictures without a
+    /// title aren't shown.
     fn picture_title(&self) -> Option<&'static str> {
         None
     }

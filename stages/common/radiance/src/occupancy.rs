@@ -4,6 +4,7 @@
 use counter_rng::CounterRng;
 use rayon::prelude::*;
 
+use crate::math::floor;
 use crate::ray::NormalizedRay;
 use crate::spec::{EMPTY, OCCUPANCY_CELLS as GRID, THIN};
 use crate::strides::Strides;
@@ -71,7 +72,13 @@ fn words_of(brick: usize, held: impl Fn(usize) -> Cell) -> (u64, u64) {
 /// The cell along each axis that a place of the unit cube lies in.
 #[inline(always)]
 pub(crate) fn cell_of(place: [f32; 3]) -> [usize; 3] {
-    place.map(|x| (x * GRID as f32).max(0.0).min(GRID as f32 - 1.0) as i32 as usize)
+    place.map(|coordinate| cell_along(coordinate) as usize)
+}
+
+/// The cell along one axis. A cast would saturate, and so not vectorise.
+#[inline(always)]
+pub(crate) fn cell_along(coordinate: f32) -> u32 {
+    floor((coordinate * GRID as f32).max(0.0).min(GRID as f32 - 1.0)).1
 }
 
 /// A density that a ray has met in a cell, where it stops light.
@@ -477,6 +484,15 @@ mod tests {
             occupancy.update(&all, &densities, 0.003);
         }
         assert!(occupancy.cells().eq([0, met.cell as usize]));
+    }
+
+    /// As casts have it.
+    #[test]
+    fn places_lie_in_their_cells() {
+        for x in (0..40_000).map(|i| i as f32 * 3e-5 - 0.1).chain([f32::NAN, f32::INFINITY]) {
+            let expected = (x * GRID as f32).max(0.0).min(GRID as f32 - 1.0) as u32;
+            assert_eq!(cell_along(x), expected, "{x}");
+        }
     }
 
     /// The largest cube of cells is empty that begins at a multiple of its side.

@@ -175,8 +175,8 @@ fn optical(
     Ok([through, transmittance, weights])
 }
 
-/// Counts the samples that a training takes: of each ray, those of `kept` up to the end of the round
-/// in which the ray becomes dark. Its optical depth is `through`.
+/// Counts the samples that a training takes: of each ray, those of `kept` up to the end of the
+/// round in which the ray becomes dark. Its optical depth is `through`.
 fn count_marched(through: &Tensor, kept: &Tensor) -> Result<usize, TchError> {
     let exists = through.f_zeros_like()?.f_reshape([-1])?.f_index_fill(0, kept, 1.0)?;
     let exists = exists.f_reshape_as(through)?;

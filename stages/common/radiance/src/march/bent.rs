@@ -1,6 +1,6 @@
 //! Bent rays: through the contraction a ray is a curve.
 
-use super::side_by_side::{Course, LaneRays, Places};
+use super::side_by_side::{LaneRays, Places, RayKind};
 use crate::occupancy::Occupancy;
 use crate::ray::{
     FASTEST, MOST_BENT, NormalizedRay, RayMap, contracted_place, contracted_velocity,
@@ -8,10 +8,10 @@ use crate::ray::{
 use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
 
-/// The course of bent rays.
+/// The kind of bent rays.
 pub(super) struct Bent;
 
-impl Course for Bent {
+impl RayKind for Bent {
     #[inline(always)]
     fn crossing(_: &Occupancy, ray: &NormalizedRay, _: &[f32; 3]) -> Option<[f32; 2]> {
         match ray.map {

@@ -2,13 +2,13 @@
 //! would wait at each.
 
 use super::marched::{DONE, March, Marched};
-use super::steps::{cell, first_step};
-use crate::occupancy::{OCCUPIED, Occupancy};
+use super::steps::first_step;
+use crate::occupancy::{OCCUPIED, Occupancy, cell_along};
 use crate::ray::NormalizedRay;
 use crate::simd::LANES;
 
 /// How rays of a kind move through the unit cube, for all lanes at once.
-pub(super) trait Course {
+pub(super) trait RayKind {
     /// From which t to which a ray may meet something; `None` where it meets nothing. `inverse` is
     /// 1 over its direction.
     fn crossing(occupancy: &Occupancy, ray: &NormalizedRay, inverse: &[f32; 3])
@@ -71,7 +71,7 @@ struct SideBySide<'a> {
 
 /// Marches rays on, see [`super::march`].
 #[inline(always)]
-pub(super) fn march<C: Course>(
+pub(super) fn march<K: RayKind>(
     march: &March<'_>,
     most: usize,
     active: &[u32],
@@ -80,9 +80,9 @@ pub(super) fn march<C: Course>(
 ) {
     samples.slots.begin(active.len(), most);
     let mut lanes = SideBySide::new(march, most, active);
-    (0..LANES).for_each(|lane| lanes.seat::<C>(lane, next));
+    (0..LANES).for_each(|lane| lanes.seat::<K>(lane, next));
     while lanes.taken != 0 {
-        let (places, mut stops) = lanes.advance::<C>();
+        let (places, mut stops) = lanes.advance::<K>();
         while stops != 0 {
             let lane = stops.trailing_zeros() as usize;
             stops &= stops - 1;
@@ -94,20 +94,20 @@ pub(super) fn march<C: Course>(
             } else {
                 next[r] = lanes.k[lane];
             }
-            lanes.seat::<C>(lane, next);
+            lanes.seat::<K>(lane, next);
         }
     }
-    take_slots::<C>(march.rays, active, samples);
+    take_slots::<K>(march.rays, active, samples);
 }
 
 /// Appends what the slots hold, ray by ray.
 #[inline(always)]
-fn take_slots<C: Course>(rays: &[NormalizedRay], active: &[u32], samples: &mut Marched) {
+fn take_slots<K: RayKind>(rays: &[NormalizedRay], active: &[u32], samples: &mut Marched) {
     for (place, &r) in active.iter().enumerate() {
         samples.starts.push(samples.t.len());
         for slot in 0..samples.slots.counts[place] {
             let [t, length] = samples.slots.sample(place, slot);
-            samples.push(t, length, C::position(&rays[r as usize], t));
+            samples.push(t, length, K::position(&rays[r as usize], t));
         }
     }
 }
@@ -157,13 +157,13 @@ impl<'a> SideBySide<'a> {
 
     /// Gives a lane the next of the active rays that has anything before it.
     #[inline(always)]
-    fn seat<C: Course>(&mut self, lane: usize, next: &mut [u32]) {
+    fn seat<K: RayKind>(&mut self, lane: usize, next: &mut [u32]) {
         self.taken &= !(1 << lane);
         while let Some(&r) = self.active.get(self.begun) {
             let (ray, offset) = (&self.march.rays[r as usize], self.march.offsets[r as usize]);
             let inverse = ray.direction.map(|d| 1.0 / d);
             self.begun += 1;
-            let Some([from, until]) = C::crossing(self.march.occupancy, ray, &inverse) else {
+            let Some([from, until]) = K::crossing(self.march.occupancy, ray, &inverse) else {
                 next[r as usize] = DONE;
                 continue;
             };
@@ -180,7 +180,7 @@ impl<'a> SideBySide<'a> {
     /// Takes every ray that is in an empty cube out of it; gives where rays were, and the lanes
     /// whose rays have come to their end or to an occupied cell: a bit each.
     #[inline(always)]
-    fn advance<C: Course>(&mut self) -> (Places, u32) {
+    fn advance<K: RayKind>(&mut self) -> (Places, u32) {
         let March { occupancy, step, .. } = *self.march;
         let LaneRays { offset, enter, .. } = &self.rays;
         let mut t = [0.0; LANES];
@@ -188,13 +188,13 @@ impl<'a> SideBySide<'a> {
             // By way of i32, since AVX2 converts no u32.
             t[i] = (self.k[i] as i32 as f32 + offset[i]).mul_add(step, enter[i]);
         }
-        let positions = C::positions(&self.rays, &t);
+        let positions = K::positions(&self.rays, &t);
         let [x, y, z] = &positions;
         let cells = [cells_along(x), cells_along(y), cells_along(z)];
         let places = Places { t, positions, cells };
         let sizes = occupancy.empty_around(&places.cells);
         // Exits of occupied cells aren't used.
-        let exits = C::exits(&self.rays, &places, &sizes.map(|size| size & SIZE_BITS));
+        let exits = K::exits(&self.rays, &places, &sizes.map(|size| size & SIZE_BITS));
         let mut stops = 0;
         for i in 0..LANES {
             let leap = first_step((exits[i] - enter[i]).mul_add(1.0 / step, -offset[i]));
@@ -231,7 +231,7 @@ impl<'a> SideBySide<'a> {
 fn cells_along(positions: &[f32; LANES]) -> [u32; LANES] {
     let mut cells = [0; LANES];
     for i in 0..LANES {
-        cells[i] = cell(positions[i]);
+        cells[i] = cell_along(positions[i]);
     }
     cells
 }

@@ -1,15 +1,15 @@
 //! Straight rays: through a box, and through a frustum's normalised device coordinates.
 
-use super::side_by_side::{Course, LaneRays, Places};
+use super::side_by_side::{LaneRays, Places, RayKind};
 use crate::occupancy::Occupancy;
 use crate::ray::NormalizedRay;
 use crate::simd::LANES;
 use crate::spec::OCCUPANCY_CELLS as GRID;
 
-/// The course of straight rays.
+/// The kind of straight rays.
 pub(super) struct Straight;
 
-impl Course for Straight {
+impl RayKind for Straight {
     #[inline(always)]
     fn crossing(
         occupancy: &Occupancy,
@@ -19,6 +19,8 @@ impl Course for Straight {
         occupancy.crossing(ray, inverse)
     }
 
+    /// As [`NormalizedRay::position`], whose other branch takes an exponential: the compiler would
+    /// compute it here, too.
     #[inline(always)]
     fn position(ray: &NormalizedRay, t: f32) -> [f32; 3] {
         std::array::from_fn(|axis| ray.direction[axis].mul_add(t, ray.origin[axis]))
