@@ -7,8 +7,30 @@
 
 use serde_json::Value;
 
+/// What is wrong after `=`, and what to do.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum ArgumentError {
+    /// One of several values is empty.
+    #[error("a value between commas is empty; leave the comma out, or write null")]
+    EmptyValue,
+    /// A value isn't the JSON that it begins like.
+    #[error("{value} begins like JSON and isn't: {problem}")]
+    Json {
+        /// The value.
+        value: String,
+        /// What is wrong.
+        problem: serde_json::Error,
+    },
+    /// There is no folder.
+    #[error("no folder is named")]
+    NoFolder,
+    /// One of several folders has no name.
+    #[error("a folder's name between commas is empty; leave the comma out")]
+    EmptyFolder,
+}
+
 /// The values of a list with what they mean. Of several none may be empty.
-pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, String> {
+pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, ArgumentError> {
     if text.is_empty() {
         return Ok(vec![("", Value::Null)]);
     }
@@ -16,24 +38,22 @@ pub(crate) fn values(text: &str) -> Result<Vec<(&str, Value)>, String> {
 }
 
 /// The folders of a list.
-pub(crate) fn folders(text: &str) -> Result<Vec<&str>, String> {
+pub(crate) fn folders(text: &str) -> Result<Vec<&str>, ArgumentError> {
     let folders: Vec<&str> = text.split(',').collect();
     match folders.iter().any(|folder| folder.is_empty()) {
-        true if text.is_empty() => Err("no folder is named".to_owned()),
-        true => Err("a folder's name between commas is empty; leave the comma out".to_owned()),
+        true if text.is_empty() => Err(ArgumentError::NoFolder),
+        true => Err(ArgumentError::EmptyFolder),
         false => Ok(folders),
     }
 }
 
-fn value(piece: &str) -> Result<Value, String> {
+fn value(piece: &str) -> Result<Value, ArgumentError> {
     if piece.is_empty() {
-        return Err(
-            "a value between commas is empty; leave the comma out, or write null".to_owned()
-        );
+        return Err(ArgumentError::EmptyValue);
     }
     let parsed = serde_json::from_str::<Value>(piece);
     if piece.starts_with(JSON) {
-        return parsed.map_err(|e| format!("{piece} begins like JSON and isn't: {e}"));
+        return parsed.map_err(|problem| ArgumentError::Json { value: piece.to_owned(), problem });
     }
     // JSON itself allows white space around a value.
     Ok(parsed.ok().filter(|_| piece.trim() == piece).unwrap_or_else(|| Value::from(piece)))
@@ -117,11 +137,11 @@ mod tests {
             ("[1,2", "begins like JSON and isn't"),
             ("\"a", "begins like JSON and isn't"),
         ] {
-            let problem = values(text).unwrap_err();
+            let problem = values(text).unwrap_err().to_string();
             assert!(problem.contains(words), "{text}: {problem}");
         }
-        assert_eq!(folders("a,./b"), Ok(vec!["a", "./b"]));
-        assert!(folders("").unwrap_err().contains("no folder"));
-        assert!(folders("a,,b").unwrap_err().contains("leave the comma out"));
+        assert_eq!(folders("a,./b").unwrap(), ["a", "./b"]);
+        assert!(folders("").unwrap_err().to_string().contains("no folder"));
+        assert!(folders("a,,b").unwrap_err().to_string().contains("leave the comma out"));
     }
 }

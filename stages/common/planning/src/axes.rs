@@ -211,13 +211,13 @@ impl Scope<'_> {
         let program = self.programs.require(&stage)?;
         let values: Vec<(&str, Value)> = match kind {
             Kind::Parameter => {
-                let given = arguments::values(text).map_err(usage)?.into_iter();
+                let given = arguments::values(text).map_err(|e| usage(e.to_string()))?.into_iter();
                 given
                     .map(|(text, given)| (text, program.schema.canonical_value(&name, &given)))
                     .collect()
             }
             Kind::Input => arguments::folders(text)
-                .map_err(usage)?
+                .map_err(|e| usage(e.to_string()))?
                 .into_iter()
                 .map(|text| (text, folder(text)))
                 .collect(),

@@ -4,8 +4,7 @@
 use std::collections::BTreeSet;
 
 use artifact::known_names;
-use contract::{Description, Input, Named, renamed};
-
+use contract::{Description, Input, Named, Rename, renamed};
 use serde_json::Map;
 
 use crate::file::StageBlock;
@@ -73,7 +72,7 @@ pub(crate) fn blocks(pipeline: &Pipeline, programs: &Programs) -> Result<(), Pip
         parameters(pipeline, program, name, block)?;
         for (input, source) in &block.inputs {
             check_input(&program.description, input, source, programs)
-                .map_err(|problem| pipeline.error(name, Part::Input(input), problem))?;
+                .map_err(|e| pipeline.error(name, Part::Input(input), e.to_string()))?;
         }
         for (input, port) in &program.description.inputs {
             let is_given = block.inputs.contains_key(input)
@@ -106,32 +105,52 @@ fn parameters(
     Err(pipeline.error(name, part, problems[0].to_string()))
 }
 
+/// What is wrong with an input of a block, and what to do.
+#[derive(Debug, thiserror::Error)]
+enum InputError<'a> {
+    /// The stage's input has another name now.
+    #[error("input {input}: {}", rename.problem(None))]
+    Renamed { input: &'a str, rename: &'static Rename },
+    /// The stage doesn't have it; `known` says what it has.
+    #[error("it has no input {input:?}; {known}")]
+    Unknown { input: &'a str, known: String },
+    /// A sink is given a folder.
+    #[error("input {input}: a sink shows stages, and {folder} is a folder; name a stage")]
+    Folder { input: &'a str, folder: &'a str },
+    /// It names a sink.
+    #[error("input {input}: {stage} is a sink, which shows a run; nothing can be made of that")]
+    Sink { input: &'a str, stage: &'a str },
+    /// The artifact that it names has no such folder; `known` says what it has.
+    #[error("input {input}: {stage} has no folder {subtree:?}; {known}")]
+    Subtree { input: &'a str, stage: &'a str, subtree: &'a str, known: String },
+    /// It names something of another kind.
+    #[error("input {input} takes {}, but {named} is {kind}", port.kinds.join(" or "))]
+    Kind { input: &'a str, port: &'a Input, named: &'a str, kind: &'a str },
+}
+
 /// Checks one input of a stage against what it names.
-fn check_input(
-    description: &Description,
-    input: &str,
-    source: &str,
-    programs: &Programs,
-) -> Result<(), String> {
+fn check_input<'a>(
+    description: &'a Description,
+    input: &'a str,
+    source: &'a str,
+    programs: &'a Programs,
+) -> Result<(), InputError<'a>> {
     // A sink gets one record of all that it is shown; what its inputs are called is the file's own
     // affair.
     let record = || description.inputs.get("run").filter(|_| description.sink);
     let Some(port) = description.inputs.get(input).or_else(record) else {
         if let Some(rename) = renamed(Named::Input, &description.name, input) {
-            return Err(format!("input {input}: {}", rename.problem(None)));
+            return Err(InputError::Renamed { input, rename });
         }
         let known = known_names(input, description.inputs.keys().map(String::as_str));
-        return Err(format!("it has no input {input:?}; {known}"));
+        return Err(InputError::Unknown { input, known });
     };
     let Source::Stage { name: other, subtree } = Source::of(source) else {
-        let problem =
-            format!("input {input}: a sink shows stages, and {source} is a folder; name a stage");
+        let problem = InputError::Folder { input, folder: source };
         return if description.sink { Err(problem) } else { Ok(()) };
     };
     match programs.get(other) {
-        Some(made_by) if made_by.description.sink => Err(format!(
-            "input {input}: {other} is a sink, which shows a run; nothing can be made of that"
-        )),
+        Some(made_by) if made_by.description.sink => Err(InputError::Sink { input, stage: other }),
         Some(made_by) if !description.sink => {
             check_kind((input, port), source, (other, subtree), made_by)
         }
@@ -140,12 +159,12 @@ fn check_input(
 }
 
 /// Checks that what an input names is of a kind that it takes.
-fn check_kind(
-    (input, port): (&str, &Input),
-    source: &str,
-    (other, subtree): (&str, Option<&str>),
-    made_by: &StageProgram,
-) -> Result<(), String> {
+fn check_kind<'a>(
+    (input, port): (&'a str, &'a Input),
+    source: &'a str,
+    (other, subtree): (&'a str, Option<&'a str>),
+    made_by: &'a StageProgram,
+) -> Result<(), InputError<'a>> {
     let output = &made_by.description.output;
     let kind = match subtree {
         None => &output.kind,
@@ -155,13 +174,13 @@ fn check_kind(
                 folder,
                 output.subtrees.keys().map(String::as_str),
             );
-            format!("input {input}: {other} has no folder {folder:?}; {known}")
+            InputError::Subtree { input, stage: other, subtree: folder, known }
         })?,
     };
     if port.kinds.contains(kind) {
         return Ok(());
     }
-    Err(format!("input {input} takes {}, but {source} is {kind}", port.kinds.join(" or ")))
+    Err(InputError::Kind { input, port, named: source, kind })
 }
 
 /// The stages that a block names as inputs.

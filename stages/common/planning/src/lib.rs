@@ -52,5 +52,6 @@ pub use pipeline::Pipeline;
 pub use plan::{input_hashes, source_hash};
 pub use renames::known_blocks;
 pub use request::{PlanError, Request};
+pub use sources::SourceError;
 pub use stages::{Asking, ProgramError, Programs, StageProgram, executable};
 pub use targets::find;

@@ -15,6 +15,7 @@ use crate::node::{Node, NodeInput, Origin, Plan, State};
 use crate::pipeline::Pipeline;
 use crate::renames::known_blocks;
 use crate::request::{PlanError, Request};
+use crate::sources::hash_source;
 use crate::stages::{Asking, Programs};
 
 impl Plan {
@@ -137,8 +138,7 @@ fn input_hash(
     match &input.from {
         Origin::Node { index, subtree: None } => Ok(output_of(*index)),
         Origin::Node { index, subtree: Some(folder) } => {
-            let manifest =
-                store.manifest(&output_of(*index)).map_err(|e| PlanError::Source(e.to_string()))?;
+            let manifest = store.manifest(&output_of(*index)).map_err(PlanError::Artifact)?;
             Ok(manifest.subtree(folder).identity())
         }
         Origin::Folder(folder) => source_hash(store, node, &input.name, folder),
@@ -152,8 +152,11 @@ pub fn source_hash(
     input: &str,
     folder: &Path,
 ) -> Result<String, PlanError> {
-    let problem = |e| PlanError::Source(format!("stage {}: input {input}: {e}", node.stage));
-    crate::sources::hash_source(store, folder).map_err(problem)
+    hash_source(store, folder).map_err(|problem| PlanError::Source {
+        stage: node.stage.clone(),
+        input: input.to_owned(),
+        problem,
+    })
 }
 
 #[cfg(test)]

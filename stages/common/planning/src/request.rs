@@ -1,7 +1,9 @@
+use artifact::Damage;
 use stage_call::Interrupted;
 
 use crate::experiment::Selection;
 use crate::part::PipelineError;
+use crate::sources::SourceError;
 
 /// What is asked for on the command line.
 #[derive(Clone, Debug, Default)]
@@ -26,8 +28,18 @@ pub enum PlanError {
     #[error("{0}")]
     Usage(String),
     /// A source folder is wrong.
+    #[error("stage {stage}: input {input}: {problem}")]
+    Source {
+        /// The stage that takes it.
+        stage: String,
+        /// The stage's input.
+        input: String,
+        /// What is wrong, and what to do.
+        problem: SourceError,
+    },
+    /// An artifact in the store can't be used.
     #[error("{0}")]
-    Source(String),
+    Artifact(Damage),
     /// A signal came while stages were asked what they are.
     #[error("interrupted")]
     Interrupted,

@@ -1,6 +1,7 @@
 //! Content hashes of folders outside the store.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -19,13 +20,38 @@ struct Entry {
     content: String,
 }
 
+/// A folder outside the store that has no content hash.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// It can't be found.
+    #[error("{folder:?}: {problem}; name a folder that is there")]
+    Absent {
+        /// The folder.
+        folder: PathBuf,
+        /// Why.
+        problem: io::Error,
+    },
+    /// It isn't a folder.
+    #[error("{0:?}: not a folder")]
+    NoFolder(PathBuf),
+    /// A file in it can't be read.
+    #[error("{folder:?}: {problem}")]
+    Unreadable {
+        /// The folder.
+        folder: PathBuf,
+        /// Why.
+        problem: io::Error,
+    },
+}
+
 /// The content hash of a folder outside the store.
-pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String> {
-    let fail = |e: std::io::Error| format!("{folder:?}: {e}");
-    let absolute =
-        folder.canonicalize().map_err(|e| format!("{}; name a folder that is there", fail(e)))?;
+pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, SourceError> {
+    let fail = |problem| SourceError::Unreadable { folder: folder.to_path_buf(), problem };
+    let absolute = folder
+        .canonicalize()
+        .map_err(|problem| SourceError::Absent { folder: folder.to_path_buf(), problem })?;
     if !absolute.is_dir() {
-        return Err(format!("{folder:?}: not a folder"));
+        return Err(SourceError::NoFolder(folder.to_path_buf()));
     }
     let files = list_files(&absolute).map_err(fail)?;
     let (listing, newest) = listing(&files).map_err(fail)?;
@@ -54,7 +80,7 @@ pub(crate) fn hash_source(store: &Store, folder: &Path) -> Result<String, String
 }
 
 /// A hash of every file's path, size and time, and the newest time.
-fn listing(files: &[(PathBuf, PathBuf)]) -> std::io::Result<(String, u128)> {
+fn listing(files: &[(PathBuf, PathBuf)]) -> io::Result<(String, u128)> {
     let mut entries = Vec::with_capacity(files.len());
     let mut newest = 0;
     for (relative, file) in files {
@@ -85,6 +111,18 @@ mod tests {
     use super::*;
     use std::ffi::OsStr;
     use std::os::unix::ffi::OsStrExt as _;
+
+    #[test]
+    fn what_is_no_folder_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(&dir.path().join("store")).unwrap();
+        let (file, absent) = (dir.path().join("file"), dir.path().join("absent"));
+        std::fs::write(&file, "x").unwrap();
+        let problem = |folder: &Path| hash_source(&store, folder).unwrap_err().to_string();
+        assert_eq!(problem(&file), format!("{file:?}: not a folder"));
+        let words = "No such file or directory (os error 2); name a folder that is there";
+        assert_eq!(problem(&absent), format!("{absent:?}: {words}"));
+    }
 
     /// Any file name is taken, and each makes a hash of its own.
     #[test]

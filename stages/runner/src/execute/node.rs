@@ -68,7 +68,9 @@ impl NodeJob<'_> {
     pub(crate) fn find(&self) -> Result<Found, StageFailure> {
         let hashes = input_hashes(self.node, self.store, |index| self.output_of(index)).map_err(
             |e| match e {
-                PlanError::Source(message) => StageFailure { code: 3, message },
+                PlanError::Source { .. } | PlanError::Artifact(_) => {
+                    StageFailure { code: 3, message: e.to_string() }
+                }
                 other => fail(other),
             },
         )?;
