@@ -88,19 +88,44 @@ fn put(fresh: &Path, target: &Path, kind: &str) -> Result<(), StageFailure> {
     }
 }
 
+/// Why a folder may not be replaced.
+#[derive(Debug, thiserror::Error)]
+enum ForeignError {
+    /// It is a file or a link.
+    #[error("{0} is not a folder of nerf-sr's")]
+    NoFolder(PathBuf),
+    /// A file in it that no sink of ours put there.
+    #[error("{0} is not nerf-sr's")]
+    File(PathBuf),
+    /// A file in it that isn't as a sink of ours left it.
+    #[error("{0} was changed by somebody")]
+    Changed(PathBuf),
+    /// It can't be read.
+    #[error("{folder}: {problem}")]
+    Unreadable {
+        /// The folder.
+        folder: PathBuf,
+        /// Why.
+        problem: io::Error,
+    },
+    /// The files in it can't be listed.
+    #[error("{0}")]
+    Unlisted(io::Error),
+}
+
 /// Whether all in a folder is what a sink of ours put there; else which file isn't. An empty folder
 /// may be replaced, too.
-fn owned(target: &Path, kind: &str) -> Result<(), String> {
-    let place = |file: &Path| target.join(file).display().to_string();
+fn owned(target: &Path, kind: &str) -> Result<(), ForeignError> {
     let is_link = target.symlink_metadata().is_ok_and(|meta| meta.file_type().is_symlink());
     if is_link || !target.is_dir() {
-        return Err(format!("{} is not a folder of nerf-sr's", target.display()));
+        return Err(ForeignError::NoFolder(target.to_path_buf()));
     }
-    let mut entries = fs::read_dir(target).map_err(|e| format!("{}: {e}", target.display()))?;
+    let unreadable = |problem| ForeignError::Unreadable { folder: target.to_path_buf(), problem };
+    let mut entries = fs::read_dir(target).map_err(unreadable)?;
     if entries.next().is_none() {
         return Ok(());
     }
-    let files = list_files(target).map_err(|e| e.to_string())?;
+    let files = list_files(target).map_err(ForeignError::Unlisted)?;
     let own = |file: &Path| file == Path::new(MANIFEST_FILE) || file == Path::new(MARK);
     let manifest = match Manifest::read(target) {
         Ok(manifest) if kind == manifest.kind => manifest,
@@ -110,20 +135,20 @@ fn owned(target: &Path, kind: &str) -> Result<(), String> {
                 .map(|(file, _)| file.as_path())
                 .find(|file| !own(file))
                 .unwrap_or(Path::new(""));
-            return Err(format!("{} is not nerf-sr's", place(first)));
+            return Err(ForeignError::File(target.join(first)));
         }
     };
     let listed = |file: &Path| manifest.files.iter().any(|entry| Path::new(&entry.path) == file);
     if let Some((foreign, _)) = files.iter().find(|(file, _)| !own(file) && !listed(file)) {
-        return Err(format!("{} is not nerf-sr's", place(foreign)));
+        return Err(ForeignError::File(target.join(foreign)));
     }
     for entry in &manifest.files {
         // A page whose file somebody took away is still ours.
         if target.join(&entry.path).exists() {
             let single = Manifest { files: vec![entry.clone()], ..manifest.clone() };
-            single.check_contents(target).map_err(|_| {
-                format!("{} was changed by somebody", place(Path::new(&entry.path)))
-            })?;
+            single
+                .check_contents(target)
+                .map_err(|_| ForeignError::Changed(target.join(&entry.path)))?;
         }
     }
     Ok(())

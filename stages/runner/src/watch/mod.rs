@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use anyhow::Context as _;
 use stage::{Event, SUMMARY_FILE};
 use stage_call::{Call, Display, StageFailure, Watcher, seconds};
 
@@ -58,16 +59,15 @@ impl Watching<'_> {
     /// watching; the training goes on.
     pub(crate) fn run(&self, training: &Call<'_>) {
         if let Err(problem) = self.look_on(training) {
-            self.display.line(&format!("{}: {problem}", self.label));
+            self.display.line(&format!("{}: {problem:#}", self.label));
         }
         // Leftovers have no value; the run's folder may hold those of others.
         std::fs::remove_dir_all(&self.scratch).ok();
         self.scratch.parent().map(std::fs::remove_dir);
     }
 
-    fn look_on(&self, training: &Call<'_>) -> Result<(), String> {
-        let view = OneView::find(self.chain, &self.watch.view)
-            .map_err(|problem| format!("not watched: {problem}"))?;
+    fn look_on(&self, training: &Call<'_>) -> anyhow::Result<()> {
+        let view = OneView::find(self.chain, &self.watch.view).context("not watched")?;
         let begin = Instant::now();
         let mut budget = LookBudget::new(training.threads, view.pixels);
         while !self.is_over.load(Ordering::Relaxed) {
@@ -87,23 +87,23 @@ impl Watching<'_> {
                 Err(_) if self.is_over.load(Ordering::Relaxed) => return Ok(()),
                 Err(_) if Instant::now() >= look.deadline => {
                     let limit = seconds(limit.as_secs_f64());
-                    return Err(format!("no longer watched: view {} takes {limit}", view.name));
+                    anyhow::bail!("no longer watched: view {} takes {limit}", view.name);
                 }
-                Err(failure) => return Err(format!("no longer watched: {failure}")),
+                Err(failure) => return Err(failure).context("no longer watched"),
             }
         }
         Ok(())
     }
 
     /// Prints the scores and writes the picture to the folder of pictures.
-    fn show(&self, seen: &Seen, view: &str) -> Result<(), String> {
+    fn show(&self, seen: &Seen, view: &str) -> anyhow::Result<()> {
         let folder = &self.watch.folder;
         let picture = folder.join(file_name(self.label));
         let beside = picture.with_extension("partial");
         std::fs::create_dir_all(folder)
             .and_then(|()| std::fs::copy(&seen.picture, &beside))
             .and_then(|_| std::fs::rename(&beside, &picture))
-            .map_err(|e| format!("no longer watched: {}: {e}", picture.display()))?;
+            .with_context(|| format!("no longer watched: {}", picture.display()))?;
         if std::env::var_os("NO_COLOR").is_none()
             && let Ok(image) = pixels::read_png(&picture)
         {

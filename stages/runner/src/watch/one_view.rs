@@ -18,7 +18,7 @@ pub(super) struct OneView {
 
 impl OneView {
     /// Finds a view by name, or the chain's first view if the name is empty.
-    pub(super) fn find(chain: &Chain, name: &str) -> Result<Self, String> {
+    pub(super) fn find(chain: &Chain, name: &str) -> anyhow::Result<Self> {
         let folders: Vec<&Path> =
             chain.render.inputs.iter().map(|(_, folder)| folder.as_path()).collect();
         let lists = folders.iter().filter_map(|folder| list(folder).ok());
@@ -26,10 +26,7 @@ impl OneView {
         let found = views.iter().find(|view| name.is_empty() || name_of(view) == Some(name));
         let Some(view) = found else {
             let known: Vec<&str> = views.iter().filter_map(name_of).collect();
-            return Err(format!(
-                "view {name}: no such view; {}",
-                artifact::known_names(name, known)
-            ));
+            anyhow::bail!("view {name}: no such view; {}", artifact::known_names(name, known));
         };
         let side = |side| view["camera"]["intrinsics"][side].as_u64().unwrap_or(0);
         let name = name_of(view).unwrap_or_default().to_owned();
