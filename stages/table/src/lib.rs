@@ -56,8 +56,7 @@ impl Stage for Table {
         }
         context.write_json("rows.json", &rows)?;
         write_csv(context, &rows)?;
-        let text =
-            markdown::markdown(params, &rows, &figures, &run.failed).map_err(Failure::Usage)?;
+        let text = markdown::markdown(params, &rows, &figures, &run.failed)?;
         let path = context.output_path("table.md")?;
         std::fs::write(&path, &text).with_context(|| format!("cannot write {}", path.display()))?;
         context.write_summary(&format!("{} results", rows.len()))

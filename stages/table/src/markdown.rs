@@ -1,6 +1,6 @@
 //! Rows as Markdown: a table of all, one of each scene, gains, and what failed.
 
-use artifact::{FailedPoint, label};
+use artifact::{FailedPoint, Failure, label};
 
 use crate::figures::Figures;
 use crate::grid::{NOTHING, PLACES, Shape, grid};
@@ -8,13 +8,13 @@ use crate::params::Params;
 use crate::rows::MISSING;
 use crate::values::{Row, distinct, mean, of};
 
-/// The tables, and the points that failed.
+/// The tables, and the points that failed; a failure where parameters name what no result has.
 pub(crate) fn markdown(
     params: &Params,
     rows: &[Row],
     figures: &Figures,
     failed: &[FailedPoint],
-) -> Result<String, String> {
+) -> Result<String, Failure> {
     let shape =
         Shape { params, figures, keys: row_keys(params, rows)?, first: reference(params, rows)? };
     let each = std::slice::from_ref(&params.each);
@@ -48,7 +48,7 @@ pub(crate) fn markdown(
 }
 
 /// Keys that make a row: those asked for, or all that differ; and the group.
-fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
+fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, Failure> {
     let mut known: Vec<&String> = Vec::new();
     let is_key = |name: &str| ![&PLACES[..], &[MISSING]].concat().contains(&name);
     for (name, _) in rows.iter().flatten().filter(|(name, value)| value.is_string() && is_key(name))
@@ -67,7 +67,8 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
         asked.find(|(_, name)| !rows.is_empty() && !rows.iter().any(|row| row.contains_key(*name)))
     {
         let known = artifact::known_names(name, known.into_iter().map(String::as_str));
-        return Err(format!("parameter {parameter}: no result has a key {name:?}; {known}"));
+        let problem = format!("parameter {parameter}: no result has a key {name:?}; {known}");
+        return Err(Failure::Usage(problem));
     }
     let differs = |name: &String| distinct(rows, std::slice::from_ref(name)).len() > 1;
     let is_row =
@@ -87,14 +88,17 @@ fn row_keys(params: &Params, rows: &[Row]) -> Result<Vec<String>, String> {
 }
 
 /// The value that others are compared with.
-fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, String> {
+fn reference(params: &Params, rows: &[Row]) -> Result<Option<f64>, Failure> {
     if params.relative_to.is_empty() || rows.is_empty() {
         return Ok(None);
     }
     let (keys, values): (Vec<String>, Vec<String>) = params.relative_to.clone().into_iter().unzip();
     match mean(&of(rows, &keys, &values), params.compared()) {
         Some(value) => Ok(Some(value)),
-        None => Err(format!("parameter relative_to: no result has {:?}", params.relative_to)),
+        None => Err(Failure::Usage(format!(
+            "parameter relative_to: no result has {:?}",
+            params.relative_to
+        ))),
     }
 }
 
