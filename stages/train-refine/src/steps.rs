@@ -23,24 +23,50 @@ pub(crate) fn train(
 ) -> anyhow::Result<()> {
     let checkpoint = context.work().map(|work| work.join("checkpoint.safetensors"));
     if let Some(path) = checkpoint.as_deref().filter(|p| p.exists()) {
-        match trainer.resume(path) {
-            Ok(()) => context.say(format!("going on from step {}", trainer.steps())),
-            Err(error) => context.say(format!("{error}; starting over")),
-        }
+        context.say(resume(trainer, path));
     }
     let progress = context.progress("training", steps);
+    take_steps(
+        trainer,
+        examples,
+        checkpoint.as_deref(),
+        || context.interrupted(),
+        |done, mean| progress.set(done, &note(mean)),
+    )
+}
+
+/// Goes on from a checkpoint, or starts over where it can't be used; says which.
+fn resume(trainer: &mut impl Training, checkpoint: &Path) -> String {
+    match trainer.resume(checkpoint) {
+        Ok(()) => format!("going on from step {}", trainer.steps()),
+        Err(error) => format!("{error}; starting over"),
+    }
+}
+
+/// Takes all steps that are left, and writes a checkpoint now and then. Fails once it is
+/// interrupted, after a last checkpoint. `tell` gets the steps taken and the mean error since it
+/// was last told.
+fn take_steps(
+    trainer: &mut impl Training,
+    examples: &[KnownView],
+    checkpoint: Option<&Path>,
+    interrupted: impl Fn() -> bool,
+    tell: impl Fn(u64, f64),
+) -> anyhow::Result<()> {
     let (mut written, mut took) = (Instant::now(), Duration::from_millis(20));
     let (mut sum, mut since, mut noted) = (0.0, 0u64, Instant::now());
     loop {
-        if let Some(path) = checkpoint
-            .as_deref()
-            .filter(|_| context.interrupted() || written.elapsed() > TIME_PER_CHECKPOINT * took)
+        let is_interrupted = interrupted();
+        if let Some(path) =
+            checkpoint.filter(|_| is_interrupted || written.elapsed() > TIME_PER_CHECKPOINT * took)
         {
             let started = Instant::now();
             write_checkpoint(trainer, path).context("cannot write the checkpoint")?;
             (written, took) = (Instant::now(), started.elapsed());
         }
-        context.check_interrupt()?;
+        if is_interrupted {
+            return Err(Failure::Interrupted.into());
+        }
         let loss = trainer.step(examples).map_err(|error| match error {
             RefinementError::NotFinite { .. } => Failure::Numerical(error.to_string()).into(),
             error => anyhow::Error::from(error),
@@ -48,7 +74,7 @@ pub(crate) fn train(
         let Some(loss) = loss else { return Ok(()) };
         (sum, since) = (sum + loss, since + 1);
         if since == STEPS_BETWEEN_NOTES || noted.elapsed() > LONGEST_SILENCE {
-            progress.set(trainer.steps(), &note(sum / since as f64));
+            tell(trainer.steps(), sum / since as f64);
             (sum, since, noted) = (0.0, 0u64, Instant::now());
         }
     }
@@ -58,4 +84,140 @@ fn write_checkpoint(trainer: &impl Training, path: &Path) -> anyhow::Result<()> 
     let partial = path.with_extension("partial");
     trainer.write_checkpoint(&partial)?;
     Ok(std::fs::rename(partial, path)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::cell::{Cell, RefCell};
+
+    use artifact::exit_code;
+
+    use super::*;
+
+    const STEPS: u64 = 120;
+
+    /// A training whose errors are 1, 2, 3, …; its checkpoint is the number of steps as text.
+    #[derive(Default)]
+    struct Counting {
+        steps: u64,
+        /// Steps that this run took.
+        taken: u64,
+        /// What the step after so many ends with.
+        failure: Option<(u64, RefinementError)>,
+    }
+
+    impl Training for Counting {
+        fn steps(&self) -> u64 {
+            self.steps
+        }
+
+        fn step(&mut self, _: &[KnownView]) -> Result<Option<f64>, RefinementError> {
+            if self.steps == STEPS {
+                return Ok(None);
+            }
+            if let Some((_, error)) = self.failure.take_if(|(after, _)| *after == self.steps) {
+                return Err(error);
+            }
+            (self.steps, self.taken) = (self.steps + 1, self.taken + 1);
+            Ok(Some(self.steps as f64))
+        }
+
+        fn write_checkpoint(&self, path: &Path) -> Result<(), RefinementError> {
+            std::fs::write(path, self.steps.to_string()).map_err(|_| refused("unwritable"))
+        }
+
+        fn resume(&mut self, path: &Path) -> Result<(), RefinementError> {
+            let text = std::fs::read_to_string(path).unwrap();
+            self.steps = text.parse().map_err(|_| refused("no number"))?;
+            Ok(())
+        }
+    }
+
+    fn refused(reason: &str) -> RefinementError {
+        RefinementError::View { name: "checkpoint".to_owned(), reason: reason.to_owned() }
+    }
+
+    /// Takes steps without checkpoints; how it ended, and what was told.
+    fn told_by(trainer: &mut Counting) -> (anyhow::Result<()>, Vec<(u64, f64)>) {
+        let told = RefCell::new(Vec::new());
+        let tell = |done, mean| told.borrow_mut().push((done, mean));
+        let ended = take_steps(trainer, &[], None, || false, tell);
+        (ended, told.into_inner())
+    }
+
+    #[test]
+    fn a_resumed_training_takes_the_steps_that_are_left() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        std::fs::write(&checkpoint, "100").unwrap();
+        let mut trainer = Counting::default();
+        assert_eq!(resume(&mut trainer, &checkpoint), "going on from step 100");
+        told_by(&mut trainer).0.unwrap();
+        assert_eq!((trainer.steps, trainer.taken), (STEPS, 20));
+    }
+
+    #[test]
+    fn a_checkpoint_that_cannot_be_used_starts_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        std::fs::write(&checkpoint, "torn").unwrap();
+        let mut trainer = Counting::default();
+        let said = resume(&mut trainer, &checkpoint);
+        assert_eq!(said, "view checkpoint: no number; starting over");
+        told_by(&mut trainer).0.unwrap();
+        assert_eq!((trainer.steps, trainer.taken), (STEPS, STEPS));
+    }
+
+    #[test]
+    fn an_interruption_leaves_a_checkpoint_to_go_on_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("checkpoint");
+        let mut trainer = Counting::default();
+        let looks = Cell::new(0);
+        let interrupted = || looks.replace(looks.get() + 1) == 3;
+        let ended = take_steps(&mut trainer, &[], Some(&checkpoint), interrupted, |_, _| {});
+        let failure = ended.unwrap_err();
+        assert!(matches!(failure.downcast_ref(), Some(Failure::Interrupted)), "{failure}");
+        assert_eq!((trainer.steps, exit_code(&failure)), (3, 130));
+        assert_eq!(std::fs::read_to_string(&checkpoint).unwrap(), "3");
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing partial is left");
+        let mut trainer = Counting::default();
+        assert_eq!(resume(&mut trainer, &checkpoint), "going on from step 3");
+        told_by(&mut trainer).0.unwrap();
+        assert_eq!(trainer.taken, STEPS - 3);
+    }
+
+    #[test]
+    fn a_checkpoint_that_cannot_be_written_is_an_error_of_its_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoint = folder.path().join("absent/checkpoint");
+        let ended =
+            take_steps(&mut Counting::default(), &[], Some(&checkpoint), || true, |_, _| {});
+        let failure = ended.unwrap_err();
+        let said = "cannot write the checkpoint: view checkpoint: unwritable";
+        assert_eq!((format!("{failure:#}").as_str(), exit_code(&failure)), (said, 1));
+    }
+
+    #[test]
+    fn numbers_that_go_wrong_are_a_numerical_failure() {
+        let not_finite = RefinementError::NotFinite { step: 7 };
+        let words = not_finite.to_string();
+        for (error, words, code) in [
+            (not_finite, words.as_str(), 4),
+            (refused("another size"), "view checkpoint: another size", 1),
+        ] {
+            let mut trainer = Counting { failure: Some((7, error)), ..Counting::default() };
+            let failure = told_by(&mut trainer).0.unwrap_err();
+            assert_eq!((failure.to_string().as_str(), exit_code(&failure)), (words, code));
+            assert_eq!(trainer.taken, 7);
+        }
+    }
+
+    #[test]
+    fn a_note_is_the_mean_since_the_last_one() {
+        let (ended, told) = told_by(&mut Counting::default());
+        ended.unwrap();
+        // Of 1 to 50, and of 51 to 100; 20 more make no note.
+        assert_eq!(told, [(50, 25.5), (100, 75.5)]);
+    }
 }
