@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
-use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, print_line, sized};
+use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, one_line, print_line, sized};
 use store::{Record, Store};
 
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
@@ -37,9 +37,10 @@ pub(crate) async fn pull(
     for result in all(tasks).await? {
         match result {
             Ok((new, size)) => (actions, bytes) = (actions + new, bytes + size),
-            Err(reason) => refused.push(reason),
+            Err(error) => refused.push(error),
         }
     }
+    let mut refused: Vec<String> = refused.iter().map(one_line).collect();
     refused.sort_unstable();
     refused.iter().for_each(|reason| transfer.progress.say(reason));
     print_line!(
@@ -64,7 +65,7 @@ async fn missing_records(
     remote: &Remote,
     selection: &Selection,
     progress: &Arc<Progress>,
-    refused: &mut Vec<String>,
+    refused: &mut Vec<anyhow::Error>,
 ) -> anyhow::Result<(Vec<Record>, usize)> {
     let mut keys = remote.keys().await?;
     let all_are_meant = selection.keys.is_empty() && selection.artifacts.is_empty();
@@ -83,7 +84,7 @@ async fn missing_records(
             Ok(Some((key, record))) => drop(records.insert(key, record)),
             // Somebody has removed it meanwhile.
             Ok(None) => {}
-            Err(reason) => refused.push(reason),
+            Err(error) => refused.push(error),
         }
     }
     let selected = selection.of(&records, &remote.name(""))?;
@@ -123,7 +124,7 @@ async fn look(
     remote: &Remote,
     records: Vec<Record>,
     progress: &Arc<Progress>,
-    refused: &mut Vec<String>,
+    refused: &mut Vec<anyhow::Error>,
 ) -> anyhow::Result<Vec<Object>> {
     let mut by_output: BTreeMap<String, Vec<Record>> = BTreeMap::new();
     for record in records {
@@ -142,7 +143,7 @@ async fn look(
     for result in all(tasks).await? {
         match result {
             Ok(object) => objects.push(object),
-            Err(reason) => refused.push(reason),
+            Err(error) => refused.push(error),
         }
     }
     objects.sort_by(|a, b| a.identity.cmp(&b.identity));
@@ -210,15 +211,14 @@ async fn download(
     transfer.download(&from, &to, &entry).await
 }
 
-/// What is wrong with one artifact stops no other: its reason is a result. Any other error is one.
+/// What is wrong with one artifact stops no other: it is the inner error, and any other error the
+/// outer one.
 async fn refusable<T>(
     task: impl Future<Output = anyhow::Result<T>>,
-) -> anyhow::Result<Result<T, String>> {
+) -> anyhow::Result<anyhow::Result<T>> {
     match task.await {
         Ok(value) => Ok(Ok(value)),
-        Err(error) if matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => {
-            Ok(Err(artifact::one_line(&error)))
-        }
+        Err(error) if matches!(error.downcast_ref(), Some(Failure::BadInput(_))) => Ok(Err(error)),
         Err(error) => Err(error),
     }
 }
