@@ -61,7 +61,6 @@ impl Supersampling {
                     .then(|| MovingCameras::new(assembly.cameras, assembly.pyramids)),
             },
             views,
-            lr_views: assembly.lr_views,
             background,
             sub_pixel_rays: SubPixelRays::new(assembly.full, options.supersample_warmup),
             supervision: options.supervision,

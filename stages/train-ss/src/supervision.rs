@@ -42,8 +42,6 @@ pub enum Supervision {
 pub struct Supersampling {
     /// LR photographs, then references.
     pub(crate) views: Vec<TrainingView>,
-    /// How many of them are LR photographs.
-    pub(crate) lr_views: usize,
     pub(crate) sampler: PixelSampler,
     pub(crate) background: Background,
     pub(crate) sub_pixel_rays: SubPixelRays,
@@ -58,9 +56,21 @@ pub struct Supersampling {
 pub(crate) struct TrainingView {
     /// What bundles are drawn from, a pixel each: of a reference, means over blocks of its pixels.
     pub(crate) image: PackedPhotograph,
-    /// A reference's own pixels.
+    /// A reference's own pixels; an LR photograph has none.
     pub(crate) hr: Option<PackedPhotograph>,
     pub(crate) rays: CameraRays,
+}
+
+/// How colours of a bundle's rays are compared with what was photographed.
+enum Comparison<'a> {
+    /// The kernel makes LR pixels of them and of the cached HR pixels around.
+    Kernel(&'a HrCache),
+    /// Each ray meets a pixel of the reference and is compared with it.
+    Reference(&'a PackedPhotograph),
+    /// Rays are fewer than the pixels of the reference's block: means are compared.
+    ReferenceMean(&'a PackedPhotograph),
+    /// The rays' mean is compared with the LR pixel.
+    Mean,
 }
 
 /// Purpose of a draw.
@@ -72,10 +82,26 @@ impl Supersampling {
         self.sub_pixel_rays.full
     }
 
-    /// The cache, where the kernel is what counts for a view by now.
-    fn kernel(&self, view: usize) -> Option<&HrCache> {
-        let counts = self.sub_pixel_rays.are_all_cast() && view < self.lr_views;
-        self.learnt.cache.as_ref().filter(|_| counts)
+    /// How many views are LR photographs.
+    fn lr_views(&self) -> usize {
+        self.views.iter().filter(|view| view.hr.is_none()).count()
+    }
+
+    /// How a view's bundles are compared by now.
+    fn comparison(&self, view: usize) -> Comparison<'_> {
+        let are_all_cast = self.sub_pixel_rays.are_all_cast();
+        match (&self.views[view].hr, &self.learnt.cache) {
+            (Some(hr), _) if are_all_cast => Comparison::Reference(hr),
+            (Some(hr), _) => Comparison::ReferenceMean(hr),
+            (None, Some(cache)) if are_all_cast => Comparison::Kernel(cache),
+            (None, _) => Comparison::Mean,
+        }
+    }
+
+    /// Column and row at which a block of a reference's pixels begins.
+    fn reference_block(&self, hr: &PackedPhotograph, [x, y]: [usize; 2]) -> [usize; 2] {
+        let [columns, rows] = self.sub_pixel_rays.full;
+        [block_start(x, columns, hr.width()), block_start(y, rows, hr.height())]
     }
 
     /// Restores what [`Learnt::write`] wrote.
@@ -124,21 +150,21 @@ impl Supersampling {
     ) -> anyhow::Result<Option<Moved>> {
         let Some(moving) = &self.learnt.moving else { return Ok(None) };
         let moved = moving
-            .moved(&*field()?, self.lr_views, self.background.shown())
+            .moved(&*field()?, self.lr_views(), self.background.shown())
             .map_err(fields::rendering_failure)?;
         Ok(Some(moved))
     }
 
     /// Where the photographs were taken from, where that was asked for.
     pub fn refined_cameras(&self) -> &[Camera] {
-        self.learnt.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views])
+        self.learnt.moving.as_ref().map_or(&[], |moving| &moving.cameras()[..self.lr_views()])
     }
 
     /// What each photograph is so many times as bright as, red, green and blue, where that was
     /// asked for.
     pub fn exposures(&self) -> &[[f32; 3]] {
         let exposures = self.learnt.exposures.as_ref();
-        exposures.map_or(&[], |exposures| &exposures.factors()[..self.lr_views])
+        exposures.map_or(&[], |exposures| &exposures.factors()[..self.lr_views()])
     }
 
     /// The view and pixel that a bundle trains on.
@@ -180,14 +206,13 @@ impl radiance::Supervisor for Supersampling {
         let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
         let SubPixelRays { full, now, .. } = self.sub_pixel_rays;
         // Where the sub-pixel rays begin, and how far apart they are, in pixels of its camera.
-        let (start, apart) = match (self.kernel(index), &view.hr) {
-            (Some(cache), _) => cache.block_in_pixels(LrPixel { view: index, x, y }),
-            (None, Some(hr)) => {
-                let start =
-                    [block_start(x, full[0], hr.width()), block_start(y, full[1], hr.height())];
-                (start.map(|s| s as f64), [0, 1].map(|i| full[i] as f64 / now[i] as f64))
+        let (start, apart) = match self.comparison(index) {
+            Comparison::Kernel(cache) => cache.block_in_pixels(LrPixel { view: index, x, y }),
+            Comparison::Reference(hr) | Comparison::ReferenceMean(hr) => {
+                let start = self.reference_block(hr, [x, y]).map(|s| s as f64);
+                (start, [0, 1].map(|i| full[i] as f64 / now[i] as f64))
             }
-            (None, None) => ([x as f64, y as f64], now.map(|n| 1.0 / n as f64)),
+            Comparison::Mean => ([x as f64, y as f64], now.map(|n| 1.0 / n as f64)),
         };
         for (k, ray) in rays.iter_mut().enumerate() {
             let (a, b) = (k % now[0], k / now[0]);
@@ -211,25 +236,28 @@ impl radiance::Supervisor for Supersampling {
             back,
             behind: self.behind(bundle),
             weight: self.sampler.weight(bundle, (index, pixel)),
-            is_clipped: self.supervision == Supervision::Kernel && index < self.lr_views,
+            is_clipped: self.supervision == Supervision::Kernel && view.hr.is_none(),
         };
         let (x, y) = (pixel % view.image.width(), pixel / view.image.width());
-        if let Some(cache) = self.kernel(index) {
-            let judge =
-                |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
-            let pixel = LrPixel { view: index, x, y };
-            let own = cache.back_project(pixel, colours, &view.image, judge, gradients);
-            return target.of_back_projected(own, gradients);
+        match self.comparison(index) {
+            Comparison::Kernel(cache) => {
+                let judge =
+                    |c: usize, prediction, sample| target.unclipped_residual(c, prediction, sample);
+                let pixel = LrPixel { view: index, x, y };
+                let own = cache.back_project(pixel, colours, &view.image, judge, gradients);
+                target.of_back_projected(own, gradients)
+            }
+            Comparison::Reference(hr) => {
+                let columns = self.sub_pixel_rays.full[0];
+                let [left, top] = self.reference_block(hr, [x, y]);
+                let samples = (0..colours.len())
+                    .map(|k| hr.pixel((top + k / columns) * hr.width() + left + k % columns));
+                target.of_each(colours, samples, gradients)
+            }
+            Comparison::ReferenceMean(_) | Comparison::Mean => {
+                target.of_mean(colours, view.image.pixel(pixel), gradients)
+            }
         }
-        if let Some(hr) = view.hr.as_ref().filter(|_| self.sub_pixel_rays.are_all_cast()) {
-            let [columns, rows] = self.sub_pixel_rays.full;
-            let left = block_start(x, columns, hr.width());
-            let top = block_start(y, rows, hr.height());
-            let samples = (0..colours.len())
-                .map(|k| hr.pixel((top + k / columns) * hr.width() + left + k % columns));
-            return target.of_each(colours, samples, gradients);
-        }
-        target.of_mean(colours, view.image.pixel(pixel), gradients)
     }
 
     fn remember(&mut self, bundle: u64, colours: &[[f32; 3]]) {
@@ -245,7 +273,7 @@ impl radiance::Supervisor for Supersampling {
                 [0, 1, 2].map(|c| if is_clipped(sample[c]) { f32::NAN } else { sample[c] });
             exposures.learn(index, photographed, [0, 1, 2].map(|c| mean(colours, c)));
         }
-        let is_cached = self.sub_pixel_rays.are_all_cast() && index < self.lr_views;
+        let is_cached = matches!(self.comparison(index), Comparison::Kernel(_));
         if let Some(cache) = self.learnt.cache.as_mut().filter(|_| is_cached) {
             let (x, y) = (pixel % image.width(), pixel / image.width());
             cache.remember(LrPixel { view: index, x, y }, colours);
