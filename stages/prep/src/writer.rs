@@ -4,8 +4,8 @@ use anyhow::Context as _;
 use artifact::{FailureExt as _, printable};
 use dataset::Frame;
 use pixels::{
-    Channel, DEGRADATION_FILE, Degradation, Kernel, Mask, Rgba8, SampleType, read_exr, write_exr,
-    write_png,
+    Channel, DEGRADATION_FILE, Degradation, DepthMap, Kernel, Mask, Rgba8, SampleType, read_exr,
+    write_exr, write_png,
 };
 use rayon::prelude::*;
 use scene::{VIEWS_FILE, View, Views, mask_file};
@@ -276,12 +276,8 @@ impl<'a> SceneWriter<'a> {
     ) -> anyhow::Result<()> {
         let native = read_exr(source)?;
         let shown = source.display().to_string();
-        let [depth, opacity] = ["Z", "A"].map(|name| {
-            native
-                .channel(name)
-                .with_context(|| format!("{}: no channel {name}", printable(&shown)))
-        });
-        let (depth, opacity) = (depth?, opacity?);
+        let map = DepthMap::of(&native)
+            .with_context(|| format!("{}: depth needs channels Z and A", printable(&shown)))?;
         let nearest = |i: usize, from: usize, to: usize| (2 * i + 1) * from / (2 * to);
         let path = self.context.output_path(&format!("truth/depth/{name}.exr"))?;
         let channels = [
@@ -300,7 +296,7 @@ impl<'a> SceneWriter<'a> {
                         nearest(first + i / width, native.height, height),
                     );
                     let at = y * native.width + x;
-                    sample.copy_from_slice(&[opacity[at], depth[at]]);
+                    sample.copy_from_slice(&[map.opacity[at], map.depth[at]]);
                 }
                 Ok(())
             },

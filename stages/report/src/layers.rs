@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use pixels::{ExrImage, Rgba8, common_range, depth_range, draw_depth, read_exr, read_png};
+use pixels::{DepthMap, ExrImage, Rgba8, common_range, read_exr, read_png};
 use scene::{View, Views};
 use serde_json::Value;
 
@@ -85,10 +85,10 @@ impl Layer<'_> {
                 let file = folder.view(view).and_then(|view| view.low_resolution.as_ref());
                 file.map(|file| folder.colour(file)).transpose()
             }
-            Source::Depth(folder) => Ok(folder.depth(view)?.and_then(|image| {
-                let (z, a) = image.channel("Z").zip(image.channel("A"))?;
-                Some(draw_depth(image.width, z, a, range))
-            })),
+            Source::Depth(folder) => {
+                let image = folder.depth(view)?;
+                Ok(image.and_then(|image| Some(DepthMap::of(&image)?.draw(image.width, range))))
+            }
             Source::Scored(row, pointer) => {
                 let file = row.view(view).and_then(|scores| scores.pointer(pointer)?.as_str());
                 // Without truth of its size there is no error map, though it has a name.
@@ -106,11 +106,8 @@ impl Layer<'_> {
         let Source::Depth(folder) = &self.source else { return Ok(None) };
         let mut ranges = Vec::new();
         for view in views {
-            let range = folder.depth(view)?.and_then(|image| {
-                let (z, a) = image.channel("Z").zip(image.channel("A"))?;
-                depth_range(z, a)
-            });
-            ranges.extend(range);
+            let image = folder.depth(view)?;
+            ranges.extend(image.and_then(|image| DepthMap::of(&image)?.range()));
         }
         Ok(common_range(ranges))
     }

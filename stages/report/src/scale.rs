@@ -1,4 +1,4 @@
-use pixels::{Palette, draw_depth, heat};
+use pixels::{DepthMap, Palette, heat};
 use serde::Serialize;
 
 /// A colour scale with numbers beside it.
@@ -37,7 +37,8 @@ impl Scale {
     pub(crate) fn depth((near, far): (f32, f32)) -> Self {
         let depth = |i: usize| near + (far - near) * i as f32 / (COLOURS - 1) as f32;
         let depths: Vec<f32> = (0..COLOURS).map(depth).collect();
-        let drawn = draw_depth(COLOURS, &depths, &[1.0; COLOURS], (near, far));
+        let map = DepthMap { depth: &depths, opacity: &[1.0; COLOURS] };
+        let drawn = map.draw(COLOURS, (near, far));
         Self {
             label: "Depth, scene units; white where nothing is".to_owned(),
             colours: drawn.data.chunks_exact(4).map(|p| css([p[0], p[1], p[2]])).collect(),
@@ -96,7 +97,7 @@ mod tests {
         let (error, depth) = (Scale::error(0.25, false), Scale::depth((1.0, 9.0)));
         assert_eq!(error.colours[0], css(heat(Palette::Error, 0.0)));
         assert_eq!(error.colours[COLOURS - 1], css(heat(Palette::Error, 1.0)));
-        let near = draw_depth(1, &[1.0], &[1.0], (1.0, 9.0)).data;
+        let near = DepthMap { depth: &[1.0], opacity: &[1.0] }.draw(1, (1.0, 9.0)).data;
         assert_eq!(depth.colours[0], css([near[0], near[1], near[2]]));
         assert!(near[0] > near[2], "{near:?}");
     }

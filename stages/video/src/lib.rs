@@ -9,7 +9,7 @@ use std::process::{Command, Stdio};
 use anyhow::Context as _;
 use artifact::{Failure, RunNode, RunRecord, folders_of};
 use contract::{Input, Output};
-use pixels::{Rgba8, common_range, depth_range, draw_depth, read_exr, write_png};
+use pixels::{DepthMap, Rgba8, common_range, read_exr, write_png};
 use rayon::prelude::*;
 use scene::{View, Views};
 use schemars::JsonSchema;
@@ -87,7 +87,7 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
         progress.add(1);
         let Some(file) = &view.depth else { return Ok(None) };
         let image = read_exr(&folder.join(file))?;
-        Ok(image.channel("Z").zip(image.channel("A")).and_then(|(z, a)| depth_range(z, a)))
+        Ok(DepthMap::of(&image).and_then(|map| map.range()))
     });
     let ranges = ranges.collect::<anyhow::Result<Vec<_>>>()?;
     let range = common_range(ranges.into_iter().flatten());
@@ -105,10 +105,7 @@ fn film(context: &Context, params: &Params, folder: &Path, prefix: &str) -> anyh
             let depth = match (&view.depth, range) {
                 (Some(file), Some(range)) => {
                     let image = read_exr(&folder.join(file))?;
-                    image
-                        .channel("Z")
-                        .zip(image.channel("A"))
-                        .map(|(z, a)| draw_depth(image.width, z, a, range))
+                    DepthMap::of(&image).map(|map| map.draw(image.width, range))
                 }
                 _ => None,
             };

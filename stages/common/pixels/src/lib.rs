@@ -6,6 +6,7 @@
 //!   premultiplied RGBA.
 //! * [`read_png`], [`write_png`], [`PngRows`]; [`read_exr`], [`write_exr`]: one writer a format,
 //!   whose bytes repeat.
+//! * [`DepthMap`]: depth and opacity of a view, and its image for people.
 //! * [`resize_pillow`]: Pillow's resampling to the last bit; [`average_pool`]: the paper code's
 //!   `avg`.
 //! * [`Resampling`]: the same as a linear operator in floats, with its adjoint; [`Degradation`]:
@@ -26,6 +27,7 @@
 
 mod cubic;
 mod degradation;
+mod depth_map;
 mod error;
 mod exposure;
 mod exr_file;
@@ -41,10 +43,11 @@ mod srgb;
 
 pub use cubic::sample_cubic;
 pub use degradation::{DEGRADATION_FILE, Degradation, Kernel};
+pub use depth_map::{DepthMap, common_range};
 pub use error::{MAX_PIXELS, PixelError};
 pub use exposure::Exposure;
 pub use exr_file::{Channel, ExrImage, SampleType, exr_size, read_exr, write_exr};
-pub use heat::{Palette, common_range, depth_range, draw_depth, heat};
+pub use heat::{Palette, heat};
 pub use image_buffer::{Image, Rgba8, psnr_of, to_u8};
 pub use image_file::read_premultiplied;
 pub use mask::Mask;

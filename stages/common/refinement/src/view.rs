@@ -1,5 +1,5 @@
 use artifact::{Failure, FailureExt as _, GivenInput};
-use pixels::{Exposure, ExrImage, Image, read_exr};
+use pixels::{DepthMap, Exposure, ExrImage, Image, read_exr};
 use scene::{Camera, Photograph, Surface, View};
 
 use crate::error::RefinementError;
@@ -22,7 +22,7 @@ impl Rendered {
     pub fn new(camera: Camera, image: &ExrImage, background: f32) -> Result<Self, RefinementError> {
         let refuse =
             |reason: String| Err(RefinementError::View { name: camera.name.clone(), reason });
-        let (Some(premultiplied), Some(depth)) = (image.premultiplied(), image.channel("Z")) else {
+        let (Some(premultiplied), Some(map)) = (image.premultiplied(), DepthMap::of(image)) else {
             return refuse("channels R, G, B, A and Z are expected".to_owned());
         };
         let k = &camera.intrinsics;
@@ -40,7 +40,7 @@ impl Rendered {
             .zip(premultiplied.data.chunks_exact(4))
             .flat_map(|(c, p)| [c[0], c[1], c[2], p[3]]);
         let view = Image::new(image.width, image.height, 4, pixels.collect());
-        Ok(Self { opacity: premultiplied.channel(3), depth: depth.to_vec(), view, camera })
+        Ok(Self { opacity: map.opacity.to_vec(), depth: map.depth.to_vec(), view, camera })
     }
 
     /// A view of an input over a grey level, and its file's channels. None where it has no image.
@@ -87,7 +87,8 @@ impl Rendered {
 
     /// Where the field sees surfaces.
     pub fn surface(&self) -> Surface<'_> {
-        Surface { camera: &self.camera, depth: &self.depth, opacity: &self.opacity }
+        let map = DepthMap { depth: &self.depth, opacity: &self.opacity };
+        Surface { camera: &self.camera, map }
     }
 }
 

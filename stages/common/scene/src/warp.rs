@@ -1,16 +1,15 @@
 use glam::DVec3;
+use pixels::DepthMap;
 
 use crate::camera::Camera;
 
-/// What a view sees: at each pixel's centre, row by row, the depth of the surface and its opacity.
+/// The surfaces that a view sees.
 #[derive(Clone, Copy, Debug)]
 pub struct Surface<'a> {
-    /// Where from; its intrinsics have the size of the lists.
+    /// Where from; its intrinsics have the size of the map.
     pub camera: &'a Camera,
-    /// Camera-space z-depth in scene units.
-    pub depth: &'a [f32],
-    /// Opacity; below one half there is no surface.
-    pub opacity: &'a [f32],
+    /// Depth and opacity at each pixel's centre.
+    pub map: DepthMap<'a>,
 }
 
 /// How one view sees a point of a surface that another sees, too.
@@ -36,7 +35,7 @@ impl Surface<'_> {
     /// [`Surface::visibility`]'s places.
     ///
     /// # Panics
-    /// Where a list hasn't one number a pixel.
+    /// Where the map hasn't one number a pixel.
     pub fn seen_from(&self, other: &Surface<'_>) -> Vec<Option<[f32; 2]>> {
         let k = &self.camera.intrinsics;
         let (width, height) = (k.width as usize, k.height as usize);
@@ -49,7 +48,7 @@ impl Surface<'_> {
     /// the other doesn't look, or something stands between.
     ///
     /// # Panics
-    /// Where a list hasn't one number a pixel, or the pixel lies outside.
+    /// Where the map hasn't one number a pixel, or the pixel lies outside.
     pub fn visibility(&self, column: usize, row: usize, other: &Surface<'_>) -> Option<Visibility> {
         let (visibility, point) = self.look(column, row, other.camera)?;
         let place = [column as f64 + 0.5, row as f64 + 0.5];
@@ -61,7 +60,7 @@ impl Surface<'_> {
     /// The same, were nothing between: how a camera would see it through whatever stands there.
     ///
     /// # Panics
-    /// Where a list hasn't one number a pixel, or the pixel lies outside.
+    /// Where the map hasn't one number a pixel, or the pixel lies outside.
     pub fn visibility_through(
         &self,
         column: usize,
@@ -74,11 +73,11 @@ impl Surface<'_> {
     /// How a camera would see what this view sees at a pixel, and which point that is.
     fn look(&self, column: usize, row: usize, other: &Camera) -> Option<(Visibility, DVec3)> {
         let i = row * self.camera.intrinsics.width as usize + column;
-        if self.opacity[i] < 0.5 {
+        if !self.map.has_surface(i) {
             return None;
         }
         let ray = self.camera.ray(column as f64 + 0.5, row as f64 + 0.5);
-        let distance = f64::from(self.depth[i]) / self.camera.depth_per_distance(&ray);
+        let distance = f64::from(self.map.depth[i]) / self.camera.depth_per_distance(&ray);
         let point = ray.at(distance);
         let (x, y, _) = other.project(point)?;
         let size = [other.intrinsics.width, other.intrinsics.height].map(f64::from);
@@ -106,7 +105,7 @@ impl Surface<'_> {
         around(y, height).into_iter().any(|row| {
             around(x, width).into_iter().any(|column| {
                 let i = row * width + column;
-                self.opacity[i] >= 0.5 && is_there(f64::from(self.depth[i]))
+                self.map.has_surface(i) && is_there(f64::from(self.map.depth[i]))
             })
         })
     }
@@ -163,8 +162,8 @@ mod tests {
         for has_plate in [false, true] {
             let (da, db) = (depths(&a, has_plate), depths(&b, has_plate));
             let (from_a, from_b) = (
-                Surface { camera: &a, depth: &da, opacity: &opacity },
-                Surface { camera: &b, depth: &db, opacity: &opacity },
+                Surface { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } },
+                Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } },
             );
             let mut seen = 0;
             for (i, place) in from_a.seen_from(&from_b).into_iter().enumerate() {
@@ -199,13 +198,9 @@ mod tests {
         }
         let nothing = vec![0.0; 64 * 48];
         let (da, db) = (depths(&a, false), depths(&b, false));
-        let empty = Surface { camera: &a, depth: &da, opacity: &nothing };
-        assert!(
-            empty
-                .seen_from(&Surface { camera: &b, depth: &db, opacity: &opacity })
-                .iter()
-                .all(Option::is_none)
-        );
+        let empty = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &nothing } };
+        let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
+        assert!(empty.seen_from(&other).iter().all(Option::is_none));
     }
 
     /// Pixels that a camera so far aside sees, too, where its depth is off by a factor.
@@ -215,12 +210,9 @@ mod tests {
         let b = camera(DVec3::new(baseline, 0.0, 4.0), 0.0);
         let (da, db): (Vec<f32>, Vec<f32>) =
             (depths(&a, false), depths(&b, false).into_iter().map(|d| d * off).collect());
-        let other = Surface { camera: &b, depth: &db, opacity: &opacity };
-        Surface { camera: &a, depth: &da, opacity: &opacity }
-            .seen_from(&other)
-            .iter()
-            .flatten()
-            .count()
+        let other = Surface { camera: &b, map: DepthMap { depth: &db, opacity: &opacity } };
+        let from = Surface { camera: &a, map: DepthMap { depth: &da, opacity: &opacity } };
+        from.seen_from(&other).iter().flatten().count()
     }
 
     /// Depth that is 5 % off elsewhere is another surface, unless both look from nearly one place:
@@ -244,9 +236,8 @@ mod tests {
             (camera(DVec3::new(0.0, 0.0, 4.0), 0.0), camera(DVec3::new(0.5, 0.2, 4.5), 3.0));
         let opacity = vec![1.0; 64 * 48];
         for depth in [f32::NAN, f32::INFINITY, -1.0, 0.0, 1e38, 1e-38] {
-            let depth = vec![depth; 64 * 48];
-            let other = Surface { camera: &b, depth: &depth, opacity: &opacity };
-            Surface { camera: &a, depth: &depth, opacity: &opacity }.seen_from(&other);
+            let map = DepthMap { depth: &vec![depth; 64 * 48], opacity: &opacity };
+            Surface { camera: &a, map }.seen_from(&Surface { camera: &b, map });
         }
     }
 }

@@ -1,4 +1,4 @@
-use pixels::ExrImage;
+use pixels::{DepthMap, ExrImage};
 
 /// How far depth is off, in scene units.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -11,26 +11,25 @@ pub struct DepthError {
     pub missed: f64,
 }
 
-/// Errors of z-depth over the pixels where the truth sees a surface (`A` at least one half). `None`
-/// where channels `Z` and `A` are missing, sizes differ or nothing is seen.
+/// Errors of z-depth where the truth has a [surface](DepthMap::has_surface). `None` where channels
+/// `Z` and `A` are missing or sizes differ; all 0 where nothing is seen.
 pub fn depth_error(found: &ExrImage, expected: &ExrImage) -> Option<DepthError> {
     if (found.width, found.height) != (expected.width, expected.height) {
         return None;
     }
-    let (z, a) = (found.channel("Z")?, found.channel("A")?);
-    let (true_z, true_a) = (expected.channel("Z")?, expected.channel("A")?);
-    let seen: Vec<usize> = (0..true_a.len()).filter(|&i| true_a[i] >= 0.5).collect();
+    let (found, expected) = (DepthMap::of(found)?, DepthMap::of(expected)?);
+    let seen: Vec<usize> = (0..expected.depth.len()).filter(|&i| expected.has_surface(i)).collect();
     if seen.is_empty() {
         return Some(DepthError::default());
     }
-    let mut errors: Vec<f64> =
-        seen.iter().map(|&i| (f64::from(z[i]) - f64::from(true_z[i])).abs()).collect();
+    let error = |&i: &usize| (f64::from(found.depth[i]) - f64::from(expected.depth[i])).abs();
+    let mut errors: Vec<f64> = seen.iter().map(error).collect();
     errors.sort_by(f64::total_cmp);
     let count = seen.len() as f64;
     Some(DepthError {
         mean_absolute: errors.iter().sum::<f64>() / count,
         median_absolute: errors[errors.len() / 2],
-        missed: seen.iter().filter(|&&i| a[i] < 0.5).count() as f64 / count,
+        missed: seen.iter().filter(|&&i| !found.has_surface(i)).count() as f64 / count,
     })
 }
 

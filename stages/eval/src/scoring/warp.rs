@@ -1,5 +1,5 @@
 use artifact::{FailureExt as _, GivenInput};
-use pixels::{ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
+use pixels::{DepthMap, ExrImage, Image, Rgba8, psnr_of, read_exr, to_u8};
 use scene::{Camera, Surface, View};
 
 use crate::scored_view::{ScoredView, read_image};
@@ -26,7 +26,7 @@ pub(crate) fn read_surface(input: &GivenInput, view: &View) -> anyhow::Result<Op
     let image = read_exr(&input.path(depth)).bad_input(format!("view {}", view.camera.name))?;
     let k = &view.camera.intrinsics;
     let whole = (image.width, image.height) == (k.width as usize, k.height as usize);
-    Ok((whole && image.channel("Z").is_some() && image.channel("A").is_some()).then_some(image))
+    Ok((whole && DepthMap::of(&image).is_some()).then_some(image))
 }
 
 /// Brings the neighbour's image over to a view and compares. The image shows what was brought over;
@@ -37,8 +37,8 @@ pub(crate) fn warp(
     other: (&Camera, &ExrImage, &Image),
 ) -> Option<(WarpScore, Rgba8)> {
     const UNSEEN: [u8; 4] = [120, 20, 30, 255];
-    let from = surface(view.0, view.1)?;
-    let places = from.seen_from(&surface(other.0, other.1)?);
+    let from = Surface { camera: view.0, map: DepthMap::of(view.1)? };
+    let places = from.seen_from(&Surface { camera: other.0, map: DepthMap::of(other.1)? });
     let (mut sum, mut seen) = (0.0, 0usize);
     let mut data = Vec::with_capacity(4 * places.len());
     for (place, truth) in places.iter().zip(view.2.data.chunks_exact(3)) {
@@ -55,10 +55,6 @@ pub(crate) fn warp(
     let psnr = psnr_of(sum / (3 * seen) as f64);
     (seen > 0)
         .then(|| (WarpScore { psnr, seen: share }, Rgba8::new(view.2.width, view.2.height, data)))
-}
-
-fn surface<'a>(camera: &'a Camera, image: &'a ExrImage) -> Option<Surface<'a>> {
-    Some(Surface { camera, depth: image.channel("Z")?, opacity: image.channel("A")? })
 }
 
 /// The true image of a view's nearest neighbour, seen from the view by the rendered depths.
