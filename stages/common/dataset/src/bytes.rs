@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FileReason};
 
 /// Little-endian numbers from a binary file, with its place in every complaint. Nothing is
 /// allocated by what the file claims.
@@ -15,38 +15,44 @@ impl<'a> Bytes<'a> {
         Self { path, rest: bytes, at: 0 }
     }
 
-    pub(crate) fn error(&self, reason: impl std::fmt::Display) -> DatasetError {
-        DatasetError::format(self.path, format!("byte {}: {reason}", self.at))
+    pub(crate) fn error(&self, reason: FileReason) -> DatasetError {
+        let reason = FileReason::Byte { byte: self.at, reason: Box::new(reason) };
+        DatasetError::format(self.path, reason)
     }
 
-    pub(crate) fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8], DatasetError> {
+    pub(crate) fn take(
+        &mut self,
+        count: usize,
+        what: &'static str,
+    ) -> Result<&'a [u8], DatasetError> {
         let Some((taken, rest)) = self.rest.split_at_checked(count) else {
-            return Err(
-                self.error(format!("the file ends within {what}; it is cut short, copy it again"))
-            );
+            return Err(self.error(FileReason::CutShort { what }));
         };
         self.rest = rest;
         self.at += count;
         Ok(taken)
     }
 
-    fn array<const N: usize>(&mut self, what: &str) -> Result<[u8; N], DatasetError> {
+    fn array<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], DatasetError> {
         Ok(self.take(N, what)?.try_into().unwrap_or([0; N]))
     }
 
-    pub(crate) fn u32(&mut self, what: &str) -> Result<u32, DatasetError> {
+    pub(crate) fn u32(&mut self, what: &'static str) -> Result<u32, DatasetError> {
         Ok(u32::from_le_bytes(self.array(what)?))
     }
 
-    pub(crate) fn u64(&mut self, what: &str) -> Result<u64, DatasetError> {
+    pub(crate) fn u64(&mut self, what: &'static str) -> Result<u64, DatasetError> {
         Ok(u64::from_le_bytes(self.array(what)?))
     }
 
-    pub(crate) fn f64(&mut self, what: &str) -> Result<f64, DatasetError> {
+    pub(crate) fn f64(&mut self, what: &'static str) -> Result<f64, DatasetError> {
         Ok(f64::from_le_bytes(self.array(what)?))
     }
 
-    pub(crate) fn f64s<const N: usize>(&mut self, what: &str) -> Result<[f64; N], DatasetError> {
+    pub(crate) fn f64s<const N: usize>(
+        &mut self,
+        what: &'static str,
+    ) -> Result<[f64; N], DatasetError> {
         let mut values = [0.0; N];
         for value in &mut values {
             *value = self.f64(what)?;
@@ -55,28 +61,22 @@ impl<'a> Bytes<'a> {
     }
 
     /// How many entries of at least `size` bytes follow: no more than the file has room for.
-    pub(crate) fn count(&mut self, size: usize, what: &str) -> Result<usize, DatasetError> {
+    pub(crate) fn count(&mut self, size: usize, what: &'static str) -> Result<usize, DatasetError> {
         let count = self.u64(what)?;
         if count > (self.rest.len() / size.max(1)) as u64 {
-            return Err(self.error(format!(
-                "{count} {what} can't be in the {} bytes that follow",
-                self.rest.len()
-            )));
+            return Err(self.error(FileReason::TooMany { count, what, left: self.rest.len() }));
         }
         Ok(count as usize)
     }
 
     /// Text up to a byte of 0.
-    pub(crate) fn text(&mut self, what: &str) -> Result<&'a str, DatasetError> {
+    pub(crate) fn text(&mut self, what: &'static str) -> Result<&'a str, DatasetError> {
         let Some(end) = self.rest.iter().position(|b| *b == 0) else {
-            return Err(self.error(format!("{what} doesn't end")));
+            return Err(self.error(FileReason::Endless { what }));
         };
         let bytes = &self.take(end + 1, what)?[..end];
         std::str::from_utf8(bytes).map_err(|_| {
-            self.error(format!(
-                "{what}, {}, is not UTF-8; rename the file, and make the model again",
-                bytes.escape_ascii()
-            ))
+            self.error(FileReason::NoName { what, name: bytes.escape_ascii().to_string() })
         })
     }
 

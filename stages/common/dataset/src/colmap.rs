@@ -7,7 +7,7 @@ use scene::{Distortion, Intrinsics};
 
 use crate::bytes::Bytes;
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, shown};
+use crate::error::{DatasetError, FileReason, FrameReason};
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names, pose_from_world_to_camera};
@@ -72,16 +72,17 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
         if folder.join("images").is_dir() { folder.join("images") } else { folder.to_path_buf() };
     let (mut frames, mut files, mut missing) = (Vec::new(), Vec::new(), Vec::new());
     for (index, image) in model.images.iter().enumerate() {
-        let of_frame = |reason: String| DatasetError::frame(&list, index, &image.name, reason);
-        let file = relative_path(&image.name).map_err(|e| of_frame(e.to_string()))?;
+        let of_frame = |reason| DatasetError::frame(&list, index, &image.name, reason);
+        let file = relative_path(&image.name).map_err(|e| of_frame(e.into()))?;
         match find(&root.join(&file), "an image") {
             Found::File => {}
             Found::Nothing(_) => {
                 missing.push(&image.name);
                 continue;
             }
-            Found::Other(reason) => {
-                return Err(of_frame(format!("{reason}; put the photograph there")));
+            Found::Other(found) => {
+                let remedy = "put the photograph there";
+                return Err(of_frame(FrameReason::Place { found, remedy }));
             }
         }
         frames.push(model.frame(image, root.join(&file)).map_err(of_frame)?);
@@ -89,12 +90,12 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     }
     if frames.is_empty() {
         let reason = match missing.first() {
-            Some(first) => format!(
-                "not one of its {} images is in {}, first {first}",
-                missing.len(),
-                shown(&root)
-            ),
-            None => "it has no images; at least one is needed".to_owned(),
+            Some(first) => FileReason::ImagesMissing {
+                count: missing.len(),
+                folder: Some(root),
+                first: first.to_string(),
+            },
+            None => FileReason::NoImages,
         };
         return Err(DatasetError::format(&list, reason));
     }
@@ -181,13 +182,12 @@ impl Model {
             let model = bytes.u32("a camera")?;
             let (width, height) = (bytes.u64("a camera")?, bytes.u64("a camera")?);
             let Some((name, count)) = MODELS.get(model as usize) else {
-                return Err(bytes
-                    .error(format!("camera {id} has model {model}, which COLMAP doesn't have")));
+                return Err(bytes.error(FileReason::ModelNumber { id, model }));
             };
             let parameters =
                 (0..*count).map(|_| bytes.f64("a camera")).collect::<Result<Vec<_>, _>>()?;
             let intrinsics = intrinsics(name, width, height, &parameters)
-                .map_err(|reason| bytes.error(format!("camera {id}: {reason}")))?;
+                .map_err(|reason| bytes.error(reason.of_camera(id)))?;
             self.cameras.insert(id, intrinsics);
         }
         end(bytes, "cameras")
@@ -199,8 +199,8 @@ impl Model {
             let (turn, translation) = (bytes.f64s::<4>("an image")?, bytes.f64s::<3>("an image")?);
             let camera = bytes.u32("an image")?;
             let name = bytes.text("an image's name")?.to_owned();
-            let rotation = rotation(turn)
-                .map_err(|reason| bytes.error(format!("image {id} ({name}): {reason}")))?;
+            let rotation =
+                rotation(turn).map_err(|reason| bytes.error(reason.of_image(id, &name)))?;
             let mut points = Vec::new();
             for _ in 0..bytes.count(24, "points of an image")? {
                 bytes.take(16, "a point of an image")?;
@@ -261,7 +261,7 @@ impl Model {
             );
             let camera = line.number(8, "camera id")?;
             if line.words.len() < 10 {
-                return Err(line.error("an image's name is missing"));
+                return Err(line.error(FileReason::Missing { what: "an image's name" }));
             }
             let name = line.words[9..].join(" ");
             let mut points = Vec::new();
@@ -286,14 +286,11 @@ impl Model {
         Ok(())
     }
 
-    fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, String> {
-        let camera = self
-            .cameras
-            .get(&image.camera)
-            .ok_or_else(|| format!("there is no camera {}", image.camera))?;
-        let stored = look(&file).map_err(|e| e.to_string())?;
-        let (taken_with, turned) = fitted(*camera, stored)
-            .map_err(|reason| format!("{reason} (camera {})", image.camera))?;
+    fn frame(&self, image: &Image, file: PathBuf) -> Result<Frame, FrameReason> {
+        let id = image.camera;
+        let camera = self.cameras.get(&id).ok_or(FrameReason::NoCamera { id })?;
+        let (taken_with, turned) = fitted(*camera, look(&file)?)
+            .map_err(|reason| FrameReason::OfCamera { id, reason: Box::new(reason) })?;
         let camera_to_world = pose_from_world_to_camera(image.rotation, image.translation);
         let depths = depths(image, &self.points);
         let frame = Frame {
@@ -307,7 +304,8 @@ impl Model {
             camera_to_world,
             depths,
         };
-        frame.check().map(|()| frame).map_err(|e| e.to_string())
+        frame.check()?;
+        Ok(frame)
     }
 }
 
@@ -344,10 +342,10 @@ fn intrinsics(
     width: u64,
     height: u64,
     parameters: &[f64],
-) -> Result<Intrinsics, String> {
+) -> Result<Intrinsics, FileReason> {
     let side = |value: u64| u32::try_from(value).ok().filter(|v| *v > 0);
     let (Some(columns), Some(rows)) = (side(width), side(height)) else {
-        return Err(format!("its size is {width}×{height}"));
+        return Err(FileReason::Size { width, height });
     };
     let (focal, centre, radial, tangential): ([f64; 2], [f64; 2], [f64; 3], [f64; 2]) =
         match (model, parameters) {
@@ -360,18 +358,14 @@ fn intrinsics(
             }
             _ => match MODELS.iter().find(|(name, _)| *name == model) {
                 Some((_, count)) if *count != parameters.len() => {
-                    return Err(format!(
-                        "{model} has {count} parameters, not {}",
-                        parameters.len()
-                    ));
+                    return Err(FileReason::Parameters {
+                        model: model.to_owned(),
+                        expected: *count,
+                        found: parameters.len(),
+                    });
                 }
-                Some(_) => {
-                    return Err(format!(
-                        "camera model {model} is not supported; undistort first (colmap \
-                    image_undistorter)"
-                    ));
-                }
-                None => return Err(format!("camera model {model:?} is none of COLMAP's")),
+                Some(_) => return Err(FileReason::Model { model: model.to_owned() }),
+                None => return Err(FileReason::ModelName { model: model.to_owned() }),
             },
         };
     let ([fx, fy], [cx, cy], distortion) = (focal, centre, Distortion { radial, tangential });
@@ -379,21 +373,17 @@ fn intrinsics(
 }
 
 /// The rotation of a quaternion (w, x, y, z), which needn't have unit length.
-fn rotation([w, x, y, z]: [f64; 4]) -> Result<DMat3, String> {
+fn rotation([w, x, y, z]: [f64; 4]) -> Result<DMat3, FileReason> {
     let quaternion = DQuat::from_xyzw(x, y, z, w);
     let length = quaternion.length();
     if !(length.is_finite() && length > 1e-9) {
-        return Err(format!("its rotation ({w}, {x}, {y}, {z}) is none"));
+        return Err(FileReason::Rotation([w, x, y, z]));
     }
     Ok(DMat3::from_quat(quaternion * (1.0 / length)))
 }
 
-fn end(bytes: &Bytes<'_>, what: &str) -> Result<(), DatasetError> {
-    if bytes.is_empty() {
-        Ok(())
-    } else {
-        Err(bytes.error(format!("there is more after the last of the {what}; is it another file?")))
-    }
+fn end(bytes: &Bytes<'_>, what: &'static str) -> Result<(), DatasetError> {
+    if bytes.is_empty() { Ok(()) } else { Err(bytes.error(FileReason::More { what })) }
 }
 
 /// A line of a text file, without those that begin with `#`.
@@ -413,16 +403,20 @@ impl<'a> Line<'a> {
         })
     }
 
-    fn error(&self, reason: impl std::fmt::Display) -> DatasetError {
-        DatasetError::format(self.path, format!("line {}: {reason}", self.number))
+    fn error(&self, reason: FileReason) -> DatasetError {
+        DatasetError::format(self.path, reason.on_line(self.number))
     }
 
-    fn number<T: std::str::FromStr>(&self, index: usize, what: &str) -> Result<T, DatasetError> {
+    fn number<T: std::str::FromStr>(
+        &self,
+        index: usize,
+        what: &'static str,
+    ) -> Result<T, DatasetError> {
         let Some(word) = self.words.get(index) else {
-            return Err(self.error(format!("{what} is missing")));
+            return Err(self.error(FileReason::Missing { what }));
         };
         word.parse()
-            .map_err(|_| self.error(format!("{what}: {word:?} is not a number of its kind")))
+            .map_err(|_| self.error(FileReason::NoNumber { what, word: (*word).to_owned() }))
     }
 }
 

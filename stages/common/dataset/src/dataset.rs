@@ -1,6 +1,6 @@
 use artifact::counted;
 
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FileReason};
 use crate::format::Format;
 use crate::frame::Frame;
 use crate::split::Split;
@@ -42,10 +42,7 @@ impl Dataset {
         for frame in self.frames.iter_mut().filter(|f| !f.taken_with.distortion.is_none()) {
             undone += 1;
             let pinhole = frame.taken_with.pinhole().ok_or_else(|| {
-                let reason = format!(
-                    "lens distortion {} leaves no pinhole's image; are its coefficients right?",
-                    frame.taken_with.distortion
-                );
+                let reason = FileReason::Distortion(frame.taken_with.distortion);
                 DatasetError::format(&frame.image, reason)
             })?;
             frame.pinhole = Some(pinhole);

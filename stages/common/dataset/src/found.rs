@@ -3,44 +3,40 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use crate::error::{DatasetError, shown};
+use crate::error::{DatasetError, Misplaced};
 
 /// What stands at a place where a file is wanted.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug)]
 pub(crate) enum Found {
     /// A file.
     File,
-    /// Nothing, in words.
-    Nothing(String),
-    /// Something that can't be read as a file, in words.
-    Other(String),
+    /// Nothing.
+    Nothing(Misplaced),
+    /// Something that can't be read as a file.
+    Other(Misplaced),
 }
 
 /// Looks at a place where a file is wanted, which `wanted` names ("an image").
-pub(crate) fn find(path: &Path, wanted: &str) -> Found {
+pub(crate) fn find(path: &Path, wanted: &'static str) -> Found {
+    let path_buf = || path.to_path_buf();
     match fs::metadata(path) {
         Ok(there) if there.is_file() => Found::File,
-        Ok(there) => {
-            Found::Other(format!("{} is {}, not {wanted}", shown(path), kind(there.file_type())))
-        }
+        Ok(there) => Found::Other(Misplaced::Kind {
+            path: path_buf(),
+            kind: kind(there.file_type()),
+            wanted,
+        }),
         Err(error) => match (broken_link(path), error.kind()) {
             (Some(link), ErrorKind::NotFound) => {
                 let target = fs::read_link(link).unwrap_or_default();
-                let words = format!(
-                    "{} is a symbolic link to {}, which is not there",
-                    shown(link),
-                    shown(&target)
-                );
-                if link == path { Found::Nothing(words) } else { Found::Other(words) }
+                let found = Misplaced::Dangling { link: link.to_path_buf(), target };
+                if link == path { Found::Nothing(found) } else { Found::Other(found) }
             }
-            (Some(link), _) => Found::Other(format!(
-                "{} is a symbolic link that leads nowhere: {error}",
-                shown(link)
-            )),
+            (Some(link), _) => Found::Other(Misplaced::Nowhere { link: link.to_path_buf(), error }),
             (None, ErrorKind::NotFound | ErrorKind::NotADirectory) => {
-                Found::Nothing(format!("{} is not there", shown(path)))
+                Found::Nothing(Misplaced::Nothing { path: path_buf() })
             }
-            (None, _) => Found::Other(format!("{} can't be looked at: {error}", shown(path))),
+            (None, _) => Found::Other(Misplaced::Unseen { path: path_buf(), error }),
         },
     }
 }
@@ -71,7 +67,7 @@ pub(crate) fn is_file(path: &Path) -> Result<bool, DatasetError> {
     match find(path, "a file") {
         Found::File => Ok(true),
         Found::Nothing(_) => Ok(false),
-        Found::Other(reason) => Err(DatasetError::Place { reason }),
+        Found::Other(found) => Err(DatasetError::Place(found)),
     }
 }
 
@@ -95,7 +91,7 @@ mod tests {
         symlink("gone", at("dangling")).unwrap();
         symlink("file", at("link")).unwrap();
         let found = |name: &str| find(&at(name), "an image");
-        assert_eq!((found("file"), found("link")), (Found::File, Found::File));
+        assert!(matches!((found("file"), found("link")), (Found::File, Found::File)));
         for (name, words) in [
             ("folder", "folder is a folder, not an image"),
             ("pipe", "pipe is a named pipe (FIFO), not an image"),
@@ -105,7 +101,8 @@ mod tests {
             ("loop/x.png", "loop is a symbolic link that leads nowhere"),
             ("dangling/x.png", "dangling is a symbolic link to gone, which is not there"),
         ] {
-            let Found::Other(text) = found(name) else { panic!("{name}: {:?}", found(name)) };
+            let Found::Other(it) = found(name) else { panic!("{name}: {:?}", found(name)) };
+            let text = it.to_string();
             assert!(text.contains(words), "{text}");
         }
         for (name, words) in [
@@ -113,7 +110,8 @@ mod tests {
             ("file/x.png", "file/x.png is not there"),
             ("dangling", "dangling is a symbolic link to gone, which is not there"),
         ] {
-            let Found::Nothing(text) = found(name) else { panic!("{name}: {:?}", found(name)) };
+            let Found::Nothing(it) = found(name) else { panic!("{name}: {:?}", found(name)) };
+            let text = it.to_string();
             assert!(text.contains(words), "{text}");
         }
     }

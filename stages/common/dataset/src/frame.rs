@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
 
-use crate::error::{DatasetError, shown};
+use crate::error::{DatasetError, FrameReason, shown};
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,7 +79,7 @@ pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, Datas
     match first_twice(&long) {
         None => Ok(long),
         Some(index) => {
-            let reason = format!("a second view named {:?}; file names must differ", short[index]);
+            let reason = FrameReason::SecondName { name: short[index].clone() };
             Err(DatasetError::frame(list, index, &shown(&paths[index]), reason))
         }
     }
@@ -88,7 +88,7 @@ pub(crate) fn names(list: &Path, paths: &[PathBuf]) -> Result<Vec<String>, Datas
 fn each_name(
     list: &Path,
     paths: &[PathBuf],
-    name: fn(&Path) -> Result<String, String>,
+    name: fn(&Path) -> Result<String, FrameReason>,
 ) -> Result<Vec<String>, DatasetError> {
     let mut names = Vec::with_capacity(paths.len());
     for (index, path) in paths.iter().enumerate() {
@@ -98,7 +98,7 @@ fn each_name(
     Ok(names)
 }
 
-fn name_with_folders(path: &Path) -> Result<String, String> {
+fn name_with_folders(path: &Path) -> Result<String, FrameReason> {
     let whole = path.with_extension("");
     let parts = whole.iter().map(|part| text(Some(part))).collect::<Result<Vec<_>, _>>()?;
     Ok(parts.join("_"))
@@ -106,8 +106,8 @@ fn name_with_folders(path: &Path) -> Result<String, String> {
 
 /// A part of a path as text. Names become files' names and are printed everywhere: no control
 /// characters.
-fn text(part: Option<&OsStr>) -> Result<String, String> {
-    let name = part.and_then(OsStr::to_str).ok_or("its name is not UTF-8; rename the file")?;
+fn text(part: Option<&OsStr>) -> Result<String, FrameReason> {
+    let name = part.and_then(OsStr::to_str).ok_or(FrameReason::NoName)?;
     Ok(name.replace(char::is_control, "_"))
 }
 

@@ -42,10 +42,11 @@ use std::path::Path;
 use artifact::printable;
 
 pub use dataset::Dataset;
-pub use error::DatasetError;
+pub use error::{DatasetError, FileReason, FrameReason, ImageFolder, Misplaced};
 pub use format::Format;
 use found::is_file;
 pub use frame::Frame;
+pub use npy::ArrayReason;
 pub use split::Split;
 
 impl Dataset {

@@ -6,11 +6,11 @@ use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::colmap;
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FileReason, FrameReason, ImageFolder, Misplaced};
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names};
-use crate::npy::read_matrix;
+use crate::npy::{ArrayReason, read_matrix};
 use crate::photograph::{Stored, fitted, is_image_name, look};
 
 /// Numbers a photograph: a 3×5 matrix (axes down, right and back, centre, and height, width, focal
@@ -30,11 +30,10 @@ pub(crate) fn read(folder: &Path) -> Result<Dataset, DatasetError> {
     let mut frames = Vec::with_capacity(rows.len());
     for (index, ((row, image), name)) in rows.iter().zip(images).zip(names).enumerate() {
         let file = name.clone();
-        let of_frame = |reason: String| DatasetError::frame(&path, index, &file, reason);
+        let of_frame = |reason| DatasetError::frame(&path, index, &file, reason);
         let frame = look(&image)
-            .map_err(|e| e.to_string())
-            .and_then(|stored| frame(row, distortion, stored, name, image))
-            .and_then(|frame| frame.check().map(|()| frame).map_err(|e| e.to_string()));
+            .map_err(FrameReason::from)
+            .and_then(|stored| frame(row, distortion, stored, name, image));
         frames.push(frame.map_err(of_frame)?);
     }
     let mut notes = vec![format!(
@@ -80,7 +79,7 @@ fn frame(
     stored: Stored,
     name: String,
     image: PathBuf,
-) -> Result<Frame, String> {
+) -> Result<Frame, FrameReason> {
     let column = |c: usize| DVec3::new(row[c], row[5 + c], row[10 + c]);
     let (down, right, back, centre, inside) =
         (column(0), column(1), column(2), column(3), column(4));
@@ -91,10 +90,10 @@ fn frame(
         fitted(Intrinsics { width, height, fx: focal, fy: focal, cx, cy, distortion }, stored)?;
     let (near, far) = (row[15], row[16]);
     if !(near.is_finite() && far.is_finite() && 0.0 < near && near < far) {
-        return Err(format!("its bounds are {near} and {far}; 0 < near < far is expected"));
+        return Err(FrameReason::Depths { near, far });
     }
     let camera_to_world = pose_of(DMat3::from_cols(right, -down, back), centre);
-    Ok(Frame {
+    let frame = Frame {
         name,
         image,
         turned,
@@ -104,19 +103,21 @@ fn frame(
         pinhole: None,
         camera_to_world,
         depths: Some([near, far]),
-    })
+    };
+    frame.check()?;
+    Ok(frame)
 }
 
-fn whole(value: f64, name: &str) -> Result<u32, String> {
+fn whole(value: f64, name: &'static str) -> Result<u32, FrameReason> {
     if (1.0..=f64::from(u32::MAX)).contains(&value) {
         Ok(value.round() as u32)
     } else {
-        Err(format!("{name} is {value}"))
+        Err(FrameReason::Side { name, value })
     }
 }
 
-/// Images of a folder by name, and what is named like one but can't be read, in words.
-fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
+/// Images of a folder by name, and the first that is named like one but can't be read.
+fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<Misplaced>)> {
     let named =
         std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| is_image_name(p));
     let mut named: Vec<PathBuf> = named.collect();
@@ -124,8 +125,8 @@ fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
     let mut odd = None;
     named.retain(|path| match find(path, "an image") {
         Found::File => true,
-        Found::Nothing(reason) | Found::Other(reason) => {
-            odd.get_or_insert(reason);
+        Found::Nothing(found) | Found::Other(found) => {
+            odd.get_or_insert(found);
             false
         }
     });
@@ -134,37 +135,33 @@ fn images_of(folder: &Path) -> Option<(Vec<PathBuf>, Option<String>)> {
 
 /// All images of `images`, or of the largest of `images_2`, `images_4` … that has one for every
 /// pose.
-fn images(folder: &Path, count: usize) -> Result<(Vec<PathBuf>, String), String> {
-    let mut folders = vec!["images".to_owned()];
-    folders.extend((2..=64).map(|n| format!("images_{n}")));
-    let mut seen = Vec::new();
-    for name in folders {
+fn images(folder: &Path, poses: usize) -> Result<(Vec<PathBuf>, String), FileReason> {
+    let mut names = vec!["images".to_owned()];
+    names.extend((2..=64).map(|n| format!("images_{n}")));
+    let mut folders = Vec::new();
+    for name in names {
         let Some((files, odd)) = images_of(&folder.join(&name)) else { continue };
-        if files.len() == count {
+        if files.len() == poses {
             return Ok((files, name));
         }
-        let odd = odd.map(|reason| format!(" ({reason})")).unwrap_or_default();
-        seen.push(format!("{name} has {}{odd}", files.len()));
+        folders.push(ImageFolder { name, images: files.len(), odd });
     }
-    let seen =
-        if seen.is_empty() { "there is no folder images".to_owned() } else { seen.join(", ") };
-    Err(format!("{count} poses, but {seen}; images and poses must be as many"))
+    Err(FileReason::Counts { poses, folders })
 }
 
 /// The array's rows.
 fn read_numbers(path: &Path) -> Result<Vec<[f64; NUMBERS]>, DatasetError> {
     let bytes = std::fs::read(path)
         .map_err(|source| DatasetError::Io { path: path.to_path_buf(), source })?;
-    let matrix = read_matrix(&bytes).map_err(|reason| no_array(path, &reason))?;
+    let matrix = read_matrix(&bytes).map_err(|reason| no_array(path, reason))?;
     if matrix.columns != NUMBERS || matrix.numbers.is_empty() {
-        let shape = [matrix.rows, matrix.columns];
-        return Err(no_array(path, &format!("its shape is {shape:?}")));
+        return Err(no_array(path, ArrayReason::Shape(vec![matrix.rows, matrix.columns])));
     }
     Ok(matrix.numbers.as_chunks().0.to_vec())
 }
 
-fn no_array(path: &Path, reason: &str) -> DatasetError {
-    DatasetError::format(path, format!("not a NumPy array of N×{NUMBERS} numbers: {reason}"))
+fn no_array(path: &Path, reason: ArrayReason) -> DatasetError {
+    DatasetError::format(path, FileReason::Array { columns: NUMBERS, reason })
 }
 
 #[cfg(test)]

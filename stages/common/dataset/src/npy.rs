@@ -4,6 +4,32 @@
 /// unless it is told to.
 const LONGEST_HEADER: usize = 10_000;
 
+/// Why a file isn't such a matrix.
+#[derive(Debug, PartialEq, thiserror::Error)]
+pub enum ArrayReason {
+    /// It isn't NumPy's at all.
+    #[error("it doesn't begin as one")]
+    Beginning,
+    /// A header that NumPy wouldn't read.
+    #[error("its header has {length} bytes; NumPy reads {LONGEST_HEADER}")]
+    LongHeader {
+        /// Its bytes.
+        length: usize,
+    },
+    /// A header without an entry of the right kind.
+    #[error("its header has no {0}")]
+    Entry(&'static str),
+    /// Another shape.
+    #[error("its shape is {0:?}")]
+    Shape(Vec<usize>),
+    /// Something else than numbers that are read.
+    #[error("it holds {0:?}")]
+    Kind(String),
+    /// Fewer numbers than its header says.
+    #[error("it is cut short")]
+    CutShort,
+}
+
 /// Numbers of a two-dimensional array, row by row.
 #[derive(Debug, PartialEq)]
 pub(crate) struct Matrix {
@@ -12,32 +38,31 @@ pub(crate) struct Matrix {
     pub(crate) numbers: Vec<f64>,
 }
 
-/// Reads a whole file; the reason is for people.
-pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, String> {
-    let (header, data) = parts(bytes).ok_or("it doesn't begin as one")?;
+/// Reads a whole file.
+pub(crate) fn read_matrix(bytes: &[u8]) -> Result<Matrix, ArrayReason> {
+    let (header, data) = parts(bytes).ok_or(ArrayReason::Beginning)?;
     if header.len() > LONGEST_HEADER {
-        let length = header.len();
-        return Err(format!("its header has {length} bytes; NumPy reads {LONGEST_HEADER}"));
+        return Err(ArrayReason::LongHeader { length: header.len() });
     }
     let kind = entry(header, "descr")
         .and_then(quoted)
-        .ok_or("its header has no descr that is a string")?;
+        .ok_or(ArrayReason::Entry("descr that is a string"))?;
     let is_by_columns = entry(header, "fortran_order")
         .and_then(truth)
-        .ok_or("its header has no fortran_order that is True or False")?;
+        .ok_or(ArrayReason::Entry("fortran_order that is True or False"))?;
     let shape = entry(header, "shape")
         .and_then(lengths)
-        .ok_or("its header has no shape of whole numbers")?;
-    let [rows, columns] = shape[..] else { return Err(format!("its shape is {shape:?}")) };
-    let count = rows.checked_mul(columns).ok_or_else(|| format!("its shape is {shape:?}"))?;
+        .ok_or(ArrayReason::Entry("shape of whole numbers"))?;
+    let [rows, columns] = shape[..] else { return Err(ArrayReason::Shape(shape)) };
+    let count = rows.checked_mul(columns).ok_or(ArrayReason::Shape(shape))?;
     let stored = match kind {
         "<f8" | "=f8" => numbers(data, count, f64::from_le_bytes),
         ">f8" => numbers(data, count, f64::from_be_bytes),
         "<f4" | "=f4" => numbers(data, count, |bytes| f64::from(f32::from_le_bytes(bytes))),
         ">f4" => numbers(data, count, |bytes| f64::from(f32::from_be_bytes(bytes))),
-        _ => return Err(format!("it holds {kind:?}")),
+        _ => return Err(ArrayReason::Kind(kind.to_owned())),
     };
-    let stored = stored.ok_or("it is cut short")?;
+    let stored = stored.ok_or(ArrayReason::CutShort)?;
     let numbers = if is_by_columns {
         let at = |i: usize| stored[i % columns * rows + i / columns];
         (0..count).map(at).collect()
@@ -107,7 +132,7 @@ mod tests {
         [b"\x93NUMPY", &[version, 0][..], length, header.as_bytes(), data].concat()
     }
 
-    fn matrix(numbers: [f64; 6]) -> Result<Matrix, String> {
+    fn matrix(numbers: [f64; 6]) -> Result<Matrix, ArrayReason> {
         Ok(Matrix { rows: 2, columns: 3, numbers: numbers.to_vec() })
     }
 
@@ -152,7 +177,8 @@ mod tests {
             ("'<f8'", "(2, 4)", "cut short"),
             ("'<f8'", &huge, "its shape is"),
         ] {
-            let reason = read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err();
+            let reason =
+                read_matrix(&file(1, &header(kind, shape), &data)).unwrap_err().to_string();
             assert!(reason.contains(words), "{kind} {shape}: {reason}");
         }
         let whole = file(1, &header("'<f8'", "(2, 3)"), &data);
@@ -169,7 +195,7 @@ mod tests {
 
     #[track_caller]
     fn assert_refused(bytes: &[u8], words: &str) {
-        let reason = read_matrix(bytes).unwrap_err();
+        let reason = read_matrix(bytes).unwrap_err().to_string();
         assert!(reason.contains(words), "{reason}");
     }
 

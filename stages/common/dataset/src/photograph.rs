@@ -2,7 +2,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use artifact::relative_path;
+use artifact::{PathError, relative_path};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder as _, ImageFormat, ImageReader, Limits};
 use pixels::{
@@ -10,7 +10,7 @@ use pixels::{
 };
 use scene::Intrinsics;
 
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FrameReason};
 use crate::frame::Frame;
 
 /// Whether a file's name is that of an image.
@@ -24,8 +24,8 @@ pub(crate) fn is_exr(path: &Path) -> bool {
 }
 
 /// The path inside the folder of an image that a file names. NeRF's files leave `.png` out.
-pub(crate) fn image_file(folder: &Path, text: &str) -> Result<PathBuf, String> {
-    let mut file = relative_path(text).map_err(|e| e.to_string())?;
+pub(crate) fn image_file(folder: &Path, text: &str) -> Result<PathBuf, PathError> {
+    let mut file = relative_path(text)?;
     if !is_image_name(&file) && !folder.join(&file).is_file() {
         // `set_extension` would cut a name like `r.0`.
         file.as_mut_os_string().push(".png");
@@ -86,7 +86,7 @@ fn is_sideways(turn: Orientation) -> bool {
 /// The intrinsics for the stored image, whose size may differ from what was said of it, but not in
 /// shape; and whether the image has to be turned as its EXIF data ask. Poses are commonly found for
 /// images as they are stored, so it is turned only where its shape fits no other way.
-pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), String> {
+pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool), FrameReason> {
     let (width, height) = stored.size;
     if (k.width, k.height) == stored.size {
         Ok((k, false))
@@ -95,10 +95,7 @@ pub(crate) fn fitted(k: Intrinsics, stored: Stored) -> Result<(Intrinsics, bool)
     } else if stored.is_sideways && has_shape_of(&k, height, width) {
         Ok((k.resized(height, width), true))
     } else {
-        Err(format!(
-            "the image has {width}×{height} pixels, its camera {}×{}: another shape",
-            k.width, k.height
-        ))
+        Err(FrameReason::Shape { image: stored.size, camera: (k.width, k.height) })
     }
 }
 
@@ -253,7 +250,7 @@ pub(crate) mod tests {
         assert_eq!(fitted(of(32, 16), stored).unwrap(), (of(32, 16), false));
         assert_eq!(fitted(of(64, 32), stored).unwrap(), (of(64, 32).resized(32, 16), false));
         assert_eq!(fitted(of(16, 32), stored).unwrap(), (of(16, 32), true));
-        assert!(fitted(of(32, 32), stored).unwrap_err().contains("another shape"));
+        assert!(fitted(of(32, 32), stored).unwrap_err().to_string().contains("another shape"));
         let upright = super::read(&path, true).unwrap();
         assert_eq!((upright.width, upright.height), (16, 32));
         assert!(

@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FileReason};
 
 /// A whole text file: UTF-8, with or without a byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
@@ -12,9 +12,9 @@ pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {
 const UTF8_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// The text of a file, or what it is instead and what to do about that.
-fn decoded(mut bytes: Vec<u8>) -> Result<String, String> {
+fn decoded(mut bytes: Vec<u8>) -> Result<String, FileReason> {
     if is_utf16(&bytes) {
-        return Err("is UTF-16; save it as UTF-8".to_owned());
+        return Err(FileReason::Utf16);
     }
     if bytes.starts_with(UTF8_MARK) {
         bytes.drain(..UTF8_MARK.len());
@@ -28,10 +28,7 @@ fn decoded(mut bytes: Vec<u8>) -> Result<String, String> {
             .iter()
             .position(u8::is_ascii_whitespace)
             .map_or(bytes.len(), |space| place + space);
-        let word = bytes[start..end].escape_ascii();
-        format!(
-            "line {line}: {word} is not UTF-8; save the file as UTF-8, and rename what it names so"
-        )
+        FileReason::NoText { word: bytes[start..end].escape_ascii().to_string() }.on_line(line)
     })
 }
 
@@ -55,11 +52,11 @@ mod tests {
         assert_eq!(decoded(Vec::new()).unwrap(), "");
         for text in ["{}", "\u{feff}{}"] {
             for bytes in [utf16(text, u16::to_le_bytes), utf16(text, u16::to_be_bytes)] {
-                assert_eq!(decoded(bytes).unwrap_err(), "is UTF-16; save it as UTF-8");
+                assert_eq!(decoded(bytes).unwrap_err().to_string(), "is UTF-16; save it as UTF-8");
             }
         }
         let latin = b"# list\n1 2 B\xe4ume.png \xff\n".to_vec();
-        let reason = decoded(latin).unwrap_err();
+        let reason = decoded(latin).unwrap_err().to_string();
         assert!(
             reason.starts_with(r"line 2: B\xe4ume.png is not UTF-8; save the file as UTF-8"),
             "{reason}"

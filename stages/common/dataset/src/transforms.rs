@@ -5,7 +5,7 @@ use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
 use crate::dataset::Dataset;
-use crate::error::DatasetError;
+use crate::error::{DatasetError, FileReason, FrameReason};
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names};
@@ -104,10 +104,7 @@ impl Read {
     /// Refuses a file without frames.
     pub(crate) fn not_empty(self, path: &Path) -> Result<Self, DatasetError> {
         if self.frames.is_empty() {
-            return Err(DatasetError::format(
-                path,
-                "`frames` is empty; at least one view is needed",
-            ));
+            return Err(DatasetError::format(path, FileReason::NoFrames));
         }
         Ok(self)
     }
@@ -119,35 +116,34 @@ pub(crate) fn read_file(
     path: &Path,
     on_missing: Missing,
 ) -> Result<Read, DatasetError> {
-    let transforms =
-        parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e.to_string()))?;
+    let transforms = parse(&read_text(path)?).map_err(|e| DatasetError::format(path, e))?;
     let (mut frames, mut files) = (Vec::new(), Vec::new());
     let (mut first_missing, mut missing) = (None, 0);
     for (index, entry) in transforms.frames.iter().enumerate() {
-        let of_frame = |reason: String| DatasetError::frame(path, index, &entry.file_path, reason);
-        let file = image_file(folder, &entry.file_path).map_err(of_frame)?;
+        let of_frame = |reason| DatasetError::frame(path, index, &entry.file_path, reason);
+        let file = image_file(folder, &entry.file_path).map_err(|e| of_frame(e.into()))?;
         match find(&folder.join(&file), "an image") {
             Found::File => {}
-            Found::Nothing(reason) if on_missing == Missing::Refused => {
-                return Err(of_frame(format!("{reason}; remove the frame or restore the file")));
+            Found::Nothing(found) if on_missing == Missing::Refused => {
+                let remedy = "remove the frame or restore the file";
+                return Err(of_frame(FrameReason::Place { found, remedy }));
             }
             Found::Nothing(_) => {
                 first_missing.get_or_insert_with(|| entry.file_path.clone());
                 missing += 1;
                 continue;
             }
-            Found::Other(reason) => {
-                return Err(of_frame(format!("{reason}; remove the frame or name its image")));
+            Found::Other(found) => {
+                let remedy = "remove the frame or name its image";
+                return Err(of_frame(FrameReason::Place { found, remedy }));
             }
         }
         frames.push(read_frame(folder, &file, entry, &transforms.shared).map_err(of_frame)?);
         files.push(file);
     }
-    if let Some(first) = first_missing.as_ref().filter(|_| frames.is_empty()) {
-        return Err(DatasetError::format(
-            path,
-            format!("not one of its {missing} images is there, first {first}"),
-        ));
+    if let Some(first) = first_missing.clone().filter(|_| frames.is_empty()) {
+        let reason = FileReason::ImagesMissing { count: missing, folder: None, first };
+        return Err(DatasetError::format(path, reason));
     }
     for (frame, name) in frames.iter_mut().zip(names(path, &files)?) {
         frame.name = name;
@@ -184,11 +180,11 @@ fn read_frame(
     file: &Path,
     entry: &FrameEntry,
     shared: &LensEntry,
-) -> Result<Frame, String> {
+) -> Result<Frame, FrameReason> {
     let mut camera_to_world = [[0.0; 4]; 3];
     let matrix = &entry.transform_matrix;
     if !(3..=4).contains(&matrix.len()) || matrix.iter().any(|row| row.len() != 4) {
-        return Err("transform_matrix must have 4 rows of 4 numbers".to_owned());
+        return Err(FrameReason::Matrix);
     }
     for (row, values) in camera_to_world.iter_mut().enumerate() {
         for (column, value) in values.iter_mut().enumerate() {
@@ -200,8 +196,7 @@ fn read_frame(
     let depth = image_beside(folder, entry.depth_file_path.as_deref())?;
     // nerfstudio's depth, 16-bit PNG of an estimate, is no true depth.
     let depth = depth.filter(|path| is_exr(path));
-    let (taken_with, turned) =
-        intrinsics(&entry.own.or(shared), look(&image).map_err(|e| e.to_string())?)?;
+    let (taken_with, turned) = intrinsics(&entry.own.or(shared), look(&image)?)?;
     let frame = Frame {
         name: String::new(),
         image,
@@ -219,19 +214,19 @@ fn read_frame(
             e @ (CameraError::Intrinsics { .. }
             | CameraError::Distortion(_)
             | CameraError::Empty { .. }),
-        ) => Err(e.to_string()),
-        Err(e) => Err(format!("transform_matrix: {e}")),
+        ) => Err(e.into()),
+        Err(e) => Err(FrameReason::Pose(e)),
     }
 }
 
 /// The mask or depth that a frame names, if it names one.
-fn image_beside(folder: &Path, text: Option<&str>) -> Result<Option<PathBuf>, String> {
+fn image_beside(folder: &Path, text: Option<&str>) -> Result<Option<PathBuf>, FrameReason> {
     let Some(text) = text else { return Ok(None) };
-    let path = folder.join(relative_path(text).map_err(|e| e.to_string())?);
+    let path = folder.join(relative_path(text)?);
     match find(&path, "an image") {
         Found::File => Ok(Some(path)),
-        Found::Nothing(reason) | Found::Other(reason) => {
-            Err(format!("{reason}; remove the entry or restore the file"))
+        Found::Nothing(found) | Found::Other(found) => {
+            Err(FrameReason::Place { found, remedy: "remove the entry or restore the file" })
         }
     }
 }
@@ -266,18 +261,15 @@ impl LensEntry {
 }
 
 /// What an image was taken with, and whether it has to be turned.
-fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), String> {
+fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), FrameReason> {
     let model = entry.camera_model.as_deref().unwrap_or("OPENCV");
     if !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"]
         .contains(&model)
     {
-        return Err(format!(
-            "camera_model {model:?} is not supported; undistort the images first (colmap \
-            image_undistorter)"
-        ));
+        return Err(FrameReason::Model { model: model.to_owned() });
     }
     if entry.is_fisheye == Some(true) || entry.k4.is_some_and(|k| k.0 != 0.0) {
-        return Err("fisheye lenses are not supported; undistort the images first".to_owned());
+        return Err(FrameReason::Fisheye);
     }
     // The size that the numbers are for; the stored image may be a smaller copy.
     let (width, height) =
@@ -285,7 +277,7 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
     let fx = focal(entry.fl_x, entry.camera_angle_x, "camera_angle_x", width)?;
     let fy = focal(entry.fl_y, entry.camera_angle_y, "camera_angle_y", height)?;
     let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
-        return Err("no focal length: neither fl_x nor camera_angle_x is given".to_owned());
+        return Err(FrameReason::NoFocalLength);
     };
     let or = |number: Option<Number>, otherwise: f64| number.map_or(otherwise, |number| number.0);
     let (cx, cy) = (or(entry.cx, 0.5 * f64::from(width)), or(entry.cy, 0.5 * f64::from(height)));
@@ -296,11 +288,11 @@ fn intrinsics(entry: &LensEntry, stored: Stored) -> Result<(Intrinsics, bool), S
     fitted(Intrinsics { width, height, fx, fy, cx, cy, distortion }, stored)
 }
 
-fn whole(value: Option<Number>, name: &str, stored: u32) -> Result<u32, String> {
+fn whole(value: Option<Number>, name: &'static str, stored: u32) -> Result<u32, FrameReason> {
     match value {
         None => Ok(stored),
         Some(Number(v)) if v >= 1.0 && v <= f64::from(u32::MAX) => Ok(v.round() as u32),
-        Some(Number(v)) => Err(format!("{name} is {v}; an image has at least one pixel")),
+        Some(Number(value)) => Err(FrameReason::Empty { name, value }),
     }
 }
 
@@ -308,9 +300,9 @@ fn whole(value: Option<Number>, name: &str, stored: u32) -> Result<u32, String> 
 fn focal(
     length: Option<Number>,
     angle: Option<Number>,
-    name: &str,
+    name: &'static str,
     size: u32,
-) -> Result<Option<f64>, String> {
+) -> Result<Option<f64>, FrameReason> {
     match (length, angle) {
         (Some(Number(length)), _) => Ok(Some(length)),
         (None, Some(Number(angle))) if angle > 0.0 && angle < std::f64::consts::PI => {
@@ -318,9 +310,7 @@ fn focal(
         }
         (None, Some(Number(angle))) => {
             let focal = 0.5 / (0.5 * angle).tan();
-            Err(format!(
-                "{name} is {angle}: focal length {focal}; the angle must lie between 0 and π"
-            ))
+            Err(FrameReason::Angle { name, angle, focal })
         }
         (None, None) => Ok(None),
     }
