@@ -5,9 +5,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::error::SchemaError;
 use crate::input::Input;
 use crate::output::Output;
-use crate::parameters::{Schema, SchemaError};
+use crate::parameters::Schema;
 use crate::rules::{GivenInputs, Rule, RuleError};
 
 /// What `STAGE describe` prints: all that the runner knows of a stage.

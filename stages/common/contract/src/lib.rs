@@ -27,6 +27,7 @@
 
 mod describe;
 mod documented;
+mod error;
 mod input;
 mod output;
 mod parameters;
@@ -40,8 +41,9 @@ mod variant_tests;
 
 pub use describe::{Description, DescriptionError};
 pub use documented::{GROUPS, ParameterSection, ParameterText, by_group, plain};
+pub use error::{KeywordError, SchemaError};
 pub use input::Input;
 pub use output::Output;
-pub use parameters::{ParameterProblem, Schema, SchemaError};
+pub use parameters::{ParameterProblem, Schema};
 pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
 pub use rules::{GivenInputs, Rule, RuleError};

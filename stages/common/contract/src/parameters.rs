@@ -1,6 +1,7 @@
 use artifact::{known_names, nearest};
 use serde_json::{Map, Value, json};
 
+use crate::error::SchemaError;
 use crate::renames::{Named, renamed};
 use crate::tagged::Tag;
 use crate::validator::{Misfit, Validator};
@@ -37,15 +38,10 @@ pub struct ParameterProblem {
     pub problem: String,
 }
 
-/// A parameter schema that can't be used: what is wrong with it.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct SchemaError(String);
-
 impl Schema {
     /// Compiles the schema that a program describes.
     pub fn new(program: &str, schema: &Value) -> Result<Self, SchemaError> {
-        let tag = Tag::find(schema).map_err(SchemaError)?;
+        let tag = Tag::find(schema)?;
         let forms = match &tag {
             None => vec![Form::new(schema.clone())?],
             Some(tag) => tag.forms(schema).into_iter().map(Form::new).collect::<Result<_, _>>()?,
@@ -150,8 +146,7 @@ impl Form {
     fn new(schema: Value) -> Result<Self, SchemaError> {
         let mut bounded = schema.clone();
         bound_formats(&mut bounded);
-        let validator =
-            Validator::new(&bounded).map_err(|e| SchemaError(format!("not a JSON Schema: {e}")))?;
+        let validator = Validator::new(&bounded).map_err(SchemaError::Keyword)?;
         Ok(Self { schema, validator })
     }
 

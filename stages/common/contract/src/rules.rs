@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::error::KeywordError;
 use crate::input::Input;
 use crate::validator::Validator;
 
@@ -45,7 +46,7 @@ pub enum RuleError {
         /// The value's name.
         name: String,
         /// What is wrong.
-        reason: String,
+        reason: KeywordError,
     },
 }
 

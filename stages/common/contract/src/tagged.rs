@@ -3,6 +3,7 @@
 
 use serde_json::{Map, Value, json};
 
+use crate::error::SchemaError;
 use crate::values::Reader;
 
 /// Such a parameter of a type, with its variants, the default's first.
@@ -22,7 +23,7 @@ struct Variant {
 impl Tag {
     /// The one that a schema has, if any. Fails where there are two, or where a name would mean two
     /// parameters of one variant.
-    pub(crate) fn find(schema: &Value) -> Result<Option<Self>, String> {
+    pub(crate) fn find(schema: &Value) -> Result<Option<Self>, SchemaError> {
         let Some(properties) = schema.get("properties").and_then(Value::as_object) else {
             return Ok(None);
         };
@@ -30,21 +31,20 @@ impl Tag {
             .iter()
             .filter_map(|(name, property)| Self::read(schema, name, property))
             .collect();
-        if tags.len() > 1 {
-            return Err(format!(
-                "one where {} and {} both select a variant",
-                tags[0].name, tags[1].name
-            ));
+        if let [first, second, ..] = &tags[..] {
+            let (first, second) = (first.name.clone(), second.name.clone());
+            return Err(SchemaError::Selectors { first, second });
         }
         let Some(tag) = tags.pop() else { return Ok(None) };
         for variant in &tag.variants {
             if let Some(name) =
                 variant.properties.keys().find(|name| properties.contains_key(*name))
             {
-                return Err(format!(
-                    "one where {name} is a parameter beside {} and inside its {}",
-                    tag.name, variant.name
-                ));
+                return Err(SchemaError::Ambiguous {
+                    name: name.clone(),
+                    selector: tag.name.clone(),
+                    variant: variant.name.clone(),
+                });
             }
         }
         Ok(Some(tag))

@@ -5,6 +5,8 @@ use std::cmp::Ordering;
 
 use serde_json::{Map, Number, Value};
 
+use crate::error::KeywordError;
+
 /// Keywords that constrain values and aren't understood: a schema that has one is refused, so that
 /// nothing passes unchecked.
 const UNSUPPORTED: [&str; 20] = [
@@ -52,7 +54,7 @@ pub(crate) struct Misfit {
 
 impl Validator {
     /// Takes a schema; the error names the keyword that can't be used.
-    pub(crate) fn new(schema: &Value) -> Result<Self, String> {
+    pub(crate) fn new(schema: &Value) -> Result<Self, KeywordError> {
         check(schema, schema)?;
         Ok(Self { root: schema.clone() })
     }
@@ -71,14 +73,15 @@ impl Validator {
 }
 
 /// Checks a schema itself.
-fn check(root: &Value, schema: &Value) -> Result<(), String> {
+fn check(root: &Value, schema: &Value) -> Result<(), KeywordError> {
     let keywords = match schema {
         Value::Bool(_) => return Ok(()),
         Value::Object(keywords) => keywords,
-        other => return Err(format!("{other} is neither an object nor true or false")),
+        other => return Err(KeywordError::Kind(other.clone())),
     };
     for (keyword, value) in keywords {
-        let wrong = || Err(format!("{keyword}: {value} can't stand there"));
+        let wrong =
+            || Err(KeywordError::Misused { keyword: keyword.clone(), value: value.clone() });
         match keyword.as_str() {
             "type" => {
                 let is_type = |one: &Value| one.as_str().is_some_and(|t| TYPES.contains(&t));
@@ -107,7 +110,7 @@ fn check(root: &Value, schema: &Value) -> Result<(), String> {
                 schemas.values().try_for_each(|schema| check(root, schema))?;
             }
             other if UNSUPPORTED.contains(&other) => {
-                return Err(format!("keyword {other} isn't supported; leave it out"));
+                return Err(KeywordError::Unsupported(other.to_owned()));
             }
             // Descriptions, defaults, formats, and words of somebody's own.
             _ => {}
