@@ -3,6 +3,7 @@ use dataset::{Dataset, Split};
 use pixels::Kernel;
 use scene::{Camera, Intrinsics};
 
+use crate::error::ParameterError;
 use crate::params::{LrSource, Params};
 use crate::sizes::{Sizes, enlarged, scaled, sizes};
 
@@ -21,23 +22,20 @@ pub(crate) struct ImagePlan {
 
 impl ImagePlan {
     /// Of a data set's training and test views. What parameters can't have is said.
-    pub(crate) fn new(set: &Dataset, split: &Split, params: &Params) -> Result<Self, String> {
+    pub(crate) fn new(
+        set: &Dataset,
+        split: &Split,
+        params: &Params,
+    ) -> Result<Self, ParameterError> {
         let has_truth = match params.lr_source {
             Some(source) => source == LrSource::Downscaled,
             None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
         if !has_truth && params.lr_width.is_some() {
-            return Err(
-                "parameter lr_width: with lr_source photographs their own width is the LR width; \
-                leave lr_width out"
-                    .to_owned(),
-            );
+            return Err(ParameterError::WidthOfPhotographs);
         }
         if !has_truth && params.kernel == Some(Kernel::Average) {
-            return Err(
-                "parameter kernel: average makes LR images and can't be assumed; choose box"
-                    .to_owned(),
-            );
+            return Err(ParameterError::AssumedAverage);
         }
         let kernel = params.kernel.unwrap_or(if has_truth { Kernel::Lanczos } else { Kernel::Box });
         let first = set.frames[split.train[0]].intrinsics();
@@ -47,12 +45,7 @@ impl ImagePlan {
         } else {
             enlarged(native, params.hr_width, params.scale)
         };
-        let plan = Self {
-            has_truth,
-            kernel,
-            sizes: sizes.map_err(|e| format!("parameters: {e}"))?,
-            native,
-        };
+        let plan = Self { has_truth, kernel, sizes: sizes?, native };
         if kernel == Kernel::Average {
             let mut all = split
                 .train
@@ -60,10 +53,7 @@ impl ImagePlan {
                 .chain(&split.test)
                 .map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
             if let Some(odd) = all.find(|sizes| !sizes.is_integer()) {
-                return Err(format!(
-                    "parameter kernel: average needs a whole scale, not {:?} → {:?}; choose box",
-                    odd.hr, odd.lr
-                ));
+                return Err(ParameterError::UnevenAverage(odd));
             }
         }
         Ok(plan)

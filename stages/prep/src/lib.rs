@@ -19,6 +19,7 @@
 mod borders;
 mod bounds;
 mod degrade;
+mod error;
 mod frame_name;
 mod image_plan;
 mod params;
@@ -88,17 +89,16 @@ impl Stage for Prep {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let set = dataset(context, params)?;
-        let split = split(&set, params).map_err(Failure::Usage)?;
-        let warnings = warnings_of_poses(&set, &split)
-            .map_err(|reason| Failure::BadInput(format!("dataset: {reason}")))?;
-        let images = ImagePlan::new(&set, &split, params).map_err(Failure::Usage)?;
+        let split = split(&set, params).map_err(Failure::from)?;
+        let warnings = warnings_of_poses(&set, &split).bad_input("dataset")?;
+        let images = ImagePlan::new(&set, &split, params).map_err(Failure::from)?;
         let mut notes: Vec<String> =
             set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let (background, sign) = background(params, &training)?;
         let plan =
-            ScenePlan::new(&set, &split, params, images, background).map_err(Failure::Usage)?;
+            ScenePlan::new(&set, &split, params, images, background).map_err(Failure::from)?;
         for note in sign.into_iter().chain([space_note(&plan.bounds, background)]) {
             context.say(&note);
             notes.push(note);

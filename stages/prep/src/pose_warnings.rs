@@ -2,6 +2,8 @@ use artifact::counted;
 use glam::DVec3;
 use scene::{Camera, Intrinsics};
 
+use crate::error::SamePose;
+
 /// Cameras that are so many times as far from the middle of all as half of them are, at least, are
 /// far off. One that is doubles the box as often as that; walks through a room have 2 to 5.
 const FAR_OFF_RATIO: f64 = 20.0;
@@ -16,17 +18,13 @@ const ONE_PLACE_SHARE: f64 = 1e-7;
 
 /// Refuses training views that were all taken by the same camera at the same place: whatever they
 /// show, it isn't one scene seen from several sides.
-pub(crate) fn check(training: &[Camera]) -> Result<(), String> {
+pub(crate) fn check(training: &[Camera]) -> Result<(), SamePose> {
     match training {
         [first, others @ ..]
             if !others.is_empty()
                 && others.iter().all(|c| c.camera_to_world == first.camera_to_world) =>
         {
-            let count = training.len();
-            Err(format!(
-                "all {count} training views have the same pose: nothing tells how far anything \
-                is; are the poses right?"
-            ))
+            Err(SamePose { views: training.len() })
         }
         _ => Ok(()),
     }
@@ -192,7 +190,8 @@ mod tests {
     #[test]
     fn one_pose_for_all_views_is_refused() {
         let same = vec![camera("a", 0.3, [0.0, 1.0, 4.0]); 8];
-        assert!(check(&same).unwrap_err().starts_with("all 8 training views have the same pose"));
+        let message = check(&same).unwrap_err().to_string();
+        assert!(message.starts_with("all 8 training views have the same pose"), "{message}");
         assert_eq!((check(&same[..1]), check(&[])), (Ok(()), Ok(())));
     }
 

@@ -3,6 +3,7 @@ use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space};
 
 use crate::bounds::{SeenDepths, place};
+use crate::error::{ParameterError, SamePose};
 use crate::image_plan::ImagePlan;
 use crate::params::Params;
 use crate::{pose_warnings, references};
@@ -26,7 +27,7 @@ impl<'a> ScenePlan<'a> {
         params: &Params,
         images: ImagePlan,
         background: Background,
-    ) -> Result<Self, String> {
+    ) -> Result<Self, ParameterError> {
         let train: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let test: Vec<&Frame> = split.test.iter().map(|&i| &set.frames[i]).collect();
         let bounds = bounds(&train, &test, params, background)?;
@@ -43,7 +44,7 @@ fn bounds(
     test: &[&Frame],
     params: &Params,
     background: Background,
-) -> Result<Bounds, String> {
+) -> Result<Bounds, ParameterError> {
     // What the user says of all views stands in for what isn't known of each.
     let given = params
         .near
@@ -52,13 +53,13 @@ fn bounds(
         .filter(|[near, far]| 0.0 < *near && near < far);
     let (train, test) = (sights(train, given), sights(test, given));
     let goes_on = background == Background::Opaque;
-    let mut bounds = place(&train, &test, goes_on, params.space).map_err(|e| e.to_string())?;
+    let mut bounds = place(&train, &test, goes_on, params.space)?;
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
         if let Some(value) = given {
             if !value.is_finite() {
-                return Err(format!("parameter {name}: {value} is not a distance"));
+                return Err(ParameterError::NoDistance { name, value });
             }
             *bound = value;
         }
@@ -67,7 +68,7 @@ fn bounds(
         frustum.far = frustum.far.min(far);
     }
     if bounds.near >= bounds.far || !bounds.is_valid() {
-        return Err(format!("parameter near: {} is not before far = {}", bounds.near, bounds.far));
+        return Err(ParameterError::NearAndFar { near: bounds.near, far: bounds.far });
     }
     Ok(bounds)
 }
@@ -78,7 +79,7 @@ fn sights(frames: &[&Frame], given: Option<[f64; 2]>) -> Vec<SeenDepths> {
 }
 
 /// Warnings of what looks wrong about poses; such as can't be right are refused.
-pub(crate) fn warnings_of_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, String> {
+pub(crate) fn warnings_of_poses(set: &Dataset, split: &Split) -> Result<Vec<String>, SamePose> {
     let camera = |&i: &usize| set.frames[i].camera();
     let training: Vec<Camera> = split.train.iter().map(camera).collect();
     let test: Vec<Camera> =
@@ -164,7 +165,7 @@ mod tests {
         set: &Dataset,
         params: &Params,
         background: Background,
-    ) -> Result<(ImagePlan, Bounds, Vec<usize>), String> {
+    ) -> Result<(ImagePlan, Bounds, Vec<usize>), ParameterError> {
         let split = split(set, params)?;
         let images = ImagePlan::new(set, &split, params)?;
         let plan = ScenePlan::new(set, &split, params, images, background)?;
@@ -194,7 +195,7 @@ mod tests {
         set: &Dataset,
         near: Option<f64>,
         far: Option<f64>,
-    ) -> Result<(f64, f64), String> {
+    ) -> Result<(f64, f64), ParameterError> {
         let params = Params { near, far, ..Params::default() };
         planned(set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
     }
@@ -205,17 +206,17 @@ mod tests {
         let set = ring(Format::Blender, 8);
         assert_eq!(near_and_far(&set, Some(1.5), Some(7.0)).unwrap(), (1.5, 7.0));
         assert_eq!(
-            near_and_far(&set, Some(7.0), Some(1.5)).unwrap_err(),
+            near_and_far(&set, Some(7.0), Some(1.5)).unwrap_err().to_string(),
             "parameter near: 7 is not before far = 1.5"
         );
         assert_eq!(
-            near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err(),
+            near_and_far(&set, None, Some(f64::INFINITY)).unwrap_err().to_string(),
             "parameter far: inf is not a distance"
         );
     }
 
     fn refused(format: Format, params: &Params) -> String {
-        planned(&ring(format, 8), params, Background::White).unwrap_err()
+        planned(&ring(format, 8), params, Background::White).unwrap_err().to_string()
     }
 
     /// What can't be is said by the parameter's name.

@@ -1,5 +1,6 @@
 use dataset::{Dataset, Split};
 
+use crate::error::ParameterError;
 use crate::params::{Params, SplitKind};
 use crate::references;
 
@@ -7,7 +8,7 @@ use crate::references;
 const HOLD_OUT_EVERY: usize = 8;
 
 /// Which frames are for what, no more test views than asked for.
-pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
+pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, ParameterError> {
     let mut split = all_views(set, params)?;
     if let Some(most) = params.test_views {
         let (most, all) = (most as usize, split.test.len());
@@ -18,15 +19,11 @@ pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, String> {
     Ok(split)
 }
 
-fn all_views(set: &Dataset, params: &Params) -> Result<Split, String> {
+fn all_views(set: &Dataset, params: &Params) -> Result<Split, ParameterError> {
     let count = set.frames.len();
     match (params.split, &set.split) {
         (Some(SplitKind::Given) | None, Some(given)) => Ok(given.clone()),
-        (Some(SplitKind::Given), None) => {
-            Err("parameter split: the data set doesn't say which views are for testing; choose \
-                holdout or paper"
-                .to_owned())
-        }
+        (Some(SplitKind::Given), None) => Err(ParameterError::NoSplit),
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
