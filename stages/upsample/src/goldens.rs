@@ -113,7 +113,7 @@ fn broken_weights_are_refused() {
 #[test]
 fn sizes_that_a_network_cannot_make_are_said() {
     assert!(fit(Some(4), [5, 7], [20, 28]).is_ok() && fit(None, [5, 7], [13, 20]).is_ok());
-    assert!(fit(Some(4), [5, 7], [20, 27]).unwrap_err().contains("4 times"));
+    assert!(fit(Some(4), [5, 7], [20, 27]).unwrap_err().to_string().contains("4 times"));
 }
 
 /// IMDN as released, on ten real views, against PyTorch's scores.

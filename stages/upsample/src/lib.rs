@@ -208,22 +208,31 @@ fn networks(
     for (view, camera) in pairs {
         let [lr, hr] = [&view.camera, *camera]
             .map(|c| [i64::from(c.intrinsics.width), i64::from(c.intrinsics.height)]);
-        fit(scale, lr, hr).map_err(|reason| {
-            Failure::BadInput(format!("view {}: {file} {reason}", camera.name))
-        })?;
+        fit(scale, lr, hr)
+            .map_err(|e| Failure::BadInput(format!("view {}: {file} {e}", camera.name)))?;
     }
     Ok(networks)
 }
 
+/// Sizes that a network can't make of each other.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, or \
+    bicubic or liif",
+    hr[0], hr[1], lr[0], lr[1]
+)]
+struct WrongScale {
+    /// The network's scale.
+    by: i64,
+    lr: [i64; 2],
+    hr: [i64; 2],
+}
+
 /// Whether a network of that scale makes the HR size of the LR one; what is wrong otherwise.
-fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), String> {
+fn fit(scale: Option<i64>, lr: [i64; 2], hr: [i64; 2]) -> Result<(), WrongScale> {
     match scale.filter(|by| lr.map(|size| size * by) != hr) {
         None => Ok(()),
-        Some(by) => Err(format!(
-            "enlarges {by} times, which doesn't make {}×{} of {}×{}; take views of another size, \
-            or bicubic or liif",
-            hr[0], hr[1], lr[0], lr[1]
-        )),
+        Some(by) => Err(WrongScale { by, lr, hr }),
     }
 }
 
