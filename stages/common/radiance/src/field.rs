@@ -11,7 +11,7 @@ use crate::mlp::Layers;
 use crate::occupancy::{CELLS, Cell, Occupancy};
 use crate::simd::LANES;
 use crate::spec::FEATURES;
-use crate::tensors::{FieldError, Tensor, read_f32, read_u8, write_tensors};
+use crate::tensors::{FieldError, FieldProblem, Tensor, read_f32, read_u8, write_tensors};
 
 /// A radiance field: density and view-dependent colour of every point of a box.
 #[derive(Clone, Debug)]
@@ -139,23 +139,32 @@ impl Field {
         architecture: Architecture,
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
-        let format = |reason: String| FieldError::Format { path: path.to_path_buf(), reason };
-        architecture.check().map_err(|e| format(e.to_string()))?;
-        if !bounds.is_valid() {
-            return Err(format(format!("the box {bounds:?} has no inside")));
-        }
+        let format = |reason| FieldError::Format { path: path.to_path_buf(), reason };
+        let field = Self::empty_of(architecture, bounds).map_err(format)?;
         let bytes = std::fs::read(path)
             .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|e| format(e.to_string()))?;
-        let mut field = Self::empty(architecture, bounds);
-        read_f32(&tensors, "grid", &mut field.grid).map_err(format)?;
-        read_f32(&tensors, "network", &mut field.network).map_err(format)?;
-        let occupancy = read_u8(&tensors, "occupancy", CELLS).map_err(format)?;
-        field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
-        if !field.is_finite() {
-            return Err(format("a parameter is not finite".to_owned()));
+        field.with_tensors(&bytes).map_err(format)
+    }
+
+    fn empty_of(architecture: Architecture, bounds: Bounds) -> Result<Self, FieldProblem> {
+        architecture.check()?;
+        if !bounds.is_valid() {
+            return Err(FieldProblem::NoInside(bounds));
         }
-        Ok(field)
+        Ok(Self::empty(architecture, bounds))
+    }
+
+    /// With what a file of tensors has.
+    fn with_tensors(mut self, bytes: &[u8]) -> Result<Self, FieldProblem> {
+        let tensors = SafeTensors::deserialize(bytes)?;
+        read_f32(&tensors, "grid", &mut self.grid)?;
+        read_f32(&tensors, "network", &mut self.network)?;
+        let occupancy = read_u8(&tensors, "occupancy", CELLS)?;
+        self.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
+        if !self.is_finite() {
+            return Err(FieldProblem::NotFinite);
+        }
+        Ok(self)
     }
 }
 

@@ -91,5 +91,5 @@ pub use spherical::spherical_harmonics;
 pub use strides::Strides;
 pub use supervisor::Supervisor;
 pub use tally::Tally;
-pub use tensors::FieldError;
+pub use tensors::{FieldError, FieldProblem};
 pub use trainer::{StepReport, Trainer, TrainingError, TrainingOptions};

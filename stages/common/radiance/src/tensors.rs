@@ -1,7 +1,11 @@
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
-use safetensors::tensor::{Dtype, SafeTensors, View};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
+
+use scene::Bounds;
+
+use crate::ranges::OutOfRange;
 
 /// A field that can't be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -20,8 +24,45 @@ pub enum FieldError {
         /// The file.
         path: PathBuf,
         /// What is wrong.
-        reason: String,
+        reason: FieldProblem,
     },
+}
+
+/// Why a file is neither a field nor a checkpoint.
+#[derive(Debug, thiserror::Error)]
+pub enum FieldProblem {
+    /// The file isn't one of tensors.
+    #[error(transparent)]
+    NotTensors(#[from] SafeTensorError),
+    /// A tensor is missing.
+    #[error("tensor {name}: {problem}")]
+    Missing {
+        /// The tensor.
+        name: String,
+        /// Why it can't be had.
+        problem: SafeTensorError,
+    },
+    /// A tensor has another type or length.
+    #[error("tensor {name}: {found:?} {shape:?} where {expected} are expected")]
+    Unexpected {
+        /// The tensor.
+        name: String,
+        /// Its type.
+        found: Dtype,
+        /// Its shape.
+        shape: Vec<usize>,
+        /// How many numbers of which type a reader expects, in words.
+        expected: String,
+    },
+    /// No field has such an architecture.
+    #[error(transparent)]
+    Architecture(#[from] OutOfRange),
+    /// Nothing lies inside the bounds.
+    #[error("the box {0:?} has no inside")]
+    NoInside(Bounds),
+    /// A parameter isn't finite.
+    #[error("a parameter is not finite")]
+    NotFinite,
 }
 
 /// A tensor to write.
@@ -84,16 +125,11 @@ pub(crate) fn read_f32(
     tensors: &SafeTensors<'_>,
     name: &str,
     into: &mut [f32],
-) -> Result<(), String> {
-    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+) -> Result<(), FieldProblem> {
+    let tensor = named(tensors, name)?;
     let (data, rest) = tensor.data().as_chunks::<4>();
     if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(format!(
-            "tensor {name}: {:?} {:?} where {} f32 are expected",
-            tensor.dtype(),
-            tensor.shape(),
-            into.len()
-        ));
+        return Err(unexpected(&tensor, name, format!("{} f32", into.len())));
     }
     for (value, bytes) in into.iter_mut().zip(data) {
         *value = f32::from_le_bytes(*bytes);
@@ -105,14 +141,20 @@ pub(crate) fn read_u8(
     tensors: &SafeTensors<'_>,
     name: &str,
     len: usize,
-) -> Result<Vec<u8>, String> {
-    let tensor = tensors.tensor(name).map_err(|e| format!("tensor {name}: {e}"))?;
+) -> Result<Vec<u8>, FieldProblem> {
+    let tensor = named(tensors, name)?;
     if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(format!(
-            "tensor {name}: {:?} {:?} where {len} u8 are expected",
-            tensor.dtype(),
-            tensor.shape()
-        ));
+        return Err(unexpected(&tensor, name, format!("{len} u8")));
     }
     Ok(tensor.data().to_vec())
+}
+
+fn named<'a>(tensors: &SafeTensors<'a>, name: &str) -> Result<TensorView<'a>, FieldProblem> {
+    let missing = |problem| FieldProblem::Missing { name: name.to_owned(), problem };
+    tensors.tensor(name).map_err(missing)
+}
+
+fn unexpected(tensor: &TensorView<'_>, name: &str, expected: String) -> FieldProblem {
+    let (found, shape) = (tensor.dtype(), tensor.shape().to_vec());
+    FieldProblem::Unexpected { name: name.to_owned(), found, shape, expected }
 }

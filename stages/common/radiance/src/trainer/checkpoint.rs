@@ -5,7 +5,7 @@ use safetensors::SafeTensors;
 use super::{Moments, Trainer};
 use crate::occupancy::CELLS;
 use crate::tally::Tally;
-use crate::tensors::{FieldError, Tensor, read_f32, read_u8, write_tensors};
+use crate::tensors::{FieldError, FieldProblem, Tensor, read_f32, read_u8, write_tensors};
 
 impl Trainer {
     /// Writes all that a resumed training needs to end in the same bytes. The caller makes it
@@ -48,7 +48,7 @@ impl Trainer {
                 let mut moments = Moments::zeros(field);
                 read_f32(tensors, &format!("{name}grid"), &mut moments.grid)?;
                 read_f32(tensors, &format!("{name}network"), &mut moments.network)?;
-                Ok::<_, String>(moments)
+                Ok::<_, FieldProblem>(moments)
             };
             let (first, second, weights) = (moments("first.")?, moments("second.")?, moments("")?);
             let is_averaged = tensors.names().contains(&"average.grid");
@@ -71,7 +71,7 @@ impl Trainer {
 /// Opens a checkpoint and reads its six counters.
 fn read_counters<T>(
     path: &Path,
-    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>,
+    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, FieldProblem>,
 ) -> Result<T, FieldError> {
     let bytes = std::fs::read(path)
         .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
@@ -82,9 +82,9 @@ fn read_counters<T>(
 /// The same of a checkpoint's bytes.
 fn counters_of<T>(
     bytes: &[u8],
-    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, String>,
-) -> Result<T, String> {
-    let tensors = SafeTensors::deserialize(bytes).map_err(|e| e.to_string())?;
+    then: impl FnOnce(&SafeTensors<'_>, [u64; 6]) -> Result<T, FieldProblem>,
+) -> Result<T, FieldProblem> {
+    let tensors = SafeTensors::deserialize(bytes)?;
     let counters = read_u8(&tensors, "counters", 48)?;
     then(&tensors, std::array::from_fn(|i| u64::from_le_bytes(counters.as_chunks::<8>().0[i])))
 }
