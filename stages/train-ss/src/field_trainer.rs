@@ -203,17 +203,18 @@ impl FieldTrainer for Trainer {
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
         let steps = Self::steps(&self);
-        write_grid(&Self::finish(*self), steps, weights)
+        write_grid(Self::finish(*self), steps, weights)
     }
 }
 
-fn write_grid(field: &Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
+fn write_grid(mut field: Field, steps: u64, weights: &Path) -> anyhow::Result<()> {
     if !field.is_finite() {
         return Err(Failure::Numerical(format!(
             "step {steps}: a parameter is not finite; lower the rate"
         ))
         .into());
     }
+    field.remove_specks();
     field.write(weights).context("cannot write the field")
 }
 
@@ -230,7 +231,7 @@ impl FieldTrainer for torch_field::GridTrainer {
     forwarded!();
 
     fn finish(self: Box<Self>, weights: &Path) -> anyhow::Result<()> {
-        write_grid(&self.field()?, Self::steps(&self), weights)
+        write_grid(self.field()?, Self::steps(&self), weights)
     }
 }
 

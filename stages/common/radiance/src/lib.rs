@@ -67,6 +67,7 @@ mod samples;
 mod shading;
 mod simd;
 pub mod spec;
+mod specks;
 mod spherical;
 mod strides;
 mod supervisor;

@@ -50,6 +50,15 @@ pub(crate) fn corner(cell: usize, side: usize) -> [usize; 3] {
     [cell % side, cell / side % side, cell / (side * side)]
 }
 
+/// A cell and the cells that share a side, an edge or a corner with it, in order.
+pub(crate) fn around(cell: usize) -> impl Iterator<Item = usize> {
+    let [xs, ys, zs] = corner(cell, GRID).map(|c| c.saturating_sub(1)..=(c + 1).min(GRID - 1));
+    zs.flat_map(move |z| {
+        let xs = xs.clone();
+        ys.clone().flat_map(move |y| xs.clone().map(move |x| x + GRID * (y + GRID * z)))
+    })
+}
+
 /// A word a brick: a bit for each cell that isn't empty, and one for each dense cell.
 fn words(held: impl Fn(usize) -> Cell + Sync) -> (Vec<u64>, Vec<u64>) {
     let bricks = (0..BRICKS * BRICKS * BRICKS).into_par_iter().with_min_len(256);
@@ -167,17 +176,9 @@ impl Occupancy {
     /// Limits it to the cells that are occupied and those around them: for a training that goes on
     /// where the rest is known to be empty.
     pub(crate) fn limit_to_occupied(&mut self) {
-        let mask = (0..CELLS).into_par_iter().map(|cell| self.is_near_occupied(cell)).collect();
+        let is_near = |cell: usize| around(cell).any(|near| self.is_occupied(near));
+        let mask = (0..CELLS).into_par_iter().map(is_near).collect();
         self.limit_to(mask);
-    }
-
-    /// Whether a cell or one around it is occupied.
-    fn is_near_occupied(&self, cell: usize) -> bool {
-        let around = |c: usize| c.saturating_sub(1)..=(c + 1).min(GRID - 1);
-        let [x, y, z] = corner(cell, GRID);
-        around(z).any(|k| {
-            around(y).any(|j| around(x).any(|i| self.is_occupied(i + GRID * (j + GRID * k))))
-        })
     }
 
     /// Limits it to cells, besides what limits it already; all that is left may be occupied.
