@@ -25,7 +25,7 @@ pub(crate) enum ParameterError {
     )]
     UnevenAverage(Sizes),
     #[error("parameters: {0}")]
-    Sizes(#[from] SizeError),
+    Sizes(SizeError),
     #[error(transparent)]
     Space(#[from] SpaceError),
     #[error("parameter {name}: {value} is not a distance")]

@@ -45,7 +45,8 @@ impl ImagePlan {
         } else {
             enlarged(native, params.hr_width, params.scale)
         };
-        let plan = Self { has_truth, kernel, sizes: sizes?, native };
+        let sizes = sizes.map_err(ParameterError::Sizes)?;
+        let plan = Self { has_truth, kernel, sizes, native };
         if kernel == Kernel::Average {
             let mut all = split
                 .train

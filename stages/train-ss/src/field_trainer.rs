@@ -263,3 +263,49 @@ impl FieldTrainer for torch_field::MlpTrainer {
         Self::field(&self).write(weights).context("cannot write the field")
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use radiance::Architecture;
+
+    use super::*;
+
+    /// A small field with two thin cells, one of them beside a dense cell.
+    fn field() -> Field {
+        let architecture = Architecture { levels: 2, log2_entries: 8, ..Architecture::default() };
+        let bounds =
+            Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
+        let mut field = Field::new(architecture, bounds, 1);
+        let (.., occupancy) = field.parts_mut();
+        let (density, mut cells) = (occupancy.density().to_vec(), occupancy.to_bytes());
+        cells.fill(0);
+        cells[5000..5002].copy_from_slice(&[1, 2]);
+        cells[9000] = 1;
+        occupancy.restore(density, &cells);
+        field
+    }
+
+    #[test]
+    fn a_field_is_written_without_specks() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        let Field { architecture, bounds, .. } = field();
+        write_grid(field(), 7, &path).unwrap();
+        let read = Field::read(&path, architecture, bounds).unwrap();
+        let (.., occupancy) = read.parts();
+        let cells = occupancy.to_bytes();
+        let held: Vec<usize> = (0..cells.len()).filter(|&cell| cells[cell] != 0).collect();
+        assert_eq!(held, [5000, 5001]);
+    }
+
+    #[test]
+    fn a_parameter_that_is_not_finite_is_not_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        let mut field = field();
+        field.parts_mut().0[3] = f32::NAN;
+        let error = write_grid(field, 7, &path).unwrap_err();
+        assert!(matches!(error.downcast_ref::<Failure>(), Some(Failure::Numerical(_))));
+        assert!(!path.exists());
+    }
+}

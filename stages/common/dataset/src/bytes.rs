@@ -1,6 +1,7 @@
 use std::path::Path;
 
-use crate::error::{DatasetError, FileReason};
+use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 
 /// Little-endian numbers from a binary file, with its place in every complaint. Nothing is
 /// allocated by what the file claims.

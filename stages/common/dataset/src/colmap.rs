@@ -7,10 +7,12 @@ use scene::{Distortion, Intrinsics};
 
 use crate::bytes::Bytes;
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FileReason, FrameReason};
+use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names, pose_from_world_to_camera};
+use crate::frame_reason::FrameReason;
 use crate::photograph::{fitted, look};
 use crate::text::read_text;
 

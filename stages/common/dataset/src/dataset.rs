@@ -1,6 +1,7 @@
 use artifact::counted;
 
-use crate::error::{DatasetError, FileReason};
+use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 use crate::format::Format;
 use crate::frame::Frame;
 use crate::split::Split;

@@ -3,7 +3,8 @@ use std::io::ErrorKind;
 use std::os::unix::fs::FileTypeExt as _;
 use std::path::Path;
 
-use crate::error::{DatasetError, Misplaced};
+use crate::error::DatasetError;
+use crate::misplaced::Misplaced;
 
 /// What stands at a place where a file is wanted.
 #[derive(Debug)]

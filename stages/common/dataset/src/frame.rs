@@ -5,7 +5,9 @@ use std::path::{Path, PathBuf};
 use glam::{DMat3, DVec3};
 use scene::{Camera, CameraError, Distortion, Intrinsics, Pose, pose_of};
 
-use crate::error::{DatasetError, FrameReason, shown};
+use crate::error::DatasetError;
+use crate::frame_reason::FrameReason;
+use crate::misplaced::shown;
 
 /// A posed photograph.
 #[derive(Clone, Debug, PartialEq)]

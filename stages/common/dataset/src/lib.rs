@@ -26,10 +26,13 @@ mod bytes;
 mod colmap;
 mod dataset;
 mod error;
+mod file_reason;
 mod format;
 mod found;
 mod frame;
+mod frame_reason;
 mod llff;
+mod misplaced;
 mod npy;
 mod number;
 mod photograph;
@@ -42,10 +45,13 @@ use std::path::Path;
 use artifact::printable;
 
 pub use dataset::Dataset;
-pub use error::{DatasetError, FileReason, FrameReason, ImageFolder, Misplaced};
+pub use error::DatasetError;
+pub use file_reason::{FileReason, ImageFolder};
 pub use format::Format;
 use found::is_file;
 pub use frame::Frame;
+pub use frame_reason::FrameReason;
+pub use misplaced::Misplaced;
 pub use npy::ArrayReason;
 pub use split::Split;
 

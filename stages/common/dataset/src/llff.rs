@@ -6,10 +6,13 @@ use scene::{Distortion, Intrinsics, pose_of};
 
 use crate::colmap;
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FileReason, FrameReason, ImageFolder, Misplaced};
+use crate::error::DatasetError;
+use crate::file_reason::{FileReason, ImageFolder};
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names};
+use crate::frame_reason::FrameReason;
+use crate::misplaced::Misplaced;
 use crate::npy::{ArrayReason, read_matrix};
 use crate::photograph::{Stored, fitted, is_image_name, look};
 
@@ -112,7 +115,7 @@ fn whole(value: f64, name: &'static str) -> Result<u32, FrameReason> {
     if (1.0..=f64::from(u32::MAX)).contains(&value) {
         Ok(value.round() as u32)
     } else {
-        Err(FrameReason::Side { name, value })
+        Err(FrameReason::Empty { name, value })
     }
 }
 

@@ -10,8 +10,9 @@ use pixels::{
 };
 use scene::Intrinsics;
 
-use crate::error::{DatasetError, FrameReason};
+use crate::error::DatasetError;
 use crate::frame::Frame;
+use crate::frame_reason::FrameReason;
 
 /// Whether a file's name is that of an image.
 pub(crate) fn is_image_name(path: &Path) -> bool {

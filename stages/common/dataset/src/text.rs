@@ -1,6 +1,7 @@
 use std::path::Path;
 
-use crate::error::{DatasetError, FileReason};
+use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 
 /// A whole text file: UTF-8, with or without a byte order mark.
 pub(crate) fn read_text(path: &Path) -> Result<String, DatasetError> {

@@ -5,10 +5,12 @@ use scene::{CameraError, Distortion, Intrinsics};
 use serde::Deserialize;
 
 use crate::dataset::Dataset;
-use crate::error::{DatasetError, FileReason, FrameReason};
+use crate::error::DatasetError;
+use crate::file_reason::FileReason;
 use crate::format::Format;
 use crate::found::{Found, find};
 use crate::frame::{Frame, names};
+use crate::frame_reason::FrameReason;
 use crate::number::{Number, words_as_text};
 use crate::photograph::{Stored, fitted, image_file, is_exr, look};
 use crate::split::Split;

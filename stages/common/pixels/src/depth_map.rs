@@ -3,6 +3,7 @@ use crate::heat::{Palette, heat};
 use crate::image_buffer::Rgba8;
 
 /// Depth and opacity of a view, a number a pixel, row by row: channels `Z` and `A` of its EXR file.
+/// There are as many of both.
 #[derive(Clone, Copy, Debug)]
 pub struct DepthMap<'a> {
     /// Camera-space z-depth in scene units: positive before the camera, and without meaning where
@@ -42,7 +43,10 @@ impl<'a> DepthMap<'a> {
     }
 
     /// Depth as colours from near (warm) to far, even in disparity where the far end is many times
-    /// as far; white where nothing stands. The range is in scene units.
+    /// as far; white where nothing stands. The range is in scene units, `width` in pixels.
+    ///
+    /// # Panics
+    /// Where the map hasn't whole rows of that width, or depths and opacities aren't as many.
     pub fn draw(&self, width: usize, (near, far): (f32, f32)) -> Rgba8 {
         let scale = |z: f32| if far > 4.0 * near && near > 0.0 { -1.0 / z.max(near) } else { z };
         let (low, high) = (scale(near), scale(far));

@@ -140,32 +140,36 @@ impl Field {
         bounds: Bounds,
     ) -> Result<Self, FieldError> {
         let format = |reason| FieldError::Format { path: path.to_path_buf(), reason };
-        let field = Self::empty_of(architecture, bounds).map_err(format)?;
+        check(&architecture, &bounds).map_err(format)?;
         let bytes = std::fs::read(path)
             .map_err(|source| FieldError::Io { path: path.to_path_buf(), source })?;
-        field.with_tensors(&bytes).map_err(format)
+        Self::from_tensors(&bytes, architecture, bounds).map_err(format)
     }
 
-    fn empty_of(architecture: Architecture, bounds: Bounds) -> Result<Self, FieldProblem> {
-        architecture.check()?;
-        if !bounds.is_valid() {
-            return Err(FieldProblem::NoInside(bounds));
-        }
-        Ok(Self::empty(architecture, bounds))
-    }
-
-    /// With what a file of tensors has.
-    fn with_tensors(mut self, bytes: &[u8]) -> Result<Self, FieldProblem> {
+    fn from_tensors(
+        bytes: &[u8],
+        architecture: Architecture,
+        bounds: Bounds,
+    ) -> Result<Self, FieldProblem> {
         let tensors = SafeTensors::deserialize(bytes)?;
-        read_f32(&tensors, "grid", &mut self.grid)?;
-        read_f32(&tensors, "network", &mut self.network)?;
+        let mut field = Self::empty(architecture, bounds);
+        read_f32(&tensors, "grid", &mut field.grid)?;
+        read_f32(&tensors, "network", &mut field.network)?;
         let occupancy = read_u8(&tensors, "occupancy", CELLS)?;
-        self.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
-        if !self.is_finite() {
+        field.occupancy.set(|cell| Cell::from_byte(occupancy[cell]));
+        if !field.is_finite() {
             return Err(FieldProblem::NotFinite);
         }
-        Ok(self)
+        Ok(field)
     }
+}
+
+fn check(architecture: &Architecture, bounds: &Bounds) -> Result<(), FieldProblem> {
+    architecture.check()?;
+    if !bounds.is_valid() {
+        return Err(FieldProblem::NoInside(*bounds));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

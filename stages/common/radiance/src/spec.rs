@@ -45,9 +45,6 @@ pub const THIN: f32 = 0.05;
 /// Optical depth of a step below which a cell is empty, once the mean is above it.
 pub const EMPTY: f32 = 0.01;
 
-/// Most cells of a speck: a group of thin cells by itself, which a trained field is rid of.
-pub const SPECK_CELLS: usize = 27;
-
 /// Weight of a sample above which its cell keeps the density found there: a random place may miss a
 /// thin surface, and the cell would become empty.
 pub const MET: f32 = 0.03;

@@ -2,12 +2,14 @@
 
 use crate::field::Field;
 use crate::occupancy::{CELLS, Cell, Occupancy, around};
-use crate::spec::SPECK_CELLS;
+
+/// Most cells of a speck: 3³.
+const SPECK_CELLS: usize = 27;
 
 impl Field {
-    /// Empties specks: groups of at most [`SPECK_CELLS`] thin cells with nothing but empty cells
-    /// around. They hold the rest of what a training has taken away, with sharp borders, and show
-    /// as faint dots before the background. A group with a dense cell stays, however small.
+    /// Empties specks: connected groups of at most 27 thin cells. Training leaves them where it has
+    /// removed density, and they show as faint dots in front of the background. A group with a
+    /// dense cell stays, however small.
     pub fn remove_specks(&mut self) {
         let is_speck = specks(&self.occupancy);
         let cells: Vec<Cell> = (0..CELLS)
@@ -33,7 +35,7 @@ fn specks(occupancy: &Occupancy) -> Vec<bool> {
     is_speck
 }
 
-/// Lists the occupied cells that hang together with one, by sides, edges or corners.
+/// Lists the occupied cells that are connected to one, by faces, edges or corners.
 fn gather(occupancy: &Occupancy, first: usize, is_seen: &mut [bool], group: &mut Vec<usize>) {
     group.clear();
     group.push(first);
@@ -62,7 +64,7 @@ mod tests {
         x + GRID * (y + GRID * z)
     }
 
-    /// Which of some cells are left, where they hold something and all else is empty.
+    /// Which of the held cells are left without specks, where all other cells are empty.
     fn left(held: &[(usize, Cell)]) -> Vec<bool> {
         let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
         let of = |cell: usize| held.iter().find(|(at, _)| *at == cell).map_or(Cell::Empty, |h| h.1);
@@ -87,9 +89,9 @@ mod tests {
         assert_eq!(left(&with_dense), [true; 3]);
     }
 
-    /// Groups hang together by corners, also of bricks. They don't around the cube's sides.
+    /// Cells are connected by corners, also of bricks. Opposite faces of the cube aren't.
     #[test]
-    fn corners_hang_together() {
+    fn corners_connect() {
         let diagonal = |n: usize| thin((0..n).map(|i| cell(i, i, 127 - i)));
         assert!(left(&diagonal(SPECK_CELLS + 1)).iter().all(|left| *left));
         let mut beside = diagonal(1);
@@ -102,8 +104,10 @@ mod tests {
 
     #[test]
     fn nothing_and_everything_stay() {
-        assert!(left(&[]).is_empty());
         let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
+        field.occupancy.set(|_| Cell::Empty);
+        field.remove_specks();
+        assert_eq!(field.occupancy.cells().count(), 0);
         field.occupancy.set(|_| Cell::Thin);
         field.remove_specks();
         assert_eq!(field.occupancy.cells().count(), CELLS);

@@ -2,7 +2,6 @@ use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView, View};
-
 use scene::Bounds;
 
 use crate::ranges::OutOfRange;
@@ -34,16 +33,16 @@ pub enum FieldProblem {
     /// The file isn't one of tensors.
     #[error(transparent)]
     NotTensors(#[from] SafeTensorError),
-    /// A tensor is missing.
+    /// A tensor can't be had.
     #[error("tensor {name}: {problem}")]
     Missing {
         /// The tensor.
         name: String,
-        /// Why it can't be had.
+        /// Why.
         problem: SafeTensorError,
     },
     /// A tensor has another type or length.
-    #[error("tensor {name}: {found:?} {shape:?} where {expected} are expected")]
+    #[error("tensor {name}: {found:?} {shape:?} where {count} {expected} are expected")]
     Unexpected {
         /// The tensor.
         name: String,
@@ -51,8 +50,10 @@ pub enum FieldProblem {
         found: Dtype,
         /// Its shape.
         shape: Vec<usize>,
-        /// How many numbers of which type a reader expects, in words.
-        expected: String,
+        /// How many numbers a reader expects.
+        count: usize,
+        /// Their type.
+        expected: &'static str,
     },
     /// No field has such an architecture.
     #[error(transparent)]
@@ -129,7 +130,7 @@ pub(crate) fn read_f32(
     let tensor = named(tensors, name)?;
     let (data, rest) = tensor.data().as_chunks::<4>();
     if tensor.dtype() != Dtype::F32 || data.len() != into.len() || !rest.is_empty() {
-        return Err(unexpected(&tensor, name, format!("{} f32", into.len())));
+        return Err(unexpected(&tensor, name, into.len(), "f32"));
     }
     for (value, bytes) in into.iter_mut().zip(data) {
         *value = f32::from_le_bytes(*bytes);
@@ -144,7 +145,7 @@ pub(crate) fn read_u8(
 ) -> Result<Vec<u8>, FieldProblem> {
     let tensor = named(tensors, name)?;
     if tensor.dtype() != Dtype::U8 || tensor.data().len() != len {
-        return Err(unexpected(&tensor, name, format!("{len} u8")));
+        return Err(unexpected(&tensor, name, len, "u8"));
     }
     Ok(tensor.data().to_vec())
 }
@@ -154,7 +155,12 @@ fn named<'a>(tensors: &SafeTensors<'a>, name: &str) -> Result<TensorView<'a>, Fi
     tensors.tensor(name).map_err(missing)
 }
 
-fn unexpected(tensor: &TensorView<'_>, name: &str, expected: String) -> FieldProblem {
+fn unexpected(
+    tensor: &TensorView<'_>,
+    name: &str,
+    count: usize,
+    expected: &'static str,
+) -> FieldProblem {
     let (found, shape) = (tensor.dtype(), tensor.shape().to_vec());
-    FieldProblem::Unexpected { name: name.to_owned(), found, shape, expected }
+    FieldProblem::Unexpected { name: name.to_owned(), found, shape, count, expected }
 }

@@ -1,0 +1,225 @@
+use std::path::{Path, PathBuf};
+
+use scene::Distortion;
+
+use crate::misplaced::{Misplaced, shown};
+use crate::npy::ArrayReason;
+
+/// Why a file isn't of its form. Text of the file is as it is there; [`DatasetError`] escapes it.
+///
+/// [`DatasetError`]: crate::DatasetError
+#[derive(Debug, thiserror::Error)]
+pub enum FileReason {
+    /// Something about a line of a text file.
+    #[error("line {line}: {reason}")]
+    Line {
+        /// Which, counted from 1.
+        line: usize,
+        /// What is wrong there.
+        reason: Box<Self>,
+    },
+    /// Something about a place in a binary file.
+    #[error("byte {byte}: {reason}")]
+    Byte {
+        /// How many bytes are before it.
+        byte: usize,
+        /// What is wrong there.
+        reason: Box<Self>,
+    },
+    /// Something about a camera of a binary file.
+    #[error("camera {id}: {reason}")]
+    Camera {
+        /// Its number.
+        id: u32,
+        /// What is wrong with it.
+        reason: Box<Self>,
+    },
+    /// Something about an image of a binary file.
+    #[error("image {id} ({name}): {reason}")]
+    Image {
+        /// Its number.
+        id: u32,
+        /// Its name.
+        name: String,
+        /// What is wrong with it.
+        reason: Box<Self>,
+    },
+    /// Text that is encoded otherwise.
+    #[error("is UTF-16; save it as UTF-8")]
+    Utf16,
+    /// Text that isn't.
+    #[error("{word} is not UTF-8; save the file as UTF-8, and rename what it names so")]
+    NoText {
+        /// The first word that isn't, its bytes spelled out.
+        word: String,
+    },
+    /// A name in a binary file that isn't text.
+    #[error("{what}, {name}, is not UTF-8; rename the file, and make the model again")]
+    NoName {
+        /// Whose name.
+        what: &'static str,
+        /// The name, its bytes spelled out.
+        name: String,
+    },
+    /// It isn't the JSON that was expected.
+    #[error(transparent)]
+    Json(#[from] serde_json::Error),
+    /// It isn't the array that was expected.
+    #[error("not a NumPy array of N×{columns} numbers: {reason}")]
+    Array {
+        /// Numbers of a row.
+        columns: usize,
+        /// What is wrong with it.
+        reason: ArrayReason,
+    },
+    /// Something is missing.
+    #[error("{what} is missing")]
+    Missing {
+        /// What.
+        what: &'static str,
+    },
+    /// A word isn't a number.
+    #[error("{what}: {word:?} is not a number of its kind")]
+    NoNumber {
+        /// What it is to say.
+        what: &'static str,
+        /// The word.
+        word: String,
+    },
+    /// It ends too early.
+    #[error("the file ends within {what}; it is cut short, copy it again")]
+    CutShort {
+        /// Where.
+        what: &'static str,
+    },
+    /// Text without an end.
+    #[error("{what} doesn't end")]
+    Endless {
+        /// What text.
+        what: &'static str,
+    },
+    /// It claims more than it holds.
+    #[error("{count} {what} can't be in the {left} bytes that follow")]
+    TooMany {
+        /// How much it claims.
+        count: u64,
+        /// Of what.
+        what: &'static str,
+        /// The bytes that there are.
+        left: usize,
+    },
+    /// It ends too late.
+    #[error("there is more after the last of the {what}; is it another file?")]
+    More {
+        /// What it lists.
+        what: &'static str,
+    },
+    /// A number of no camera model.
+    #[error("camera {id} has model {model}, which COLMAP doesn't have")]
+    ModelNumber {
+        /// The camera.
+        id: u32,
+        /// The number.
+        model: u32,
+    },
+    /// A name of no camera model.
+    #[error("camera model {model:?} is none of COLMAP's")]
+    ModelName {
+        /// The name.
+        model: String,
+    },
+    /// A camera model that isn't read.
+    #[error("camera model {model} is not supported; undistort first (colmap image_undistorter)")]
+    Model {
+        /// Its name.
+        model: String,
+    },
+    /// A camera model with too many parameters or too few.
+    #[error("{model} has {expected} parameters, not {found}")]
+    Parameters {
+        /// Its name.
+        model: String,
+        /// How many it has.
+        expected: usize,
+        /// How many there are.
+        found: usize,
+    },
+    /// A size that no image has.
+    #[error("its size is {width}×{height}")]
+    Size {
+        /// Columns.
+        width: u64,
+        /// Rows.
+        height: u64,
+    },
+    /// A quaternion that is no rotation.
+    #[error("its rotation ({}, {}, {}, {}) is none", .0[0], .0[1], .0[2], .0[3])]
+    Rotation([f64; 4]),
+    /// A list of frames has none.
+    #[error("`frames` is empty; at least one view is needed")]
+    NoFrames,
+    /// A model has no images.
+    #[error("it has no images; at least one is needed")]
+    NoImages,
+    /// None of the images that it names is there.
+    #[error("not one of its {count} images is {}, first {first}", place(folder.as_deref()))]
+    ImagesMissing {
+        /// How many it names.
+        count: usize,
+        /// Where they should be, if all in one folder.
+        folder: Option<PathBuf>,
+        /// The first.
+        first: String,
+    },
+    /// No folder has an image for every pose.
+    #[error("{poses} poses, but {}; images and poses must be as many", listed(folders))]
+    Counts {
+        /// How many poses there are.
+        poses: usize,
+        /// The folders of images.
+        folders: Vec<ImageFolder>,
+    },
+    /// Distortion that can't be undone.
+    #[error("lens distortion {0} leaves no pinhole's image; are its coefficients right?")]
+    Distortion(Distortion),
+}
+
+impl FileReason {
+    pub(crate) fn on_line(self, line: usize) -> Self {
+        Self::Line { line, reason: Box::new(self) }
+    }
+
+    pub(crate) fn of_camera(self, id: u32) -> Self {
+        Self::Camera { id, reason: Box::new(self) }
+    }
+
+    pub(crate) fn of_image(self, id: u32, name: &str) -> Self {
+        Self::Image { id, name: name.to_owned(), reason: Box::new(self) }
+    }
+}
+
+/// A folder with images.
+#[derive(Debug)]
+pub struct ImageFolder {
+    /// Its name.
+    pub name: String,
+    /// How many it has.
+    pub images: usize,
+    /// The first thing in it that is named like an image and can't be read.
+    pub odd: Option<Misplaced>,
+}
+
+fn place(folder: Option<&Path>) -> String {
+    folder.map_or_else(|| "there".to_owned(), |folder| format!("in {}", shown(folder)))
+}
+
+fn listed(folders: &[ImageFolder]) -> String {
+    if folders.is_empty() {
+        return "there is no folder images".to_owned();
+    }
+    let one = |ImageFolder { name, images, odd }: &ImageFolder| {
+        let odd = odd.as_ref().map(|odd| format!(" ({odd})")).unwrap_or_default();
+        format!("{name} has {images}{odd}")
+    };
+    folders.iter().map(one).collect::<Vec<_>>().join(", ")
+}

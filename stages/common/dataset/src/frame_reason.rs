@@ -1,0 +1,109 @@
+use artifact::PathError;
+use scene::CameraError;
+
+use crate::misplaced::Misplaced;
+
+/// Why a frame can't be used. Text of a file is as it is there; [`DatasetError`] escapes it.
+///
+/// [`DatasetError`]: crate::DatasetError
+#[derive(Debug, thiserror::Error)]
+pub enum FrameReason {
+    /// The path of its image, mask or depth.
+    #[error(transparent)]
+    Path(#[from] PathError),
+    /// Its image can't be read.
+    #[error(transparent)]
+    Pixels(#[from] pixels::PixelError),
+    /// It has no camera that can be.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// Its pose is none.
+    #[error("transform_matrix: {0}")]
+    Pose(CameraError),
+    /// A pose of another size.
+    #[error("transform_matrix must have 4 rows of 4 numbers")]
+    Matrix,
+    /// An image, mask or depth isn't where it should be.
+    #[error("{found}; {remedy}")]
+    Place {
+        /// What stands there.
+        found: Misplaced,
+        /// What to do.
+        remedy: &'static str,
+    },
+    /// Its camera isn't listed.
+    #[error("there is no camera {id}")]
+    NoCamera {
+        /// The camera's number.
+        id: u32,
+    },
+    /// Something about a camera that is listed.
+    #[error("{reason} (camera {id})")]
+    OfCamera {
+        /// The camera's number.
+        id: u32,
+        /// What is wrong.
+        reason: Box<Self>,
+    },
+    /// Image and camera have different shapes.
+    #[error(
+        "the image has {}×{} pixels, its camera {}×{}: another shape",
+        image.0, image.1, camera.0, camera.1
+    )]
+    Shape {
+        /// The image's columns and rows.
+        image: (u32, u32),
+        /// The camera's.
+        camera: (u32, u32),
+    },
+    /// A side of an image without pixels.
+    #[error("{name} is {value}; an image has at least one pixel")]
+    Empty {
+        /// Which.
+        name: &'static str,
+        /// Its length.
+        value: f64,
+    },
+    /// Depths that contradict each other.
+    #[error("its bounds are {near} and {far}; 0 < near < far is expected")]
+    Depths {
+        /// Of the nearest point.
+        near: f64,
+        /// Of the farthest.
+        far: f64,
+    },
+    /// A camera model that isn't read.
+    #[error(
+        "camera_model {model:?} is not supported; undistort the images first (colmap \
+        image_undistorter)"
+    )]
+    Model {
+        /// Its name.
+        model: String,
+    },
+    /// A fisheye lens.
+    #[error("fisheye lenses are not supported; undistort the images first")]
+    Fisheye,
+    /// Nothing says how wide it looks.
+    #[error("no focal length: neither fl_x nor camera_angle_x is given")]
+    NoFocalLength,
+    /// An angle of view that no pinhole has.
+    #[error("{name} is {angle}: focal length {focal}; the angle must lie between 0 and π")]
+    Angle {
+        /// What says it.
+        name: &'static str,
+        /// The angle.
+        angle: f64,
+        /// The focal length that follows, in image sides.
+        focal: f64,
+    },
+    /// Another frame has its name.
+    #[error("a second view named {name:?}; file names must differ")]
+    SecondName {
+        /// The name.
+        name: String,
+    },
+    /// A name that isn't text.
+    #[error("its name is not UTF-8; rename the file")]
+    NoName,
+}
