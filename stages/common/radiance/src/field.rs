@@ -167,7 +167,7 @@ impl Field {
 fn check(architecture: &Architecture, bounds: &Bounds) -> Result<(), FieldProblem> {
     architecture.check()?;
     if !bounds.is_valid() {
-        return Err(FieldProblem::NoInside(*bounds));
+        return Err(FieldProblem::NoInside(Box::new(*bounds)));
     }
     Ok(())
 }

@@ -60,7 +60,7 @@ pub enum FieldProblem {
     Architecture(#[from] OutOfRange),
     /// Nothing lies inside the bounds.
     #[error("the box {0:?} has no inside")]
-    NoInside(Bounds),
+    NoInside(Box<Bounds>),
     /// A parameter isn't finite.
     #[error("a parameter is not finite")]
     NotFinite,
