@@ -270,17 +270,18 @@ mod tests {
 
     use super::*;
 
-    /// A small field with two thin cells, one of them beside a dense cell.
+    /// A small field with two thin cells, one of them beside an opaque cell.
     fn field() -> Field {
         let architecture = Architecture { levels: 2, log2_entries: 8, ..Architecture::default() };
         let bounds =
             Bounds { min: [-1.0; 3], max: [1.0; 3], near: 2.0, far: 6.0, ..Bounds::default() };
         let mut field = Field::new(architecture, bounds, 1);
         let (.., occupancy) = field.parts_mut();
-        let (density, mut cells) = (occupancy.density().to_vec(), occupancy.to_bytes());
-        cells.fill(0);
+        let (mut density, mut cells) =
+            (occupancy.density().to_vec(), vec![0; occupancy.density().len()]);
+        density[5000..5002].copy_from_slice(&[10.0, 1000.0]);
         cells[5000..5002].copy_from_slice(&[1, 2]);
-        cells[9000] = 1;
+        (density[9000], cells[9000]) = (10.0, 1);
         occupancy.restore(density, &cells);
         field
     }

@@ -1,15 +1,23 @@
 //! Removes specks from the occupancy of a trained field.
 
+use std::f32::consts::LN_2;
+
 use crate::field::Field;
 use crate::occupancy::{CELLS, Cell, Occupancy, around};
+use crate::spec::OCCUPANCY_CELLS as GRID;
 
 /// Most cells of a speck: 3³.
 const SPECK_CELLS: usize = 27;
+/// Density, for a cube side, from which a cell stops half of the light that crosses it.
+const HALF_OPAQUE: f32 = LN_2 * GRID as f32;
 
 impl Field {
-    /// Empties specks: connected groups of at most 27 thin cells. Training leaves them where it has
-    /// removed density, and they show as faint dots in front of the background. A group with a
-    /// dense cell stays, however small.
+    /// Empties specks: connected groups of at most 27 cells, none of which stops half of the light
+    /// that crosses it. Training leaves them where it has removed density, and they show as faint
+    /// dots in front of the background. A group with a more opaque cell stays, however small.
+    ///
+    /// Takes the densities that a training has found; a field from a file has none, and stays as it
+    /// is.
     pub fn remove_specks(&mut self) {
         let is_speck = specks(&self.occupancy);
         let cells: Vec<Cell> = (0..CELLS)
@@ -23,11 +31,12 @@ impl Field {
 fn specks(occupancy: &Occupancy) -> Vec<bool> {
     let (mut is_seen, mut is_speck) = (vec![false; CELLS], vec![false; CELLS]);
     let mut group = Vec::new();
+    // Below 0 the density isn't known.
+    let is_faint = |&cell: &usize| (0.0..HALF_OPAQUE).contains(&occupancy.density()[cell]);
     for cell in occupancy.cells() {
         if !is_seen[cell] {
             gather(occupancy, cell, &mut is_seen, &mut group);
-            let is_thin = |&cell: &usize| occupancy.cell(cell) == Cell::Thin;
-            if group.len() <= SPECK_CELLS && group.iter().all(is_thin) {
+            if group.len() <= SPECK_CELLS && group.iter().all(is_faint) {
                 group.iter().for_each(|&cell| is_speck[cell] = true);
             }
         }
@@ -58,58 +67,68 @@ mod tests {
 
     use super::*;
     use crate::architecture::Architecture;
-    use crate::spec::OCCUPANCY_CELLS as GRID;
+
+    const FAINT: f32 = 0.9 * HALF_OPAQUE;
+    const OPAQUE: f32 = 1.1 * HALF_OPAQUE;
 
     fn cell(x: usize, y: usize, z: usize) -> usize {
         x + GRID * (y + GRID * z)
     }
 
-    /// Which of the held cells are left without specks, where all other cells are empty.
-    fn left(held: &[(usize, Cell)]) -> Vec<bool> {
+    /// Which of the held cells, each with its density, are left without specks, where all other
+    /// cells are empty.
+    fn left(held: &[(usize, f32)]) -> Vec<bool> {
         let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
-        let of = |cell: usize| held.iter().find(|(at, _)| *at == cell).map_or(Cell::Empty, |h| h.1);
-        field.occupancy.set(of);
+        let (mut density, mut cells) = (vec![0.0; CELLS], vec![0; CELLS]);
+        for &(cell, of_cell) in held {
+            (density[cell], cells[cell]) = (of_cell, 1 + (cell % 2) as u8);
+        }
+        field.occupancy.restore(density, &cells);
         field.remove_specks();
-        let kept: Vec<usize> = field.occupancy.cells().collect();
-        assert!(kept.iter().all(|&cell| of(cell) == field.occupancy.cell(cell)), "none changes");
-        held.iter().map(|(cell, _)| kept.contains(cell)).collect()
+        let kept = field.occupancy.to_bytes();
+        assert!((0..CELLS).all(|cell| [0, cells[cell]].contains(&kept[cell])), "none changes");
+        held.iter().map(|(cell, _)| kept[*cell] != 0).collect()
     }
 
-    fn thin(cells: impl IntoIterator<Item = usize>) -> Vec<(usize, Cell)> {
-        cells.into_iter().map(|cell| (cell, Cell::Thin)).collect()
+    fn faint(cells: impl IntoIterator<Item = usize>) -> Vec<(usize, f32)> {
+        cells.into_iter().map(|cell| (cell, FAINT)).collect()
     }
 
     #[test]
-    fn only_small_thin_groups_are_specks() {
-        let row = |n: usize| thin((0..n).map(|x| cell(x + 50, 7, 127)));
+    fn only_small_faint_groups_are_specks() {
+        let row = |n: usize| faint((0..n).map(|x| cell(x + 50, 7, 127)));
         assert!(left(&row(SPECK_CELLS)).iter().all(|left| !left));
         assert!(left(&row(SPECK_CELLS + 1)).iter().all(|left| *left));
-        let mut with_dense = row(3);
-        with_dense[2].1 = Cell::Dense;
-        assert_eq!(left(&with_dense), [true; 3]);
+        for density in [OPAQUE, -1.0] {
+            let mut with_opaque = row(3);
+            with_opaque[2].1 = density;
+            assert_eq!(left(&with_opaque), [true; 3], "{density}");
+        }
     }
 
     /// Cells are connected by corners, also of bricks. Opposite faces of the cube aren't.
     #[test]
     fn corners_connect() {
-        let diagonal = |n: usize| thin((0..n).map(|i| cell(i, i, 127 - i)));
+        let diagonal = |n: usize| faint((0..n).map(|i| cell(i, i, 127 - i)));
         assert!(left(&diagonal(SPECK_CELLS + 1)).iter().all(|left| *left));
         let mut beside = diagonal(1);
-        beside.push((cell(2, 0, 127), Cell::Dense));
+        beside.push((cell(2, 0, 127), OPAQUE));
         assert_eq!(left(&beside), [false, true]);
         // Neighbours by number, at opposite sides of the cube.
-        let wrapped = [(cell(127, 4, 4), Cell::Thin), (cell(0, 5, 4), Cell::Dense)];
-        assert_eq!(left(&wrapped), [false, true]);
+        assert_eq!(
+            left(&[(cell(127, 4, 4), FAINT), (cell(0, 5, 4), OPAQUE)]),
+            [false, true],
+            "not connected"
+        );
     }
 
     #[test]
     fn nothing_and_everything_stay() {
-        let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
-        field.occupancy.set(|_| Cell::Empty);
-        field.remove_specks();
-        assert_eq!(field.occupancy.cells().count(), 0);
-        field.occupancy.set(|_| Cell::Thin);
-        field.remove_specks();
-        assert_eq!(field.occupancy.cells().count(), CELLS);
+        for byte in [0, 1] {
+            let mut field = Field::new(Architecture::default(), Bounds::default(), 1);
+            field.occupancy.restore(vec![0.0; CELLS], &vec![byte; CELLS]);
+            field.remove_specks();
+            assert_eq!(field.occupancy.cells().count(), CELLS * usize::from(byte));
+        }
     }
 }
