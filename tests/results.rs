@@ -27,7 +27,7 @@ const SMALL_IN_PAPER_TABLE: [(&str, &str); 6] = [
     ("rays: 8000000}", "rays: 10000, views-low.size: 24, prep-hr.lr_width: 48}"),
     ("rays: 16000000}", "rays: 10000, views-low.size: 12, prep-hr.lr_width: 48}"),
     ("rays: 20000000}", "rays: 10000, views-low.size: 22, prep-hr.lr_width: 44}"),
-    ("rays: 17500000}", "rays: 10000, views-low.size: 11, prep-hr.lr_width: 44}"),
+    ("rays: 16500000}", "rays: 10000, views-low.size: 11, prep-hr.lr_width: 44}"),
     ("      views-low.size: \"{width}\"\n", ""),
     ("      prep-hr.lr_width: \"{hr_width}\"\n", ""),
 ];
