@@ -3,7 +3,8 @@ use artifact::Failure;
 use crate::bounds::SpaceError;
 use crate::sizes::{SizeError, Sizes};
 
-/// Parameters that a data set can't have.
+/// Parameters that a data set can't have. Functions fail with a [`Failure`] made of it, which has
+/// the exit code.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum ParameterError {
     #[error(
@@ -34,7 +35,6 @@ pub(crate) enum ParameterError {
     NearAndFar { near: f64, far: f64 },
 }
 
-// Explicitly by `map_err`: `?` alone would lose the exit code.
 impl From<ParameterError> for Failure {
     fn from(error: ParameterError) -> Self {
         Self::Usage(error.to_string())

@@ -1,4 +1,4 @@
-use artifact::counted;
+use artifact::{Failure, counted};
 use dataset::{Dataset, Split};
 use pixels::Kernel;
 use scene::{Camera, Intrinsics};
@@ -22,20 +22,16 @@ pub(crate) struct ImagePlan {
 
 impl ImagePlan {
     /// Of a data set's training and test views. What parameters can't have is said.
-    pub(crate) fn new(
-        set: &Dataset,
-        split: &Split,
-        params: &Params,
-    ) -> Result<Self, ParameterError> {
+    pub(crate) fn new(set: &Dataset, split: &Split, params: &Params) -> Result<Self, Failure> {
         let has_truth = match params.lr_source {
             Some(source) => source == LrSource::Downscaled,
             None => set.format.is_benchmark() || params.lr_width.is_some(),
         };
         if !has_truth && params.lr_width.is_some() {
-            return Err(ParameterError::WidthOfPhotographs);
+            return Err(ParameterError::WidthOfPhotographs.into());
         }
         if !has_truth && params.kernel == Some(Kernel::Average) {
-            return Err(ParameterError::AssumedAverage);
+            return Err(ParameterError::AssumedAverage.into());
         }
         let kernel = params.kernel.unwrap_or(if has_truth { Kernel::Lanczos } else { Kernel::Box });
         let first = set.frames[split.train[0]].intrinsics();
@@ -54,7 +50,7 @@ impl ImagePlan {
                 .chain(&split.test)
                 .map(|&i| plan.sizes_of(&set.frames[i].intrinsics()));
             if let Some(odd) = all.find(|sizes| !sizes.is_integer()) {
-                return Err(ParameterError::UnevenAverage(odd));
+                return Err(ParameterError::UnevenAverage(odd).into());
             }
         }
         Ok(plan)

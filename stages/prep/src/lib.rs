@@ -89,16 +89,15 @@ impl Stage for Prep {
 
     fn run(context: &Context, params: &Params) -> anyhow::Result<()> {
         let set = dataset(context, params)?;
-        let split = split(&set, params).map_err(Failure::from)?;
+        let split = split(&set, params)?;
         let warnings = warnings_of_poses(&set, &split).bad_input("dataset")?;
-        let images = ImagePlan::new(&set, &split, params).map_err(Failure::from)?;
+        let images = ImagePlan::new(&set, &split, params)?;
         let mut notes: Vec<String> =
             set.notes.iter().cloned().chain([images.choice(&split)]).chain(warnings).collect();
         notes.iter().for_each(|note| context.say(note));
         let training: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let (background, sign) = background(params, &training)?;
-        let plan =
-            ScenePlan::new(&set, &split, params, images, background).map_err(Failure::from)?;
+        let plan = ScenePlan::new(&set, &split, params, images, background)?;
         for note in sign.into_iter().chain([space_note(&plan.bounds, background)]) {
             context.say(&note);
             notes.push(note);

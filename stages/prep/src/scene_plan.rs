@@ -1,4 +1,4 @@
-use artifact::WARNING;
+use artifact::{Failure, WARNING};
 use dataset::{Dataset, Frame, Split};
 use scene::{Background, Bounds, Camera, Space};
 
@@ -27,7 +27,7 @@ impl<'a> ScenePlan<'a> {
         params: &Params,
         images: ImagePlan,
         background: Background,
-    ) -> Result<Self, ParameterError> {
+    ) -> Result<Self, Failure> {
         let train: Vec<&Frame> = split.train.iter().map(|&i| &set.frames[i]).collect();
         let test: Vec<&Frame> = split.test.iter().map(|&i| &set.frames[i]).collect();
         let bounds = bounds(&train, &test, params, background)?;
@@ -44,7 +44,7 @@ fn bounds(
     test: &[&Frame],
     params: &Params,
     background: Background,
-) -> Result<Bounds, ParameterError> {
+) -> Result<Bounds, Failure> {
     // What the user says of all views stands in for what isn't known of each.
     let given = params
         .near
@@ -53,13 +53,13 @@ fn bounds(
         .filter(|[near, far]| 0.0 < *near && near < far);
     let (train, test) = (sights(train, given), sights(test, given));
     let goes_on = background == Background::Opaque;
-    let mut bounds = place(&train, &test, goes_on, params.space)?;
+    let mut bounds = place(&train, &test, goes_on, params.space).map_err(ParameterError::from)?;
     for (name, given, bound) in
         [("near", params.near, &mut bounds.near), ("far", params.far, &mut bounds.far)]
     {
         if let Some(value) = given {
             if !value.is_finite() {
-                return Err(ParameterError::NoDistance { name, value });
+                return Err(ParameterError::NoDistance { name, value }.into());
             }
             *bound = value;
         }
@@ -68,7 +68,7 @@ fn bounds(
         frustum.far = frustum.far.min(far);
     }
     if bounds.near >= bounds.far || !bounds.is_valid() {
-        return Err(ParameterError::NearAndFar { near: bounds.near, far: bounds.far });
+        return Err(ParameterError::NearAndFar { near: bounds.near, far: bounds.far }.into());
     }
     Ok(bounds)
 }
@@ -165,7 +165,7 @@ mod tests {
         set: &Dataset,
         params: &Params,
         background: Background,
-    ) -> Result<(ImagePlan, Bounds, Vec<usize>), ParameterError> {
+    ) -> Result<(ImagePlan, Bounds, Vec<usize>), Failure> {
         let split = split(set, params)?;
         let images = ImagePlan::new(set, &split, params)?;
         let plan = ScenePlan::new(set, &split, params, images, background)?;
@@ -195,7 +195,7 @@ mod tests {
         set: &Dataset,
         near: Option<f64>,
         far: Option<f64>,
-    ) -> Result<(f64, f64), ParameterError> {
+    ) -> Result<(f64, f64), Failure> {
         let params = Params { near, far, ..Params::default() };
         planned(set, &params, Background::White).map(|(_, bounds, _)| (bounds.near, bounds.far))
     }

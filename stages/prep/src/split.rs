@@ -1,3 +1,4 @@
+use artifact::Failure;
 use dataset::{Dataset, Split};
 
 use crate::error::ParameterError;
@@ -8,7 +9,7 @@ use crate::references;
 const HOLD_OUT_EVERY: usize = 8;
 
 /// Which frames are for what, no more test views than asked for.
-pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, ParameterError> {
+pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, Failure> {
     let mut split = all_views(set, params)?;
     if let Some(most) = params.test_views {
         let (most, all) = (most as usize, split.test.len());
@@ -19,11 +20,11 @@ pub(crate) fn split(set: &Dataset, params: &Params) -> Result<Split, ParameterEr
     Ok(split)
 }
 
-fn all_views(set: &Dataset, params: &Params) -> Result<Split, ParameterError> {
+fn all_views(set: &Dataset, params: &Params) -> Result<Split, Failure> {
     let count = set.frames.len();
     match (params.split, &set.split) {
         (Some(SplitKind::Given) | None, Some(given)) => Ok(given.clone()),
-        (Some(SplitKind::Given), None) => Err(ParameterError::NoSplit),
+        (Some(SplitKind::Given), None) => Err(ParameterError::NoSplit.into()),
         (Some(SplitKind::Holdout) | None, _) => Ok(Split::hold_out(count, HOLD_OUT_EVERY)),
         (Some(SplitKind::Paper), _) => {
             let mut split = Split::all(count);
