@@ -171,8 +171,8 @@ bench: build ## What the engine costs: rows of JSON in OUT=FILE (lego from DATA,
 	@against="$(abspath $(AGAINST))"; if [ -d "$$against" ]; then $(MAKE) -C "$$against" bench AGAINST= RAYS=$(BENCH_RAYS) DATA=$(abspath $(DATA)) OUT=$(abspath out/bench-against.json) && against=$(abspath out/bench-against.json) || exit; fi; \
 	  SCENE=$(abspath $(BENCH_SCENE)) OUT=$(abspath $(or $(OUT),out/bench.json)) SIMD=$(SIMD) RAYS=$(BENCH_RAYS) AGAINST="$$against" cargo bench --quiet -p train-ss --bench bench
 
-compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS="FACTOR …" SCENES="lego 100x2" PICTURE=FILE.svg
-	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
+compare-engines: build ## Train and render with this build and that of AGAINST=DIR, another built checkout; RAYS="FACTOR …" or BUDGETS=1, SCENES="lego 100x2" PICTURE=FILE.svg
+	@python3 scripts/compare-engines.py $(AGAINST) . --data $(DATA) $(if $(RAYS),--rays $(RAYS)) $(if $(BUDGETS),--budgets) $(if $(SCENES),--only "$(SCENES)") $(if $(PICTURE),--picture $(PICTURE))
 
 reference: build ## Make schemas/ and docs/reference/ anew, from the types and the built programs
 	UPDATE=1 cargo test --release --workspace --exclude $(REMOTE) --test schemas

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Compares what two builds' engines cost and bring, on withheld training views, one after the other in one run.
 
-compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ...] [--seeds N] [--picture FILE.svg]
+compare-engines.py OLD NEW [--data DIR] [--only NAME ...] [--rays FACTOR ... | --budgets] [--seeds N] [--picture FILE.svg]
 
 OLD and NEW are work trees, each built by `make build`. OLD prepares each scene, NEW scores the views of both; which of them trains
 first changes from seed to seed and from factor to factor. With several factors of the rays, --picture draws PSNR against training
-time. Times are by the clock; processor time, which a busy machine changes less, stands beside them and in the picture. Depth error
-is the mean of the views' median errors in scene units, where true depth is known; seen is the share of pixels whose depth agrees
-with a neighbouring view's. LPIPS needs DATA/weights.
+time. --budgets takes rays and other parameters from each build's own protocols (experiments/common.yaml). Times are by the clock;
+processor time, which a busy machine changes less, stands beside them and in the picture. Depth error is the mean of the views'
+median errors in scene units, where true depth is known; seen is the share of pixels whose depth agrees with a neighbouring view's.
+LPIPS needs DATA/weights.
 """
 
 import argparse
@@ -15,6 +16,7 @@ import itertools
 import json
 import os
 import pathlib
+import re
 import statistics
 import subprocess
 import sys
@@ -22,13 +24,17 @@ import tempfile
 import time
 from typing import NamedTuple
 
-# Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field.
+# Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field. Names of the others end with their protocol.
 SCENES = {
     "lego 100x2": ("nerf_synthetic/lego", 100, 2, 2_000_000),
     "lego 200x4": ("nerf_synthetic/lego", 200, 4, 2_000_000),
     "fern 252x4": ("nerf_llff_data/fern", 252, 4, 2_000_000),
     "demo with backdrop": (None, 100, 2, 1_500_000),
+    "lego 100x4": ("nerf_synthetic/lego", 100, 4, 2_000_000),
+    "lego 200x2": ("nerf_synthetic/lego", 200, 2, 2_000_000),
+    "fern 252x2": ("nerf_llff_data/fern", 252, 2, 2_000_000),
 }
+DEFAULT = list(SCENES)[:4]
 
 
 class Cost(NamedTuple):
@@ -91,13 +97,28 @@ class Result(NamedTuple):
         return f"| {self.scene} | {self.build} | {self.seed} | {self.rays / 1e6:g} M | {figures} | {os.getloadavg()[0]:.1f} |"
 
 
+def budget(tree: pathlib.Path, name: str) -> dict[str, dict[str, int]]:
+    """Each stage's parameters in the preset of a scene's protocol."""
+    protocol = name.split()[-1]
+    preset = re.search(rf"^    {protocol}:(.*?)^    \S", (tree / "experiments/common.yaml").read_text(), re.DOTALL | re.MULTILINE)
+    if preset is None:
+        sys.exit(f"{name}: {tree}/experiments/common.yaml has no protocol {protocol}; give scenes with a protocol by --only")
+    params = {}
+    for stage, key, value in re.findall(r"([a-z-]+)\.(\w+): (\d+)", preset[1]):
+        params.setdefault(stage, {})[key] = int(value)
+    return params
+
+
 def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int, factor: float) -> Result:
     _, _, scale, rays = SCENES[name]
-    rays = int(rays * factor)
-    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed}
-    tree, at = getattr(options, build), f"{build}-{seed}-{rays}"
+    tree = getattr(options, build)
+    own = budget(tree, name) if options.budgets else {}
+    trained = own.get("train-ss", {"rays": int(rays * factor)})
+    rays = trained.pop("rays")
+    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed} | trained
+    at = f"{build}-{seed}-{rays}"
     training = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
-    rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, {})
+    rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, own.get("render-depth", {}))
     weights = (options.data / "weights").resolve()
     inputs = {"views": f"{at}/views", "truth": "scene/truth"} | ({"weights": str(weights)} if weights.is_dir() else {})
     run(options.new, "eval", folder, f"{at}/eval", inputs, {})
@@ -156,8 +177,10 @@ def main() -> None:
     parser.add_argument("old", type=pathlib.Path)
     parser.add_argument("new", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="scenes (default ../shared/data)")
-    parser.add_argument("--only", nargs="*", choices=SCENES, default=list(SCENES), help="which scenes (default all)")
-    parser.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors of the rays")
+    parser.add_argument("--only", nargs="*", choices=SCENES, default=DEFAULT, help=f"which scenes (default {', '.join(DEFAULT)})")
+    rays = parser.add_mutually_exclusive_group()
+    rays.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors of the rays")
+    rays.add_argument("--budgets", action="store_true", help="the rays of each build's own protocol, and its other parameters")
     parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
     options = parser.parse_args()
