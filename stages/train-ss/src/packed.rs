@@ -121,8 +121,8 @@ impl Bytes {
     }
 
     /// Loads the first and the last of some bytes that are soon read, if they are in memory: most
-    /// rows lie in two cache lines. Calls that follow each other wait for memory together; reads with
-    /// work between them would wait one by one.
+    /// rows lie in two cache lines. Calls that follow each other wait for memory together; reads
+    /// with work between them would wait one by one.
     pub(crate) fn touch(&self, range: &Range<usize>) {
         if let Self::Memory(bytes) = self
             && let Some(row) = bytes.get(range.clone())
