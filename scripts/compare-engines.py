@@ -24,7 +24,7 @@ import tempfile
 import time
 from typing import NamedTuple
 
-# Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field. Names of the others end with their protocol.
+# Data set (None is the demo scene with a backdrop), LR width, scale, rays of one field.
 SCENES = {
     "lego 100x2": ("nerf_synthetic/lego", 100, 2, 2_000_000),
     "lego 200x4": ("nerf_synthetic/lego", 200, 4, 2_000_000),
@@ -34,7 +34,10 @@ SCENES = {
     "lego 200x2": ("nerf_synthetic/lego", 200, 2, 2_000_000),
     "fern 252x2": ("nerf_llff_data/fern", 252, 2, 2_000_000),
 }
-DEFAULT = list(SCENES)[:4]
+# Compared by default, with few rays.
+SHORT = ["lego 100x2", "lego 200x4", "fern 252x4", "demo with backdrop"]
+# Scenes of the protocols in experiments/common.yaml, which end their names.
+PROTOCOLS = [name for name, (dataset, *_) in SCENES.items() if dataset]
 
 
 class Cost(NamedTuple):
@@ -97,25 +100,24 @@ class Result(NamedTuple):
         return f"| {self.scene} | {self.build} | {self.seed} | {self.rays / 1e6:g} M | {figures} | {os.getloadavg()[0]:.1f} |"
 
 
-def budget(tree: pathlib.Path, name: str) -> dict[str, dict[str, int]]:
-    """Each stage's parameters in the preset of a scene's protocol."""
-    protocol = name.split()[-1]
-    preset = re.search(rf"^    {protocol}:(.*?)^    \S", (tree / "experiments/common.yaml").read_text(), re.DOTALL | re.MULTILINE)
-    if preset is None:
-        sys.exit(f"{name}: {tree}/experiments/common.yaml has no protocol {protocol}; give scenes with a protocol by --only")
+def protocol(tree: pathlib.Path, name: str) -> dict[str, dict[str, int]]:
+    """Each stage's parameters in a build's protocol of a scene."""
+    width_and_scale = name.split()[-1]
+    preset = re.search(rf"^    {width_and_scale}:(.*?)^    \S", (tree / "experiments/common.yaml").read_text(), re.DOTALL | re.MULTILINE)
     params = {}
-    for stage, key, value in re.findall(r"([a-z-]+)\.(\w+): (\d+)", preset[1]):
+    for stage, key, value in re.findall(r"([a-z-]+)\.(\w+): (\d+)", preset[1] if preset else ""):
         params.setdefault(stage, {})[key] = int(value)
+    if "rays" not in params.get("train-ss", {}):
+        sys.exit(f"{tree}/experiments/common.yaml: protocol {width_and_scale} of {name} has no train-ss.rays")
     return params
 
 
 def measure(options: argparse.Namespace, folder: pathlib.Path, name: str, build: str, seed: int, factor: float) -> Result:
     _, _, scale, rays = SCENES[name]
     tree = getattr(options, build)
-    own = budget(tree, name) if options.budgets else {}
-    trained = own.get("train-ss", {"rays": int(rays * factor)})
-    rays = trained.pop("rays")
-    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed} | trained
+    own = protocol(tree, name) if options.budgets else {"train-ss": {"rays": int(rays * factor)}}
+    rays = own["train-ss"].pop("rays")
+    params = {"field": {"grid": {"rays": rays}}, "supersample": scale, "seed": seed} | own["train-ss"]
     at = f"{build}-{seed}-{rays}"
     training = run(tree, "train-ss", folder, f"{at}/field", {"scene": "scene/train"}, params)
     rendering = run(tree, "render-depth", folder, f"{at}/views", {"field": f"{at}/field", "cameras": "scene/truth"}, own.get("render-depth", {}))
@@ -177,16 +179,21 @@ def main() -> None:
     parser.add_argument("old", type=pathlib.Path)
     parser.add_argument("new", type=pathlib.Path)
     parser.add_argument("--data", type=pathlib.Path, default=pathlib.Path("../shared/data"), help="scenes (default ../shared/data)")
-    parser.add_argument("--only", nargs="*", choices=SCENES, default=DEFAULT, help=f"which scenes (default {', '.join(DEFAULT)})")
+    parser.add_argument("--only", nargs="*", choices=SCENES, help=f"which scenes (default {', '.join(SHORT)}; with --budgets all but the demo scene)")
     rays = parser.add_mutually_exclusive_group()
     rays.add_argument("--rays", type=float, nargs="+", default=[1.0], help="factors of the rays")
     rays.add_argument("--budgets", action="store_true", help="the rays of each build's own protocol, and its other parameters")
     parser.add_argument("--picture", type=pathlib.Path, help="an SVG of PSNR against training time")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each training")
     options = parser.parse_args()
+    names = options.only or (PROTOCOLS if options.budgets else SHORT)
+    if options.budgets:
+        # What is missing is said before hours of training.
+        for tree, name in itertools.product((options.old, options.new), names):
+            protocol(tree, name)
     print("| scene | build | seed | rays | PSNR | SSIM | LPIPS | depth error | seen | training (processor) | rendering (processor) | peak memory | load |\n" + "| --- " * 13 + "|")
     results = []
-    for name in options.only:
+    for name in names:
         with tempfile.TemporaryDirectory() as folder:
             prepare(options, pathlib.Path(folder), name)
             for seed, (turn, factor) in itertools.product(range(1, options.seeds + 1), enumerate(options.rays, 1)):
