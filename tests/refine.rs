@@ -122,7 +122,7 @@ fn a_block_follows_the_one_it_extends() {
         ("extends: nothing", &["pipeline.yaml:", "there is no stage \"nothing\""][..]),
         ("extends: downscaled-views", &["itself extends another"]),
         ("extends: train-ss\n    run: train-ss", &["give one of them"]),
-        ("like: train-ss", &["pipeline.yaml:", "`like` is called `extends` now"]),
+        ("like: train-ss", &["pipeline.yaml:", "unknown field `like`"]),
     ] {
         let changed = format!("{own}\n    {more}");
         project.replace(own, &changed);

@@ -9,7 +9,7 @@ use std::process::Command;
 use std::sync::LazyLock;
 use std::time::SystemTime;
 
-use contract::{Description, Named, RENAMES, Rename, Schema};
+use contract::Description;
 use schemars::{JsonSchema, schema_for};
 use serde_json::Value;
 
@@ -184,21 +184,6 @@ fn parameters_have_one_meaning() {
             names.dedup();
             assert_eq!(names.len(), count, "{}: {:?}", description.name, variant.variant);
         }
-    }
-}
-
-/// Every old name is gone, and every new one is there.
-#[test]
-fn renames_lead_to_names_that_are_there() {
-    let descriptions = descriptions();
-    for Rename { program, kind, old, new, .. } in RENAMES {
-        let description = descriptions.iter().find(|d| d.name == *program).expect(program);
-        let schema = Schema::new(program, &description.parameters).unwrap();
-        let names: Vec<&str> = match kind {
-            Named::Parameter => schema.names(),
-            Named::Input => description.inputs.keys().map(String::as_str).collect(),
-        };
-        assert!(names.contains(new) && !names.contains(old), "{program}: {old} → {new}");
     }
 }
 

@@ -4,7 +4,7 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::report_text;
-use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State, known_blocks};
+use planning::{Asking, Devices, Pipeline, Plan, PlanError, Request, State};
 use slurm::{Job, Queue, Slurm};
 use stage::check_device;
 use store::Store;
@@ -95,7 +95,7 @@ pub(crate) fn of_stage(plan: &Plan, stage: &str) -> Result<Vec<usize>, PlanError
         let known: BTreeSet<&str> = plan.nodes.iter().map(|n| n.stage.as_str()).collect();
         return Err(PlanError::Usage(format!(
             "no stage {stage:?} in this plan; {}",
-            known_blocks(stage, known)
+            artifact::known_names(stage, known)
         )));
     }
     Ok(found)

@@ -75,7 +75,7 @@ impl Description {
     /// Says what is wrong with a description that has the right form: what it names must be there,
     /// and its folders inside the output.
     pub fn check(&self) -> Result<(), DescriptionError> {
-        let schema = Schema::new(&self.name, &self.parameters)?;
+        let schema = Schema::new(&self.parameters)?;
         if self.name.is_empty() {
             return Err(DescriptionError::Unnamed);
         }

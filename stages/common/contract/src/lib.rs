@@ -15,7 +15,7 @@
 //! use serde_json::{Map, json};
 //!
 //! let properties = json!({"rays": {"type": "integer", "minimum": 1, "default": 5}});
-//! let schema = Schema::new("render", &json!({"properties": properties}))?;
+//! let schema = Schema::new(&json!({"properties": properties}))?;
 //! assert_eq!(schema.resolve(&Map::new()).unwrap(), json!({"rays": 5}));
 //! let none = Map::from_iter([("rays".to_owned(), json!(0))]);
 //! let problems = schema.resolve(&none).unwrap_err();
@@ -31,7 +31,6 @@ mod error;
 mod input;
 mod output;
 mod parameters;
-mod renames;
 mod rules;
 mod tagged;
 mod validator;
@@ -45,5 +44,4 @@ pub use error::{KeywordError, SchemaError};
 pub use input::Input;
 pub use output::Output;
 pub use parameters::{ParameterProblem, Schema};
-pub use renames::{Named, RENAMES, Rename, renamed, renamed_in};
 pub use rules::{GivenInputs, Rule, RuleError};

@@ -2,7 +2,6 @@ use artifact::{known_names, nearest};
 use serde_json::{Map, Value, json};
 
 use crate::error::SchemaError;
-use crate::renames::{Named, renamed};
 use crate::tagged::Tag;
 use crate::validator::{Misfit, Validator};
 use crate::values::Reader;
@@ -15,7 +14,6 @@ use crate::values::Reader;
 /// beside it. A name means one parameter of a variant at most.
 #[derive(Debug)]
 pub struct Schema {
-    program: String,
     /// One for each variant, the default's first; a single one where nothing is selected.
     forms: Vec<Form>,
     tag: Option<Tag>,
@@ -40,13 +38,13 @@ pub struct ParameterProblem {
 
 impl Schema {
     /// Compiles the schema that a program describes.
-    pub fn new(program: &str, schema: &Value) -> Result<Self, SchemaError> {
+    pub fn new(schema: &Value) -> Result<Self, SchemaError> {
         let tag = Tag::find(schema)?;
         let forms = match &tag {
             None => vec![Form::new(schema.clone())?],
             Some(tag) => tag.forms(schema).into_iter().map(Form::new).collect::<Result<_, _>>()?,
         };
-        Ok(Self { program: program.to_owned(), forms, tag })
+        Ok(Self { forms, tag })
     }
 
     /// Names of all parameters, sorted.
@@ -93,7 +91,7 @@ impl Schema {
             if form.property(name).is_some() {
                 resolved.insert(name.clone(), form.canonical_value(name, value));
             } else {
-                let problem = self.unknown(form, name, value);
+                let problem = self.unknown(form, name);
                 problems.push(ParameterProblem { name: name.clone(), problem });
             }
         }
@@ -124,11 +122,8 @@ impl Schema {
         &self.forms[selected.unwrap_or(0)]
     }
 
-    /// What to say of a parameter that there isn't.
-    fn unknown(&self, form: &Form, name: &str, value: &Value) -> String {
-        if let Some(rename) = renamed(Named::Parameter, &self.program, name) {
-            return rename.problem(Some(value));
-        }
+    /// Describes the problem of a parameter that doesn't exist.
+    fn unknown(&self, form: &Form, name: &str) -> String {
         let others = || self.forms.iter().position(|other| other.property(name).is_some());
         match &self.tag {
             Some(tag) if others().is_some() => tag.foreign(others().unwrap_or(0)),
@@ -246,28 +241,24 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::renames::RENAMES;
 
     fn schema() -> Schema {
-        Schema::new(
-            "x",
-            &json!({
-                "type": "object",
-                "additionalProperties": false,
-                "properties": {
-                    "scale": {"type": "integer", "format": "uint32", "minimum": 1, "default": 2},
-                    "rate": {"type": "number", "default": 2.0},
-                    "peak": {"type": "number", "default": 255},
-                    "width": {"type": ["integer", "null"], "default": null},
-                    "place": {"type": "array", "items": {"type": "number"}, "default": [1, 0.5]},
-                    "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
-                    "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}],
-                    "default": null}
-                },
-                "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"},
-                {"const": "lanczos", "type": "string"}]}}
-            }),
-        )
+        Schema::new(&json!({
+            "type": "object",
+            "additionalProperties": false,
+            "properties": {
+                "scale": {"type": "integer", "format": "uint32", "minimum": 1, "default": 2},
+                "rate": {"type": "number", "default": 2.0},
+                "peak": {"type": "number", "default": 255},
+                "width": {"type": ["integer", "null"], "default": null},
+                "place": {"type": "array", "items": {"type": "number"}, "default": [1, 0.5]},
+                "kernel": {"$ref": "#/$defs/Kernel", "default": "lanczos"},
+                "assumed": {"anyOf": [{"$ref": "#/$defs/Kernel"}, {"type": "null"}],
+                "default": null}
+            },
+            "$defs": {"Kernel": {"oneOf": [{"const": "box", "type": "string"},
+            {"const": "lanczos", "type": "string"}]}}
+        }))
         .unwrap()
     }
 
@@ -338,28 +329,6 @@ mod tests {
             let problems = resolve(&given).unwrap_err();
             assert_eq!(problems[0].name, name);
             assert!(problems[0].problem.contains(word), "{}", problems[0]);
-        }
-    }
-
-    /// Whoever gives an old name learns the new one, and what to write instead of an old value.
-    #[test]
-    fn every_old_name_is_refused_with_the_new_one() {
-        for rename in RENAMES.iter().filter(|rename| rename.kind == Named::Parameter) {
-            let schema =
-                Schema::new(rename.program, &json!({"properties": {rename.new: {}}})).unwrap();
-            let given = |value: &str| Map::from_iter([(rename.old.to_owned(), json!(value))]);
-            let says = |value: &str| schema.resolve(&given(value)).unwrap_err()[0].to_string();
-            assert_eq!(
-                says("1"),
-                format!("parameter {}: is called {} now", rename.old, rename.new)
-            );
-            for (old, write) in rename.values {
-                assert!(
-                    says(old).ends_with(&format!("; for {old} write {write}")),
-                    "{}",
-                    says(old)
-                );
-            }
         }
     }
 }

@@ -34,7 +34,7 @@ fn described() -> Value {
 }
 
 fn schema() -> Schema {
-    Schema::new("x", &described()).unwrap()
+    Schema::new(&described()).unwrap()
 }
 
 fn map(value: &Value) -> Map<String, Value> {
@@ -141,12 +141,12 @@ fn a_name_means_one_parameter() {
     let mut twice = described();
     twice["properties"]["layers"] = json!({"default": 1});
     assert!(
-        Schema::new("x", &twice)
+        Schema::new(&twice)
             .unwrap_err()
             .to_string()
             .contains("layers is a parameter beside field and inside its mlp")
     );
     let mut two = described();
     two["properties"]["other"] = two["properties"]["field"].clone();
-    assert!(Schema::new("x", &two).unwrap_err().to_string().contains("both select a variant"));
+    assert!(Schema::new(&two).unwrap_err().to_string().contains("both select a variant"));
 }

@@ -5,13 +5,11 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use artifact::known_names;
-use contract::{Named, renamed_in};
 use serde_json::Value;
 
 use crate::arguments;
 use crate::file::StageBlock;
 use crate::pipeline::Pipeline;
-use crate::renames::known_blocks;
 use crate::request::{PlanError, Request};
 use crate::stages::{Programs, StageProgram};
 
@@ -70,13 +68,6 @@ impl Kind {
         match self {
             Self::Parameter => "a",
             Self::Input => "an",
-        }
-    }
-
-    fn named(self) -> Named {
-        match self {
-            Self::Parameter => Named::Parameter,
-            Self::Input => Named::Input,
         }
     }
 
@@ -179,9 +170,8 @@ impl Scope<'_> {
         name: &str,
         value: &Value,
     ) -> Result<Setting, PlanError> {
-        let (stage, name) = self
-            .owner(kind, name, &value.to_string())
-            .map_err(|error| self.in_file(kind, name, error))?;
+        let (stage, name) =
+            self.owner(kind, name).map_err(|error| self.in_file(kind, name, error))?;
         let program = self.programs.require(&stage)?;
         let value = if kind == Kind::Parameter {
             program.schema.canonical_value(&name, value)
@@ -207,7 +197,7 @@ impl Scope<'_> {
         let usage = |problem: String| PlanError::Usage(format!("{given}: {problem}"));
         let (name, text) =
             text.split_once('=').ok_or_else(|| usage("expected NAME=VALUE[,VALUE…]".to_owned()))?;
-        let (stage, name) = self.owner(kind, name, text)?;
+        let (stage, name) = self.owner(kind, name)?;
         let program = self.programs.require(&stage)?;
         let values: Vec<(&str, Value)> = match kind {
             Kind::Parameter => {
@@ -246,28 +236,22 @@ impl Scope<'_> {
     /// The stage that a name belongs to, and the name without it. Where several stages have the
     /// name, that one is meant that the targets need; a block that extends another follows that
     /// one.
-    fn owner(&self, kind: Kind, name: &str, value: &str) -> Result<(String, String), PlanError> {
+    fn owner(&self, kind: Kind, name: &str) -> Result<(String, String), PlanError> {
         // A stage's own name may have a point.
         let mut splits = name.match_indices('.').map(|(at, _)| (&name[..at], &name[at + 1..]));
         let stated = splits
             .find(|(stage, _)| self.pipeline.stages.contains_key(*stage))
             .or_else(|| name.split_once('.'));
         if let Some((stage, own)) = stated {
-            return self.stated_owner(kind, (stage, own), value);
+            return self.stated_owner(kind, (stage, own));
         }
         let stages = self.pipeline.stages.keys();
         let with_name: Vec<&String> =
             stages.filter(|s| self.has(s, kind, name) && !self.follows(s, kind, name)).collect();
         let meant: Vec<&String> =
             with_name.iter().copied().filter(|s| self.needed.contains(*s)).collect();
-        // A stage that is needed had the name, and another one has it.
-        if meant.is_empty()
-            && let Some(problem) = self.renamed(kind, self.needed, name, value)
-        {
-            return Err(PlanError::Usage(format!("{} {name}: {problem}", kind.flag())));
-        }
         match if meant.is_empty() { &with_name } else { &meant }[..] {
-            [] => Err(self.unknown(kind, name, value)),
+            [] => Err(self.unknown(kind, name)),
             [stage] => Ok((stage.clone(), name.to_owned())),
             ref several => {
                 let options =
@@ -297,41 +281,21 @@ impl Scope<'_> {
         &self,
         kind: Kind,
         (stage, own): (&str, &str),
-        value: &str,
     ) -> Result<(String, String), PlanError> {
         let usage =
             |problem: String| PlanError::Usage(format!("{} {stage}.{own}: {problem}", kind.flag()));
         if !self.pipeline.stages.contains_key(stage) {
-            let known = known_blocks(stage, self.pipeline.stages.keys().map(String::as_str));
+            let known = known_names(stage, self.pipeline.stages.keys().map(String::as_str));
             return Err(usage(format!("no stage {stage:?}; {known}")));
         }
         let names = kind.names(self.programs.require(stage)?);
         if names.contains(&own) {
             return Ok((stage.to_owned(), own.to_owned()));
         }
-        if let Some(problem) = self.renamed(kind, [stage], own, value) {
-            return Err(usage(problem));
-        }
         Err(usage(format!("{stage} has no such {}; {}", kind.noun(), known_names(own, names))))
     }
 
-    /// What to say of a name that one of these stages had once.
-    fn renamed<'s>(
-        &self,
-        kind: Kind,
-        stages: impl IntoIterator<Item = &'s (impl AsRef<str> + ?Sized + 's)>,
-        name: &str,
-        value: &str,
-    ) -> Option<String> {
-        let programs = stages.into_iter().filter_map(|stage| self.programs.get(stage.as_ref()));
-        let programs = programs.map(|program| program.description.name.as_str());
-        renamed_in(kind.named(), programs, name, Some(&Value::from(value)))
-    }
-
-    fn unknown(&self, kind: Kind, name: &str, value: &str) -> PlanError {
-        if let Some(problem) = self.renamed(kind, self.pipeline.stages.keys(), name, value) {
-            return PlanError::Usage(format!("{} {name}: {problem}", kind.flag()));
-        }
+    fn unknown(&self, kind: Kind, name: &str) -> PlanError {
         let programs = self.pipeline.stages.keys().filter_map(|stage| self.programs.get(stage));
         let known: BTreeSet<&str> = programs.flat_map(|program| kind.names(program)).collect();
         let meant = artifact::nearest(name, known)

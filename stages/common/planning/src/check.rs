@@ -4,18 +4,17 @@
 use std::collections::BTreeSet;
 
 use artifact::known_names;
-use contract::{Description, Input, Named, Rename, renamed};
+use contract::{Description, Input};
 use serde_json::Map;
 
 use crate::file::StageBlock;
 use crate::part::{Part, PipelineError, Source};
 use crate::pipeline::Pipeline;
-use crate::renames::{known_blocks, known_subtrees};
 use crate::stages::{Programs, StageProgram};
 
 /// Checks that every stage which the file names is there.
 pub(crate) fn names(pipeline: &Pipeline) -> Result<(), PipelineError> {
-    let known = |name: &str| known_blocks(name, pipeline.stages.keys().map(String::as_str));
+    let known = |name: &str| known_names(name, pipeline.stages.keys().map(String::as_str));
     for name in &pipeline.default {
         if !pipeline.stages.contains_key(name) {
             let problem = format!(
@@ -47,7 +46,7 @@ fn extension(pipeline: &Pipeline, name: &str, block: &StageBlock) -> Result<(), 
     let Some(other) = &block.extends else { return Ok(()) };
     let problem = match pipeline.stages.get(other) {
         None => {
-            let known = known_blocks(other, pipeline.stages.keys().map(String::as_str));
+            let known = known_names(other, pipeline.stages.keys().map(String::as_str));
             format!("extends: there is no stage {other:?}; {known}")
         }
         Some(other_block) if other_block.extends.is_some() => {
@@ -108,9 +107,6 @@ fn parameters(
 /// What is wrong with an input of a block, and what to do.
 #[derive(Debug, thiserror::Error)]
 enum InputError<'a> {
-    /// The stage's input has another name now.
-    #[error("input {input}: {}", rename.problem(None))]
-    Renamed { input: &'a str, rename: &'static Rename },
     /// The stage doesn't have it; `known` says what it has.
     #[error("it has no input {input:?}; {known}")]
     Unknown { input: &'a str, known: String },
@@ -139,9 +135,6 @@ fn check_input<'a>(
     // affair.
     let record = || description.inputs.get("run").filter(|_| description.sink);
     let Some(port) = description.inputs.get(input).or_else(record) else {
-        if let Some(rename) = renamed(Named::Input, &description.name, input) {
-            return Err(InputError::Renamed { input, rename });
-        }
         let known = known_names(input, description.inputs.keys().map(String::as_str));
         return Err(InputError::Unknown { input, known });
     };
@@ -169,11 +162,7 @@ fn check_kind<'a>(
     let kind = match subtree {
         None => &output.kind,
         Some(folder) => output.subtrees.get(folder).ok_or_else(|| {
-            let known = known_subtrees(
-                &made_by.description.name,
-                folder,
-                output.subtrees.keys().map(String::as_str),
-            );
+            let known = known_names(folder, output.subtrees.keys().map(String::as_str));
             InputError::Subtree { input, stage: other, subtree: folder, known }
         })?,
     };

@@ -1,13 +1,11 @@
 //! Files that extend others, targets of `pipelines/`, and the pipelines that are shipped.
 
-use std::collections::BTreeSet;
-
 use tempfile::TempDir;
 
 use super::*;
 use crate::part::Part;
 use crate::request::PlanError;
-use crate::{renames, targets};
+use crate::targets;
 
 /// A folder with files.
 fn folder(files: &[(&str, &str)]) -> TempDir {
@@ -117,7 +115,7 @@ fn files_that_cannot_be_extended() {
         (
             &[("x.yaml", "extends: y.yaml"), ("y.yaml", "default: [a]\nstages:\n  a: {like: b}")],
             "y.yaml:3: ",
-            "`extends` now",
+            "unknown field `like`",
         ),
         (&[("x.yaml", "stages: {}")], "x.yaml: ", "missing field `default`"),
         (&[("x.yaml", "default: []")], "x.yaml: ", "missing field `stages`"),
@@ -208,7 +206,7 @@ fn targets_are_found_beside_the_pipeline() {
             &["c", "e"],
             &["e can't be made together with c: block a isn't the same in", "make it by itself"],
         ),
-        (&["joined"], &["no stage \"joined\"; it is called hr-finetune now"]),
+        (&["othre"], &["no stage \"othre\"; did you mean other?"]),
     ] {
         let error = find(&home, names).unwrap_err().to_string();
         assert!(words.iter().all(|words| error.contains(words)), "{error}");
@@ -278,49 +276,5 @@ fn every_shipped_file_is_a_target_and_all_can_be_made_at_once() {
         // It has what it needs, and its blocks are those of pipeline.yaml where it doesn't say
         // otherwise.
         assert!(pipeline.stages.keys().all(|stage| pipeline.has_same(&of_file, stage)), "{name}");
-    }
-}
-
-/// Old names lead to new ones, which are there; and no old one is.
-#[test]
-fn old_names_are_told_the_new_ones() {
-    let (pipeline, names) = shipped();
-    let (all, _) = targets::find(&pipeline, &names).unwrap();
-    for (old, new) in renames::BLOCKS {
-        assert!(all.stages.contains_key(new) && !all.stages.contains_key(old), "{old} {new}");
-        let said = format!("{old:?}; it is called {new} now");
-        let error = targets::find(&pipeline, &[old.to_owned()]).unwrap_err().to_string();
-        assert!(error.contains(&said), "{error}");
-        for (text, line) in [
-            (format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    inputs: {{x: {old}/x}}"), 5),
-            (format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    extends: {old}"), 5),
-            (format!("default: [{old}]\nstages:\n  a: {{}}"), 1),
-        ] {
-            let pipeline = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap();
-            let error = holds_together(&pipeline).unwrap_err().to_string();
-            assert!(error.starts_with(&format!("p.yaml:{line}: ")), "{error}");
-            assert!(
-                error.contains(&format!("it is called {new} now")) || error.contains(&said),
-                "{error}"
-            );
-        }
-    }
-    let uses: BTreeSet<&str> =
-        all.stages.values().flat_map(|block| block.inputs.values().map(String::as_str)).collect();
-    for (program, old, new) in renames::SUBTREES {
-        assert!(
-            uses.contains(format!("{program}/{new}").as_str())
-                && !uses.contains(format!("{program}/{old}").as_str())
-        );
-        assert_eq!(renames::known_subtrees(program, old, [new]), format!("it is called {new} now"));
-        assert_eq!(renames::known_subtrees("other", old, [new]), format!("known: {new}"));
-    }
-    for (old, new) in renames::WORDS {
-        let text = format!("default: [a]\nstages:\n  a: {{}}\n  b:\n    {old}: a\n");
-        let error = Pipeline::parse(text.as_bytes(), Path::new("p.yaml")).unwrap_err().to_string();
-        assert_eq!(
-            error,
-            format!("p.yaml:5: stage b: `{old}` is called `{new}` now; write `{new}:`")
-        );
     }
 }

@@ -10,7 +10,6 @@ use slurm::Resources;
 
 use crate::experiment::Experiment;
 use crate::part::{Part, PipelineError};
-use crate::renames;
 
 /// A pipeline file: `pipeline.yaml`, or one of `pipelines/`.
 ///
@@ -183,13 +182,7 @@ fn problem_of(document: &serde_yaml::Value) -> Option<(Vec<String>, String)> {
     if let Some(key) = ["default", "stages"].iter().find(|key| missing(key)) {
         return Some((Vec::new(), format!("missing field `{key}`")));
     }
-    let blocks = document.get("stages").and_then(serde_yaml::Value::as_mapping)?;
-    blocks.iter().find_map(|(name, block)| {
-        let (old, new) = renames::WORDS.iter().find(|(old, _)| block.get(old).is_some())?;
-        let keys = ["stages", name.as_str()?, old].map(str::to_owned).to_vec();
-        let problem = format!("stage {}: `{old}` is called `{new}` now; write `{new}:`", keys[1]);
-        Some((keys, problem))
-    })
+    None
 }
 
 /// Names longer than this make no folder's name.

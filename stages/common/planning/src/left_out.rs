@@ -11,7 +11,6 @@ use crate::check::needs;
 use crate::experiment::Selection;
 use crate::part::Source;
 use crate::pipeline::Pipeline;
-use crate::renames::known_blocks;
 use crate::request::PlanError;
 
 /// The stages that a sink shows, of those that its block names.
@@ -78,7 +77,7 @@ impl Files {
     pub(crate) fn new(pipeline: &Pipeline, choice: &Selection) -> Result<Self, PlanError> {
         let of = pipeline.experiment.needs.clone();
         if let Some(name) = of.keys().find(|name| !pipeline.stages.contains_key(*name)) {
-            let known = known_blocks(name, pipeline.stages.keys().map(String::as_str));
+            let known = known_names(name, pipeline.stages.keys().map(String::as_str));
             return Err(PlanError::Usage(format!(
                 "experiment: needs {name}: no such stage; {known}"
             )));

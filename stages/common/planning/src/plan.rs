@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use artifact::hash_json;
+use artifact::{hash_json, known_names};
 use contract::Description;
 use slurm::Resources;
 use store::Store;
@@ -13,7 +13,6 @@ use crate::experiment_axes;
 use crate::key;
 use crate::node::{Node, NodeInput, Origin, Plan, State};
 use crate::pipeline::Pipeline;
-use crate::renames::known_blocks;
 use crate::request::{PlanError, Request};
 use crate::sources::hash_source;
 use crate::stages::{Asking, Programs};
@@ -87,7 +86,7 @@ impl<'a> Goal<'a> {
         check::names(pipeline)?;
         let targets = if request.targets.is_empty() { &pipeline.default } else { &request.targets };
         if let Some(target) = targets.iter().find(|target| !pipeline.stages.contains_key(*target)) {
-            let known = known_blocks(target, pipeline.stages.keys().map(String::as_str));
+            let known = known_names(target, pipeline.stages.keys().map(String::as_str));
             return Err(PlanError::Usage(format!("no stage {target:?}; {known}")));
         }
         let needed = closure(targets, |stage| needs(pipeline, stage).map(str::to_owned).collect());

@@ -331,12 +331,7 @@ fn files_that_cannot_be_used() {
             "extends: there is no stage \"trian\"; did you mean train?",
         ),
         ("extends: train", "extends: train\n    run: x", 11, "give one of them"),
-        (
-            "extends: train",
-            "like: train",
-            11,
-            "stage again: `like` is called `extends` now; write `extends:`",
-        ),
+        ("extends: train", "like: train", 11, "stages.again: unknown field `like`"),
         ("rays: 7", "rays: 0", 14, "parameter rays: 0 is less than the minimum"),
         ("rays: 7", "rayz: 7", 14, "parameter rayz: unknown; did you mean rays?"),
         (

@@ -81,7 +81,7 @@ impl StageProgram {
         description
             .check()
             .map_err(|problem| ProgramError::Description { path: path.to_path_buf(), problem })?;
-        let schema = Schema::new(&description.name, &description.parameters)?;
+        let schema = Schema::new(&description.parameters)?;
         Ok(Self { path: path.to_path_buf(), description, schema })
     }
 

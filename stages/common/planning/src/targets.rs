@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
+use artifact::known_names;
+
 use crate::part::Part;
 use crate::pipeline::{Pipeline, SHELVES};
-use crate::renames::known_blocks;
 use crate::request::PlanError;
 
 /// The pipeline that has all targets, and the blocks that they are. `pipelines/NAME.yaml` is the
@@ -52,7 +53,7 @@ fn on_shelf(pipeline: &Pipeline, target: &str) -> Result<(Pipeline, Vec<String>)
     }
     let blocks = others.iter().chain([pipeline]).flat_map(|other| other.stages.keys());
     let known: BTreeSet<&str> = blocks.chain(files.keys()).map(String::as_str).collect();
-    Err(PlanError::Usage(format!("no stage {target:?}; {}", known_blocks(target, known))))
+    Err(PlanError::Usage(format!("no stage {target:?}; {}", known_names(target, known))))
 }
 
 /// The files of `pipelines/` and `experiments/`, by name; the former win.

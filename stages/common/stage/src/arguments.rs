@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::anyhow;
 use artifact::{Failure, FailureExt as _, known_names};
-use contract::{Description, Named, Schema, renamed};
+use contract::{Description, Schema};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -59,14 +59,8 @@ pub(crate) fn input_folders<'a>(
             .split_once('=')
             .ok_or_else(|| Failure::Usage(format!("--input {text}: expected NAME=DIR")))?;
         if !description.inputs.contains_key(name) {
-            let problem = match renamed(Named::Input, &description.name, name) {
-                Some(rename) => rename.problem(None),
-                None => format!(
-                    "no such input; {}",
-                    known_names(name, description.inputs.keys().map(String::as_str))
-                ),
-            };
-            return Err(Failure::Usage(format!("--input {name}: {problem}")).into());
+            let known = known_names(name, description.inputs.keys().map(String::as_str));
+            return Err(Failure::Usage(format!("--input {name}: no such input; {known}")).into());
         }
         folders.push((name, Path::new(folder)));
     }
@@ -97,7 +91,7 @@ pub(crate) fn read_params<P: DeserializeOwned>(
                 .usage(format!("--params {place}: expected a JSON object"))?
         }
     };
-    let schema = Schema::new(&description.name, &description.parameters)
+    let schema = Schema::new(&description.parameters)
         .map_err(|e| anyhow!("the stage's own parameter schema: {e}"))?;
     let resolved = schema.resolve(&given).map_err(|problems| {
         let lines: Vec<String> = problems.iter().map(ToString::to_string).collect();
