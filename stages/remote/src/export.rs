@@ -64,7 +64,7 @@ impl History {
                 .collect(),
         };
         let artifact = records.get(&name).map_or(name, |record| record.output.clone());
-        if !store.is_whole(&artifact) {
+        if !store.is_whole(&artifact)? {
             let object = store.object(&artifact);
             return Err(Failure::BadInput(format!(
                 "{}: the artifact is not whole; run again, or pull it",
@@ -74,10 +74,12 @@ impl History {
         }
         let history = with_history(&records, keys);
         records.retain(|key, _| history.contains(key));
-        let mut objects: BTreeSet<String> =
-            records.values().map(|record| record.output.clone()).collect();
-        objects
-            .retain(|identity| *identity == artifact || !records_only && store.is_whole(identity));
+        let mut objects = BTreeSet::from([artifact.clone()]);
+        for record in records.values().filter(|_| !records_only) {
+            if store.is_whole(&record.output)? {
+                objects.insert(record.output.clone());
+            }
+        }
         let missing: BTreeSet<&String> = records
             .values()
             .map(|record| &record.output)

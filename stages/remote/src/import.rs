@@ -166,7 +166,7 @@ impl<'a, R: Read> Reader<'a, R> {
 
     /// An object, put together in the scratch folder and found whole; none where the store has it.
     fn object(&mut self, identity: &str) -> anyhow::Result<Option<Arrival>> {
-        let is_here = self.intake.store.is_whole(identity);
+        let is_here = self.intake.store.is_whole(identity)?;
         let folder = self.intake.scratch(identity);
         let first = object_entry(identity, MANIFEST_FILE);
         let bytes = self.small(&first, MANIFEST_LIMIT)?;

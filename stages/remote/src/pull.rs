@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 
 use anyhow::Context as _;
 use artifact::{Failure, FileEntry, MANIFEST_FILE, counted, one_line, print_line, sized};
-use store::{Record, Store};
+use store::{Record, Store, StoreError};
 
 use crate::intake::{Intake, MANIFEST_LIMIT, RECORD_LIMIT, read_manifest, read_record};
 use crate::progress::Progress;
@@ -71,7 +71,7 @@ async fn missing_records(
     let all_are_meant = selection.keys.is_empty() && selection.artifacts.is_empty();
     let count = keys.len();
     if all_are_meant {
-        keys.retain(|key| store.hit(key).is_none());
+        keys = lacking(store, keys)?;
     } else if selection.artifacts.is_empty() && !selection.history {
         keys.retain(|key| selection.keys.iter().any(|start| key.starts_with(start)));
     }
@@ -88,13 +88,25 @@ async fn missing_records(
         }
     }
     let selected = selection.of(&records, &remote.name(""))?;
-    let missing: Vec<Record> = selected
-        .iter()
-        .filter(|key| store.hit(key).is_none())
-        .filter_map(|key| records.remove(key))
-        .collect();
-    let known = if all_are_meant { known } else { selected.len() - missing.len() };
+    let count = selected.len();
+    let missing: Vec<Record> =
+        lacking(store, selected)?.iter().filter_map(|key| records.remove(key)).collect();
+    let known = if all_are_meant { known } else { count - missing.len() };
     Ok((missing, known))
+}
+
+/// Keys of the actions that the store lacks.
+fn lacking(
+    store: &Store,
+    keys: impl IntoIterator<Item = String>,
+) -> Result<Vec<String>, StoreError> {
+    let mut lacking = Vec::new();
+    for key in keys {
+        if store.hit(&key)?.is_none() {
+            lacking.push(key);
+        }
+    }
+    Ok(lacking)
 }
 
 async fn record(
@@ -158,7 +170,7 @@ async fn manifest(
     records: Vec<Record>,
 ) -> anyhow::Result<Object> {
     progress.add(0)?;
-    if intake.store.is_whole(&identity) {
+    if intake.store.is_whole(&identity)? {
         return Ok(Object { identity, records, bytes: 0, is_here: true });
     }
     let file = format!("objects/{identity}/{MANIFEST_FILE}");

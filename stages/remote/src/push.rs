@@ -62,7 +62,7 @@ async fn push_records(
     let mut sizes = BTreeMap::new();
     let mut without = 0;
     for &record in records {
-        if !store.is_whole(&record.output) {
+        if !store.is_whole(&record.output)? {
             without += 1;
             continue;
         }

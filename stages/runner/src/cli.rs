@@ -277,6 +277,7 @@ pub fn main() -> ExitCode {
             let plan_code =
                 error.chain().find_map(|e| e.downcast_ref::<PlanError>()).map(|e| match e {
                     PlanError::Pipeline(_) | PlanError::Usage(_) => 2,
+                    PlanError::Store(_) => 1,
                     PlanError::Source { .. } | PlanError::Artifact(_) => 3,
                     PlanError::Interrupted => 130,
                 });

@@ -3,7 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use artifact::{Manifest, label};
+use anyhow::Context as _;
+use artifact::{Damage, Manifest, label};
 use metrics::METRICS_FILE;
 use planning::{Change, changes};
 use serde::Serialize;
@@ -26,7 +27,10 @@ pub(crate) struct StageDifference {
 
 impl Lineage {
     /// Of the actions that have these keys. What garbage collection has taken is left out.
-    pub(crate) fn of(store: &Store, keys: impl IntoIterator<Item = String>) -> Self {
+    pub(crate) fn of(
+        store: &Store,
+        keys: impl IntoIterator<Item = String>,
+    ) -> anyhow::Result<Self> {
         let (mut open, mut seen): (Vec<String>, BTreeSet<String>) =
             (keys.into_iter().collect(), BTreeSet::new());
         let mut found: Vec<Record> = Vec::new();
@@ -34,7 +38,12 @@ impl Lineage {
             if !seen.insert(key.clone()) {
                 continue;
             }
-            if let Some(record) = store.record(&key) {
+            if let Some(record) = store.record(&key)? {
+                // What can't be read isn't gone.
+                if let Err(unreadable @ Damage::Unreadable { .. }) = store.manifest(&record.output)
+                {
+                    return Err(unreadable.into());
+                }
                 open.extend(record.made_of.clone());
                 found.push(record);
             }
@@ -51,37 +60,43 @@ impl Lineage {
             };
             (name, record.clone())
         });
-        Self { records: records.collect() }
+        Ok(Self { records: records.collect() })
     }
 
     /// What differs from an earlier one, stage by stage. Where what a stage was made of differs,
     /// its inputs' hashes aren't told.
-    pub(crate) fn differences(&self, before: &Self, store: &Store) -> Vec<StageDifference> {
+    pub(crate) fn differences(
+        &self,
+        before: &Self,
+        store: &Store,
+    ) -> anyhow::Result<Vec<StageDifference>> {
         let names: BTreeSet<&String> = self.records.keys().chain(before.records.keys()).collect();
         let mut found = Vec::new();
         for name in names {
             let sides = [(before, before.records.get(name)), (self, self.records.get(name))];
             let depth = Depth::of(sides.map(|(_, record)| record), store);
-            let [parts_before, parts_now] = sides.map(|(lineage, record)| {
-                record.map(|record| lineage.parts(record, store, depth)).unwrap_or_default()
+            let [parts_before, parts_now] = sides.map(|(lineage, record)| match record {
+                Some(record) => lineage.parts(record, store, depth),
+                None => Ok(Map::new()),
             });
-            let changes = changes(&parts_before, &parts_now);
+            let changes = changes(&parts_before?, &parts_now?);
             if !changes.is_empty() {
                 found.push(StageDifference { stage: name.clone(), changes });
             }
         }
-        found
+        Ok(found)
     }
 
     /// What may differ of a result, by name.
-    fn parts(&self, record: &Record, store: &Store, depth: Depth) -> Map<String, Value> {
+    fn parts(
+        &self,
+        record: &Record,
+        store: &Store,
+        depth: Depth,
+    ) -> anyhow::Result<Map<String, Value>> {
         if depth == Depth::Name {
-            return record
-                .key_parts
-                .iter()
-                .filter(|(name, _)| *name == "stage")
-                .map(owned)
-                .collect();
+            let stage = record.key_parts.iter().filter(|(name, _)| *name == "stage");
+            return Ok(stage.map(owned).collect());
         }
         let mut parts: Map<String, Value> = record
             .key_parts
@@ -97,9 +112,9 @@ impl Lineage {
             Value::from(if manifest.is_some() { "kept" } else { "gone" }),
         );
         if let Some(manifest) = manifest.filter(|_| depth == Depth::Content) {
-            add_content(&mut parts, record, &manifest, &store.object(&record.output));
+            add_content(&mut parts, record, &manifest, &store.object(&record.output))?;
         }
-        parts
+        Ok(parts)
     }
 
     /// Whether an input's hash is of something here that the record's action was made of.
@@ -138,7 +153,7 @@ fn add_content(
     record: &Record,
     manifest: &Manifest,
     folder: &Path,
-) {
+) -> anyhow::Result<()> {
     for file in manifest.files.iter().filter(|file| !file.path.ends_with(".json")) {
         parts.insert(format!("file {}", file.path), Value::from(file.blake3.clone()));
     }
@@ -147,7 +162,8 @@ fn add_content(
         .iter()
         .filter(|file| file.path.ends_with(".json") && !file.path.contains('/'))
     {
-        let bytes = std::fs::read(folder.join(&file.path)).unwrap_or_default();
+        let path = folder.join(&file.path);
+        let bytes = std::fs::read(&path).with_context(|| path.display().to_string())?;
         let Ok(value) = serde_json::from_slice::<Value>(&bytes) else { continue };
         // Which file has the values in use isn't recorded: what names no parameter is something
         // else.
@@ -163,6 +179,7 @@ fn add_content(
             });
         }
     }
+    Ok(())
 }
 
 fn owned((name, value): (&String, &Value)) -> (String, Value) {

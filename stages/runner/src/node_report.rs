@@ -8,7 +8,7 @@ use planning::{Change, Plan, State};
 use serde::Serialize;
 use serde_json::{Map, Value};
 use slurm::Job;
-use store::Record;
+use store::{Record, StoreError};
 
 use crate::session::Session;
 
@@ -86,14 +86,16 @@ impl PlanReport {
         plan: &Plan,
         states: &[State],
         records: &[Record],
-    ) -> Self {
-        let nodes = (0..plan.nodes.len())
-            .map(|number| NodeReport::new(session, plan, (number, &states[number]), records));
+    ) -> Result<Self, StoreError> {
+        let mut nodes = Vec::with_capacity(plan.nodes.len());
+        for number in 0..plan.nodes.len() {
+            nodes.push(NodeReport::new(session, plan, (number, &states[number]), records)?);
+        }
         let sinks = plan
             .sinks
             .iter()
             .map(|sink| SinkReport { stage: sink.stage.clone(), shows: sink.shows.clone() });
-        Self { nodes: nodes.collect(), sinks: sinks.collect() }
+        Ok(Self { nodes, sinks: sinks.collect() })
     }
 
     /// The nodes of a stage alone, or of the stages that a sink shows.
@@ -111,7 +113,7 @@ impl NodeReport {
         plan: &Plan,
         (number, state): (usize, &State),
         records: &[Record],
-    ) -> Self {
+    ) -> Result<Self, StoreError> {
         let (store, node) = (&session.store, &plan.nodes[number]);
         let mut report = Self {
             number,
@@ -146,13 +148,13 @@ impl NodeReport {
             }
             State::WillRun { key_parts } => {
                 let key = hash_json(key_parts);
-                report.has_checkpoint = store.has_checkpoint(&key);
+                report.has_checkpoint = store.has_checkpoint(&key)?;
                 report.changes = planning::nearest_changes(key_parts, &node.stage, records);
                 report.key = Some(key);
             }
             State::Waits { on } => report.waits_on.clone_from(on),
         }
         report.by_scene = node.by_scene(&folder);
-        report
+        Ok(report)
     }
 }

@@ -49,11 +49,11 @@ pub(crate) fn words(
                 Some(None) => "will run: it never ran before".to_owned(),
                 Some(Some(changes)) if changes.is_empty() => {
                     match session.store.record(&hash_json(key_parts)) {
-                        Some(record) => format!(
+                        Ok(Some(record)) => format!(
                             "will run: its artifact {} is gone or incomplete",
                             short(&record.output)
                         ),
-                        None => "will run".to_owned(),
+                        _ => "will run".to_owned(),
                     }
                 }
                 Some(Some(changes)) => format!("will run: {}", changes.join("; ")),

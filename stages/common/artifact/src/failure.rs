@@ -42,7 +42,7 @@ pub fn one_line(error: &anyhow::Error) -> String {
     for cause in error.chain() {
         let cause = cause.to_string();
         // A library that prints its source in its own message would say it twice.
-        if !text.ends_with(&cause) {
+        if !text.contains(&cause) {
             text = if text.is_empty() { cause } else { format!("{text}: {cause}") };
         }
     }

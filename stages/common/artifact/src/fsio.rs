@@ -27,9 +27,16 @@ pub fn temporary(mode: u32) -> tempfile::Builder<'static, 'static> {
 /// Writes a value as indented JSON that ends in a line feed: the form of every JSON file people may
 /// open.
 pub fn write_json(path: &Path, value: &impl Serialize) -> io::Result<()> {
-    let mut text = serde_json::to_string_pretty(value)?;
-    text.push('\n');
-    fs::write(path, text)
+    fs::write(path, json_text(value)?)
+}
+
+/// Writes a value as [`write_json`] does, whole or not at all ([`write_atomically`]).
+pub fn write_json_atomically(path: &Path, value: &impl Serialize) -> io::Result<()> {
+    write_atomically(path, json_text(value)?.as_bytes())
+}
+
+fn json_text(value: &impl Serialize) -> io::Result<String> {
+    Ok(serde_json::to_string_pretty(value)? + "\n")
 }
 
 /// Makes a rename in `folder` durable.

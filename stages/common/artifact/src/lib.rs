@@ -6,7 +6,7 @@
 //! * [`canonical()`]: the one JSON form that is ever hashed.
 //! * [`RunRecord`]: what a sink (the report) is told of a run.
 //! * [`Failure`]: what went wrong, by what the user does next; each kind has its exit code.
-//! * [`print_line!`], [`report_line!`], [`printable()`], [`counted`]: words for people.
+//! * [`print_line!`], [`report_line!`], [`printable()`], [`counted`], [`advice()`]: words for people.
 //!
 //! What a stage says of itself is in `contract`, what makes a program a stage in `stage`. A library
 //! that stages share needs neither.
@@ -24,6 +24,7 @@
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
+mod advice;
 mod amounts;
 mod canonical;
 mod console;
@@ -36,11 +37,12 @@ mod printable;
 mod run_record;
 mod warnings;
 
+pub use advice::advice;
 pub use amounts::{amount, counted, sized};
 pub use canonical::{canonical, hash_json};
 pub use console::{print_lines, print_text, report_text};
 pub use failure::{Failure, FailureExt, exit_code, one_line};
-pub use fsio::{sync_folder, temporary, write_atomically, write_json};
+pub use fsio::{sync_folder, temporary, write_atomically, write_json, write_json_atomically};
 pub use given_input::GivenInput;
 pub use manifest::{
     Damage, FileEntry, MANIFEST_FILE, Manifest, PathError, hash_files, list_files, relative_path,

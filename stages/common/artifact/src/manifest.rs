@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::advice::advice;
 use crate::canonical::hash_json;
 
 /// The manifest's name inside an artifact.
@@ -42,8 +43,16 @@ pub struct FileEntry {
 /// A file that isn't what the manifest says.
 #[derive(Debug, thiserror::Error)]
 pub enum Damage {
-    /// The file is not there or can't be read.
-    #[error("{path}: {source}; the artifact is damaged: `nerf-sr verify --remove`, then run again")]
+    /// The file is missing.
+    #[error(
+        "{path}: not found; the artifact is damaged: `nerf-sr verify --remove`, then run again"
+    )]
+    Missing {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The file can't be read; the artifact may be whole.
+    #[error("cannot read {path}: {source}{}", advice(.path, .source))]
     Unreadable {
         /// The file.
         path: PathBuf,
@@ -82,6 +91,17 @@ pub enum Damage {
     },
 }
 
+impl Damage {
+    /// Returns the damage behind a failed file operation. A file in a folder's place leaves no doubt
+    /// that the files of the folder are missing.
+    fn of_file(path: PathBuf, source: io::Error) -> Self {
+        match source.kind() {
+            io::ErrorKind::NotFound | io::ErrorKind::NotADirectory => Self::Missing { path },
+            _ => Self::Unreadable { path, source },
+        }
+    }
+}
+
 impl Manifest {
     /// Hashes every file below `folder` (but its manifest).
     pub fn of_folder(kind: &str, folder: &Path) -> io::Result<Self> {
@@ -98,8 +118,7 @@ impl Manifest {
     /// Reads `folder/artifact.json`, refusing paths that would leave the folder.
     pub fn read(folder: &Path) -> Result<Self, Damage> {
         let path = folder.join(MANIFEST_FILE);
-        let bytes =
-            fs::read(&path).map_err(|source| Damage::Unreadable { path: path.clone(), source })?;
+        let bytes = fs::read(&path).map_err(|source| Damage::of_file(path.clone(), source))?;
         let invalid = |reason: String| Damage::Manifest { path: path.clone(), reason };
         let manifest: Self = serde_json::from_slice(&bytes).map_err(|e| invalid(e.to_string()))?;
         if manifest.schema != SCHEMA {
@@ -147,7 +166,7 @@ impl Manifest {
                 Ok(meta) => {
                     return Err(Damage::Size { path, expected: file.size, found: meta.len() });
                 }
-                Err(source) => return Err(Damage::Unreadable { path, source }),
+                Err(source) => return Err(Damage::of_file(path, source)),
             }
         }
         Ok(())
@@ -164,7 +183,7 @@ impl Manifest {
                 match hash_file(&path) {
                     Ok(hash) if hash == file.blake3 => Ok(()),
                     Ok(_) => Err(Damage::Content { path }),
-                    Err(source) => Err(Damage::Unreadable { path, source }),
+                    Err(source) => Err(Damage::of_file(path, source)),
                 }
             })
             .collect();
@@ -277,6 +296,23 @@ mod tests {
             matches!(&damage, Damage::Content { path } if path.ends_with("train/a.txt")),
             "{damage}"
         );
+    }
+
+    /// A missing file is damage; a file that can't be read may be whole.
+    #[test]
+    fn missing_and_unreadable_files_differ() {
+        let (dir, manifest) = example();
+        let (folder, file) = (dir.path().join("train"), dir.path().join("train/a.txt"));
+        let problem = || manifest.check_contents(dir.path()).unwrap_err();
+        fs::remove_file(&file).unwrap();
+        assert!(matches!(problem(), Damage::Missing { path } if path == file));
+        std::os::unix::fs::symlink("a.txt", &file).unwrap();
+        assert!(matches!(problem(), Damage::Unreadable { path, .. } if path == file));
+        let said = problem().to_string();
+        assert!(said.starts_with("cannot read ") && !said.contains("--remove"), "{said}");
+        fs::remove_dir_all(&folder).unwrap();
+        fs::write(&folder, "").unwrap();
+        assert!(matches!(problem(), Damage::Missing { path } if path == file));
     }
 
     #[test]

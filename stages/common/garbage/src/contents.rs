@@ -1,12 +1,13 @@
 use std::collections::BTreeMap;
 
+use artifact::Damage;
 use store::{Record, Store, StoreError, Unfinished};
 
 /// What lies in a store.
 pub(crate) struct Contents {
     /// Records by key.
     pub(crate) records: BTreeMap<String, Record>,
-    /// Keys of all files beside the records, those that can't be read among them.
+    /// Keys of all records and logs.
     pub(crate) action_files: Vec<String>,
     /// Bytes of the objects, by identity.
     pub(crate) objects: BTreeMap<String, u64>,
@@ -15,21 +16,35 @@ pub(crate) struct Contents {
 }
 
 impl Contents {
+    /// Reads what lies in a store. What can't be read may be needed, and a damaged record doesn't
+    /// tell what it needs: either is an error.
     pub(crate) fn of(store: &Store) -> Result<Self, StoreError> {
-        let objects = store.objects()?.into_iter();
-        Ok(Self {
-            records: store.records()?.into_iter().map(|record| (record.key(), record)).collect(),
-            action_files: store.action_files()?,
-            objects: objects
-                .map(|identity| {
-                    (identity.clone(), store.manifest(&identity).map_or(0, |m| m.size()))
-                })
-                .collect(),
-            unfinished: store
-                .partials()?
-                .into_iter()
-                .map(|key| (key.clone(), store.unfinished(&key)))
-                .collect(),
-        })
+        let action_files = store.action_files()?;
+        let mut records = BTreeMap::new();
+        for key in &action_files {
+            if let Some(record) = store.undamaged_record(key)? {
+                records.insert(key.clone(), record);
+            }
+        }
+        let mut objects = BTreeMap::new();
+        for identity in store.objects()? {
+            let bytes = size(store, &identity)?;
+            objects.insert(identity, bytes);
+        }
+        let mut unfinished = BTreeMap::new();
+        for key in store.partials()? {
+            let action = store.unfinished(&key)?;
+            unfinished.insert(key, action);
+        }
+        Ok(Self { records, action_files, objects, unfinished })
+    }
+}
+
+/// Bytes of an object; 0 for a damaged one.
+fn size(store: &Store, identity: &str) -> Result<u64, StoreError> {
+    match store.manifest(identity) {
+        Ok(manifest) => Ok(manifest.size()),
+        Err(unreadable @ Damage::Unreadable { .. }) => Err(unreadable.into()),
+        Err(_) => Ok(0),
     }
 }

@@ -51,6 +51,10 @@ pub struct Verdict {
 }
 
 /// Decides what goes. `plan` is what the pipeline needs.
+///
+/// # Errors
+/// If a record, an object, an unfinished action, a run, a pin or a lock can't be read, or a record,
+/// a run or a pin is damaged: what it needs isn't known then.
 pub fn judge(store: &Store, plan: Root, choice: Choice) -> Result<Verdict, StoreError> {
     let contents = Contents::of(store)?;
     let runs = store.runs()?;

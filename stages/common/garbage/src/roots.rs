@@ -75,10 +75,12 @@ pub(crate) fn roots(
         }));
     }
     if !choice.drop_unfinished {
-        let with_checkpoint = contents.unfinished.keys().filter(|key| store.has_checkpoint(key));
-        roots.extend(with_checkpoint.map(|key| {
-            of_action("an unfinished action has a checkpoint (--drop-unfinished)".to_owned(), key)
-        }));
+        let why = "an unfinished action has a checkpoint (--drop-unfinished)";
+        for key in contents.unfinished.keys() {
+            if store.has_checkpoint(key)? {
+                roots.push(of_action(why.to_owned(), key));
+            }
+        }
     }
     Ok(roots)
 }

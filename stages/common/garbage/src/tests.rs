@@ -69,7 +69,7 @@ fn cases() -> impl Strategy<Value = Case> {
     let some = || prop::collection::vec(any::<u8>(), 0..3);
     let waiting = || prop::collection::vec((0..3u8, 0..2u8), 0..2);
     let holder = prop_oneof![
-        some().prop_map(Holder::Pin),
+        prop::collection::vec(any::<u8>(), 1..3).prop_map(Holder::Pin),
         any::<u8>().prop_map(Holder::Lock),
         (some(), waiting(), 0..20u64, any::<bool>()).prop_map(
             |(keys, waiting, days_ago, in_progress)| Holder::Run {
@@ -197,7 +197,7 @@ fn make_action(
 ) -> String {
     let (key, stage, made_of) =
         (hash_json(key_parts), format!("s{}", action.stage), made_of.to_vec());
-    if store.record(&key).is_some() {
+    if store.record(&key).unwrap().is_some() {
         return key;
     }
     let entered = held(|| store.try_enter());
@@ -247,7 +247,7 @@ fn expected(case: &Case, made: &Made) -> BTreeSet<String> {
         }
     }
     for (number, (parts, _)) in &made.parts {
-        let record = made.store.record(number);
+        let record = made.store.record(number).unwrap();
         let fits = nodes.iter().any(|(stage, parameter)| {
             parts["stage"] == json!(format!("s{stage}")) && parts["parameter p"] == json!(parameter)
         });
@@ -282,11 +282,11 @@ proptest! {
         let store = &made.store;
         let stays = expected(&case, &made);
         let records: BTreeSet<String> =
-            stays.iter().filter(|key| store.record(key).is_some()).cloned().collect();
+            stays.iter().filter(|key| store.record(key).unwrap().is_some()).cloned().collect();
         let unfinished: BTreeSet<String> =
             stays.iter().filter(|key| store.partial(key).exists()).cloned().collect();
         let objects: BTreeSet<String> =
-            records.iter().map(|key| store.record(key).unwrap().output).collect();
+            records.iter().map(|key| store.record(key).unwrap().unwrap().output).collect();
         let key = |number: &u8| made.keys[*number as usize % made.keys.len()].clone();
         let plan = Root {
             why: "the plan".into(),
@@ -318,32 +318,58 @@ proptest! {
     }
 }
 
-/// An object that no record names goes, and so does a record that can't be read; the reason is
-/// said.
+const CHOICE: Choice = Choice { keep_days: 7, drop_unfinished: false, drop_old: true };
+
+/// An object that no record names goes, with the log that is left; the reason is said. A damaged
+/// record may be the one that names it: nothing goes then.
 #[test]
 fn orphans_go() {
     let dir = tempfile::tempdir().unwrap();
     let store = Store::open(dir.path()).unwrap();
-    let action = Action {
-        stage: 0,
-        parameter: 0,
-        inputs: vec![],
-        content: 1,
-        days_old: 0,
-        state: Finished::Yes,
-    };
     let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
-    let key = make_action(&store, &action, &parts, &[]);
-    fs::write(store.action(&key, "json"), "{").unwrap();
-    let verdict = judge(
-        &store,
-        Root::default(),
-        Choice { keep_days: 7, drop_unfinished: false, drop_old: true },
-    )
-    .unwrap();
+    let key = make_action(&store, &old_action(1), &parts, &[]);
+    let record = store.action(&key, "json");
+    fs::write(store.action(&key, "log"), "done").unwrap();
+    fs::write(&record, "{").unwrap();
+    let said = judge(&store, Root::default(), CHOICE).err().unwrap().to_string();
+    assert!(said.contains(&format!("{key}.json: the record is damaged")), "{said}");
+    fs::remove_file(&record).unwrap();
+    let verdict = judge(&store, Root::default(), CHOICE).unwrap();
     assert!(verdict.lines()[0].ends_with("no record names it: goes"), "{:?}", verdict.lines());
     verdict.carry_out(&store, &held(|| store.try_close())).unwrap();
     assert!(store.objects().unwrap().is_empty() && store.action_files().unwrap().is_empty());
+}
+
+/// What can't be read may be needed, or may say what is. A loop of links stands for it, which not
+/// even root can read.
+#[test]
+fn what_can_not_be_read_is_an_error() {
+    let key = hash_json(&json!({"stage": "s0", "unfinished": true}));
+    let begun = |folder: &str| format!("partial/{key}/{folder}");
+    for file in [
+        "actions/{record}.json".to_owned(),
+        "objects/{object}/artifact.json".to_owned(),
+        "runs/x.jsonl".to_owned(),
+        "pins/x.jsonl".to_owned(),
+        format!("locks/{key}"),
+        begun("action.json"),
+        begun("work"),
+        "slurm/1-2-x".to_owned(),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let parts = json!({"stage": "s0"}).as_object().unwrap().clone();
+        let record = make_action(&store, &old_action(1), &parts, &[]);
+        let object = store.objects().unwrap().remove(0);
+        fs::create_dir_all(dir.path().join(begun(""))).unwrap();
+        let file = file.replace("{record}", &record).replace("{object}", &object);
+        let path = dir.path().join(&file);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::remove_file(&path).ok();
+        std::os::unix::fs::symlink(path.file_name().unwrap(), &path).unwrap();
+        let said = judge(&store, Root::default(), CHOICE).err().unwrap().to_string();
+        assert!(said.contains(&file), "{file}: {said}");
+    }
 }
 
 fn old_action(content: u8) -> Action {

@@ -58,7 +58,7 @@ impl Plan {
             }
             let hashes = input_hashes(node, store, |index| cached_output(&states[index]))?;
             let key_parts = key::parts(node, &hashes, self.device(&node.stage));
-            states.push(match store.hit(&hash_json(&key_parts)) {
+            states.push(match store.hit(&hash_json(&key_parts))? {
                 Some(record) => State::Cached(Box::new(record)),
                 None => State::WillRun { key_parts },
             });

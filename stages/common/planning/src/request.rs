@@ -1,5 +1,6 @@
 use artifact::Damage;
 use stage_call::Interrupted;
+use store::StoreError;
 
 use crate::experiment::Selection;
 use crate::part::PipelineError;
@@ -40,6 +41,9 @@ pub enum PlanError {
     /// An artifact in the store can't be used.
     #[error("{0}")]
     Artifact(Damage),
+    /// The store can't be read: whether an artifact is there isn't known.
+    #[error(transparent)]
+    Store(#[from] StoreError),
     /// A signal came while stages were asked what they are.
     #[error("interrupted")]
     Interrupted,

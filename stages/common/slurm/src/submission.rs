@@ -106,11 +106,18 @@ pub fn all(root: &Path) -> Result<Vec<(String, PathBuf)>, SlurmError> {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         entries => entries.map_err(|e| SlurmError::file(&folder, e))?,
     };
-    let paths = entries.flatten().map(|entry| entry.path()).filter(|path| path.is_dir());
-    let mut named: Vec<(String, PathBuf)> = paths
-        .filter_map(|path| Some((path.file_name()?.to_str()?.to_owned(), path)))
-        .filter(|(id, _)| !id.starts_with('.'))
-        .collect();
+    let mut named = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(|e| SlurmError::file(&folder, e))?.path();
+        let is_folder = match fs::metadata(&path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+            meta => meta.map_err(|e| SlurmError::file(&path, e))?.is_dir(),
+        };
+        let id = path.file_name().and_then(OsStr::to_str).filter(|id| !id.starts_with('.'));
+        if let Some(id) = id.filter(|_| is_folder) {
+            named.push((id.to_owned(), path));
+        }
+    }
     named.sort();
     Ok(named)
 }

@@ -1,14 +1,15 @@
 use std::fs;
 use std::io;
 
-use artifact::{MANIFEST_FILE, Manifest, hash_json, write_atomically};
+use artifact::{hash_json, write_json_atomically};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::error::{StoreError, at};
+use crate::error::{StoreError, at, read_if_found};
 use crate::folder::Store;
 use crate::lock::Entered;
+use crate::objects::is_hash;
 
 /// Version of a key's list of parts: names of parameters changed between 1 and 2.
 pub const KEY_VERSION: u64 = 2;
@@ -82,46 +83,65 @@ pub struct Unfinished {
 impl Store {
     /// The record of a key, if the action was done and its object is whole (sizes only; see
     /// [`Store::verify`]).
-    pub fn hit(&self, key: &str) -> Option<Record> {
-        self.record(key).filter(|record| self.is_whole(&record.output))
+    pub fn hit(&self, key: &str) -> Result<Option<Record>, StoreError> {
+        let Some(record) = self.record(key)? else { return Ok(None) };
+        Ok(self.is_whole(&record.output)?.then_some(record))
     }
 
     /// As [`Store::hit`], and where an object's files are whole but its manifest is missing, cut
     /// short or another's, that is written again. `kind` is what the stage makes.
-    pub fn hit_or_repair(&self, _: &Entered, key: &str, kind: &str) -> Option<Record> {
-        if let Some(record) = self.hit(key) {
-            return Some(record);
-        }
-        let record = self.record(key)?;
-        let object = self.object(&record.output);
-        let found = Manifest::of_folder(kind, &object).ok()?;
-        if found.identity() != record.output {
-            return None;
-        }
-        let mut text = serde_json::to_string_pretty(&found).ok()?;
-        text.push('\n');
-        write_atomically(&object.join(MANIFEST_FILE), text.as_bytes()).ok()?;
-        self.hit(key)
+    pub fn hit_or_repair(
+        &self,
+        _: &Entered,
+        key: &str,
+        kind: &str,
+    ) -> Result<Option<Record>, StoreError> {
+        let Some(record) = self.record(key)? else { return Ok(None) };
+        let is_whole = self.is_whole(&record.output)? || self.repair(&record.output, kind)?;
+        Ok(is_whole.then_some(record))
     }
 
-    /// The record of a key. One that doesn't parse counts as absent: the action is run again.
-    pub fn record(&self, key: &str) -> Option<Record> {
-        let bytes = fs::read(self.action(key, "json")).ok()?;
-        serde_json::from_slice(&bytes).ok()
+    /// The record of a key. A damaged one counts as absent: the action is run again.
+    pub fn record(&self, key: &str) -> Result<Option<Record>, StoreError> {
+        match self.undamaged_record(key) {
+            Err(StoreError::Content { .. }) => Ok(None),
+            record => record,
+        }
     }
 
-    /// All records, sorted by key.
+    /// The record of a key. A damaged one, or one of another key, is [`StoreError::Content`].
+    pub fn undamaged_record(&self, key: &str) -> Result<Option<Record>, StoreError> {
+        let path = self.action(key, "json");
+        let Some(bytes) = read_if_found(&path)? else { return Ok(None) };
+        let problem = match serde_json::from_slice::<Record>(&bytes) {
+            Ok(record) if record.key() == key => return Ok(Some(record)),
+            Ok(_) => "the record is of another action".to_owned(),
+            Err(error) => format!("the record is damaged: {error}"),
+        };
+        let remedy = "`nerf-sr verify --remove` removes it".to_owned();
+        Err(StoreError::Content { path, problem, remedy })
+    }
+
+    /// All records, sorted by key, without the damaged ones.
     pub fn records(&self) -> Result<Vec<Record>, StoreError> {
-        let keys = self.names("actions")?;
-        Ok(keys.iter().filter_map(|name| self.record(name.strip_suffix(".json")?)).collect())
+        let mut records = Vec::new();
+        for key in self.action_files()? {
+            records.extend(self.record(&key)?);
+        }
+        Ok(records)
     }
 
-    /// Keys that have any file among the actions, sorted: records that can't be read are among
-    /// them.
+    /// Keys that have any file among the actions, sorted: those of damaged records are among them.
     pub fn action_files(&self) -> Result<Vec<String>, StoreError> {
-        let names = self.names("actions")?;
-        let mut keys: Vec<String> =
-            names.iter().filter_map(|name| Some(name.rsplit_once('.')?.0.to_owned())).collect();
+        let mut keys = Vec::new();
+        for name in self.names("actions")? {
+            // Other names are somebody else's.
+            if let Some((key, "json" | "log")) = name.rsplit_once('.')
+                && is_hash(key)
+            {
+                keys.push(key.to_owned());
+            }
+        }
         keys.dedup();
         Ok(keys)
     }
@@ -131,24 +151,35 @@ impl Store {
         self.names("partial")
     }
 
-    /// An action that was begun, where its file is whole.
-    pub fn unfinished(&self, key: &str) -> Option<Unfinished> {
-        serde_json::from_slice(&fs::read(self.partial(key).join("action.json")).ok()?).ok()
+    /// An action that was begun, where its file is whole: a kill may have cut the file short.
+    pub fn unfinished(&self, key: &str) -> Result<Option<Unfinished>, StoreError> {
+        let bytes = read_if_found(&self.partial(key).join("action.json"))?;
+        Ok(bytes.and_then(|bytes| serde_json::from_slice(&bytes).ok()))
     }
 
     /// Whether an unfinished action left a checkpoint.
-    pub fn has_checkpoint(&self, key: &str) -> bool {
-        let files = walkdir::WalkDir::new(self.partial(key).join("work")).into_iter().flatten();
-        files.into_iter().any(|entry| entry.file_type().is_file())
+    pub fn has_checkpoint(&self, key: &str) -> Result<bool, StoreError> {
+        let work = self.partial(key).join("work");
+        for entry in walkdir::WalkDir::new(&work) {
+            match entry {
+                Ok(entry) if entry.file_type().is_file() => return Ok(true),
+                Ok(_) => {}
+                Err(error) => {
+                    let path = error.path().unwrap_or(&work).to_path_buf();
+                    let source = io::Error::from(error);
+                    if source.kind() != io::ErrorKind::NotFound {
+                        return Err(StoreError::Io { path, source });
+                    }
+                }
+            }
+        }
+        Ok(false)
     }
 
     /// Writes a record, in place of the one that its key has.
     pub(crate) fn write_record(&self, record: &Record) -> Result<(), StoreError> {
         let path = self.action(&record.key(), "json");
-        let mut text = serde_json::to_string_pretty(record)
-            .map_err(|e| StoreError::NoArtifact(e.to_string()))?;
-        text.push('\n');
-        at(&path, write_atomically(&path, text.as_bytes()))
+        at(&path, write_json_atomically(&path, record))
     }
 
     /// Removes an action's record and log.
@@ -171,10 +202,10 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
-    use artifact::Damage;
+    use artifact::{Damage, MANIFEST_FILE};
 
     use super::*;
-    use crate::testing::{entered, make};
+    use crate::testing::{UNREADABLE, begin, entered, make};
 
     #[test]
     fn a_lost_file_is_a_miss_and_a_flipped_byte_is_found() {
@@ -184,11 +215,78 @@ mod tests {
         fs::write(store.object(&done.output).join("x"), "1235").unwrap();
         assert!(matches!(store.verify(&done.output), Err(Damage::Content { .. })));
         fs::remove_file(store.object(&done.output).join("x")).unwrap();
-        assert_eq!(store.hit(&done.key()), None);
-        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text"), None);
+        assert_eq!(store.hit(&done.key()).unwrap(), None);
+        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap(), None);
         // Made again, the damaged object is replaced.
         make(&store, "a", "1234");
         store.verify(&done.output).unwrap();
+    }
+
+    /// A record that can't be read is no missing one; each look names it.
+    #[test]
+    fn unreadable_records_are_errors() {
+        for damage in UNREADABLE {
+            let dir = tempfile::tempdir().unwrap();
+            let store = Store::open(dir.path()).unwrap();
+            let key = make(&store, "a", "1234").key();
+            damage(&store.action(&key, "json"));
+            for problem in [
+                store.record(&key).err(),
+                store.hit(&key).err(),
+                store.hit_or_repair(&entered(&store), &key, "text").err(),
+                store.records().err(),
+            ] {
+                let said = problem.unwrap().to_string();
+                assert!(said.contains(&format!("actions/{key}.json: ")), "{said}");
+            }
+        }
+    }
+
+    /// A damaged record counts as absent, unless one asks for it; and so does another action's: a
+    /// swapped file is no hit.
+    #[test]
+    fn damaged_records_are_no_hits() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let (a, b) = (make(&store, "a", "1234"), make(&store, "b", "5678"));
+        let path = store.action(&a.key(), "json");
+        for (bytes, words) in [
+            (Vec::new(), "the record is damaged"),
+            (b"{\"stage\":".to_vec(), "the record is damaged"),
+            (fs::read(store.action(&b.key(), "json")).unwrap(), "of another action"),
+        ] {
+            fs::write(&path, bytes).unwrap();
+            assert_eq!(store.hit(&a.key()).unwrap(), None);
+            assert_eq!(store.records().unwrap(), std::slice::from_ref(&b));
+            let said = store.undamaged_record(&a.key()).unwrap_err().to_string();
+            assert!(said.contains(words) && said.contains("verify --remove"), "{said}");
+        }
+        fs::write(dir.path().join("actions/notes.txt"), "mine").unwrap();
+        fs::write(dir.path().join("actions/notes.json"), "mine").unwrap();
+        let mut keys = [a.key(), b.key()];
+        keys.sort();
+        assert_eq!(store.action_files().unwrap(), keys, "the others are somebody else's");
+    }
+
+    #[test]
+    fn unreadable_actions_that_were_begun_are_errors() {
+        for damage in UNREADABLE {
+            let dir = tempfile::tempdir().unwrap();
+            let store = Store::open(dir.path()).unwrap();
+            let attempt = begin(&store, "a", None);
+            let key = store.partials().unwrap().remove(0);
+            assert!(store.unfinished(&key).unwrap().is_some());
+            assert!(!store.has_checkpoint(&key).unwrap());
+            let file = store.partial(&key).join("action.json");
+            fs::write(&file, "{\"sta").unwrap();
+            assert_eq!(store.unfinished(&key).unwrap(), None, "cut by a kill");
+            damage(&file);
+            let said = store.unfinished(&key).unwrap_err().to_string();
+            assert!(said.contains("action.json: "), "{said}");
+            fs::create_dir_all(&attempt.work).unwrap();
+            fs::write(attempt.work.join("checkpoint"), "").unwrap();
+            assert!(store.has_checkpoint(&key).unwrap());
+        }
     }
 
     /// Whatever became of a manifest, it is written again; whatever stands in an object's place, it
@@ -206,16 +304,14 @@ mod tests {
             if let Some(bytes) = damage {
                 fs::write(&manifest, bytes).unwrap();
             }
-            assert_eq!(store.hit(&done.key()), None);
-            assert_eq!(
-                store.hit_or_repair(&entered(&store), &done.key(), "text").as_ref(),
-                Some(&done)
-            );
+            assert_eq!(store.hit(&done.key()).unwrap(), None);
+            let repaired = store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap();
+            assert_eq!(repaired.as_ref(), Some(&done));
             store.verify(&done.output).unwrap();
         }
         fs::remove_dir_all(&object).unwrap();
         fs::write(&object, "a file").unwrap();
-        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text"), None);
+        assert_eq!(store.hit_or_repair(&entered(&store), &done.key(), "text").unwrap(), None);
         assert_eq!(make(&store, "a", "1234"), done);
         fs::remove_file(&manifest).unwrap();
         assert_eq!(make(&store, "a", "1234"), done);

@@ -37,17 +37,21 @@ impl Store {
     pub fn take_in(&self, _: &Entered, arrival: &Arrival) -> Result<(), StoreError> {
         // Somebody else may have put it there meanwhile: then readers shall not miss it for a
         // moment.
-        let is_there = !arrival.replaces && self.is_whole(&arrival.identity);
+        let is_there = !arrival.replaces && self.is_whole(&arrival.identity)?;
         self.place(&arrival.folder, &arrival.identity, is_there)
     }
 
     /// Takes in a record that came from another store, after its object; whether it was new. The
     /// record that is there stays, unless its object isn't whole and the new one's is.
     pub fn take_in_record(&self, _: &Entered, record: &Record) -> Result<bool, StoreError> {
-        let known = self.record(&record.key());
-        let stays = known.is_some_and(|known| {
-            self.is_whole(&known.output) || !self.is_whole(&record.output) || known == *record
-        });
+        let stays = match self.record(&record.key())? {
+            Some(known) => {
+                known == *record
+                    || self.is_whole(&known.output)?
+                    || !self.is_whole(&record.output)?
+            }
+            None => false,
+        };
         if !stays {
             self.write_record(record)?;
         }
@@ -98,11 +102,11 @@ mod tests {
         assert!(is_new);
         assert!(!take_from(&store, &entered, "second").0);
         let key = record("", "").key();
-        assert_eq!(store.hit(&key).unwrap().host, "first");
+        assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
         fs::write(store.object(&identity).join("x"), "12").unwrap();
         take_from(&store, &entered, "third");
         store.verify(&identity).unwrap();
-        assert_eq!(store.hit(&key).unwrap().host, "first");
+        assert_eq!(store.hit(&key).unwrap().unwrap().host, "first");
     }
 
     #[test]
@@ -122,7 +126,7 @@ mod tests {
         fs::remove_file(folder.join("x")).unwrap();
         assert!(matches!(
             store.check_arrival(&folder, &identity),
-            Err(StoreError::Damage(Damage::Unreadable { .. }))
+            Err(StoreError::Damage(Damage::Missing { .. }))
         ));
         assert!(store.objects().unwrap().is_empty());
     }

@@ -125,7 +125,7 @@ mod tests {
         assert_eq!(a.output, b.output);
         assert_ne!(a.key(), b.key());
         assert_eq!(store.objects().unwrap(), std::slice::from_ref(&a.output));
-        assert_eq!(store.hit(&a.key()), Some(a));
+        assert_eq!(store.hit(&a.key()).unwrap(), Some(a));
         assert!(store.partials().unwrap().is_empty());
     }
 

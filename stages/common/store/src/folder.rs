@@ -1,7 +1,6 @@
 use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
 
 use artifact::unix_time;
 
@@ -74,18 +73,26 @@ impl Store {
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
             entries => at(&folder, entries)?,
         };
-        let mut names: Vec<String> = entries
-            .filter_map(|e| e.ok()?.file_name().into_string().ok())
-            .filter(|n| !n.starts_with('.'))
-            .collect();
+        let mut names = Vec::new();
+        for entry in entries {
+            // A name that isn't UTF-8 is somebody else's.
+            names.extend(at(&folder, entry)?.file_name().into_string().ok());
+        }
+        names.retain(|name| !name.starts_with('.'));
         names.sort_unstable();
         Ok(names)
     }
 
     /// Takes a file or folder out of sight at once; [`Store::empty_trash`] deletes it.
     pub(crate) fn discard(&self, path: &Path) -> Result<(), StoreError> {
-        let place = format!("{}-{}-{}", unix_time(), std::process::id(), unique());
-        at(path, fs::rename(path, self.root.join("trash").join(place)))
+        use io::ErrorKind::{AlreadyExists, DirectoryNotEmpty};
+        loop {
+            let place = self.root.join("trash").join(unique_name(unix_time())?);
+            match fs::rename(path, place) {
+                Err(error) if matches!(error.kind(), AlreadyExists | DirectoryNotEmpty) => {}
+                result => return at(path, result),
+            }
+        }
     }
 
     /// Deletes what was removed. It may take its time, and may be cut short at any point.
@@ -104,8 +111,10 @@ impl Store {
     }
 }
 
-/// Tells names apart that one process gives.
-pub(crate) fn unique() -> u32 {
-    static COUNT: AtomicU32 = AtomicU32::new(0);
-    COUNT.fetch_add(1, Ordering::Relaxed)
+/// Returns a name that sorts by time and that nobody else gives: time, process and random digits.
+/// The first process of every container has the number 1.
+pub(crate) fn unique_name(unix: u64) -> Result<String, StoreError> {
+    let random = getrandom::u32().map_err(io::Error::from);
+    let random = at(Path::new("random numbers of the system"), random)?;
+    Ok(format!("{unix}-{}-{random:08x}", std::process::id()))
 }

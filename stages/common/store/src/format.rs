@@ -4,7 +4,7 @@ use std::path::Path;
 
 use artifact::write_atomically;
 
-use crate::error::{StoreError, at};
+use crate::error::{StoreError, at, lock_error};
 use crate::folder::Store;
 
 /// Version of a store's layout. It grows when an older runner could harm what a newer one wrote.
@@ -69,7 +69,7 @@ impl Store {
             }
             gate => gate?,
         };
-        at(self.root(), gate.lock())?;
+        gate.lock().map_err(|source| lock_error(&self.gate_path(), source))?;
         // A still newer program may have been faster.
         self.check_format()?;
         let path = self.root().join("format");
@@ -125,12 +125,12 @@ mod tests {
         }
         drop(checked);
         assert_eq!(
-            (newer.objects().unwrap(), newer.hit(&done.key())),
+            (newer.objects().unwrap(), newer.hit(&done.key()).unwrap()),
             (vec![done.output.clone()], Some(done))
         );
         // It makes what the older one left half made.
         let made = make(&newer, "b", "5678");
-        assert_eq!(newer.hit(&made.key()), Some(made));
+        assert_eq!(newer.hit(&made.key()).unwrap(), Some(made));
         Store::open_as(dir.path(), 2).unwrap();
         assert_eq!(fs::read_to_string(dir.path().join("format")).unwrap(), "2\n");
     }

@@ -9,6 +9,9 @@
 //!   clear of each other.
 //! * [`RunFile`], [`Run`], [`Waiting`]: what runs and pins need.
 //!
+//! Only a file that is not found counts as absent. Any other error while reading is an error that
+//! names the file, for what can't be read may be needed.
+//!
 //! Stages don't use this crate: they write a folder, and the runner takes it in.
 //!
 //! ```no_run
@@ -23,7 +26,7 @@
 //!     let checked = store.check(attempt, "text")?;
 //!     let record = Record { stage: action.stage, ..Record::default() };
 //!     let record = store.publish(&entered, checked, record)?;
-//!     assert_eq!(store.hit(&record.key()), Some(record));
+//!     assert_eq!(store.hit(&record.key())?, Some(record));
 //! }
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
@@ -38,6 +41,7 @@ mod folder;
 mod format;
 mod lock;
 mod objects;
+mod run;
 mod runs;
 #[cfg(test)]
 mod testing;
@@ -45,9 +49,9 @@ mod testing;
 pub use action::{KEY_VERSION, KEY_VERSION_PART, Record, Unfinished};
 pub use arrivals::Arrival;
 pub use attempt::{Attempt, Checked};
-pub use error::StoreError;
+pub use error::{StoreError, is_taken};
 pub use folder::Store;
 pub use format::FORMAT;
 pub use lock::{Closed, Entered, Holder, KeyLock, Locked, host_name};
 pub use objects::is_hash;
-pub use runs::{Run, RunFile, Waiting};
+pub use run::{Run, RunFile, Waiting};

@@ -1,4 +1,4 @@
-use std::fs::{self, File, TryLockError};
+use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use artifact::unix_time;
 use serde::{Deserialize, Serialize};
 
-use crate::error::{StoreError, at};
+use crate::error::{StoreError, at, is_taken};
 use crate::folder::Store;
 
 /// The lock on a key; held while it, or a process that was handed its [`KeyLock::file`], lives.
@@ -78,12 +78,8 @@ impl Store {
         loop {
             let mut file =
                 at(&path, File::options().create(true).read(true).append(true).open(&path))?;
-            match file.try_lock() {
-                Ok(()) => {}
-                Err(TryLockError::WouldBlock) => return Ok(Locked::By(holder_in(&path))),
-                Err(TryLockError::Error(error)) => {
-                    return Err(StoreError::Io { path, source: error });
-                }
+            if !is_taken(&path, file.try_lock())? {
+                return Ok(Locked::By(holder_in(&path)));
             }
             // Garbage collection may have removed the file between opening and locking: then the
             // lock is another file's.
@@ -98,9 +94,13 @@ impl Store {
 
     /// Keys whose locks somebody holds, sorted.
     pub fn locked_keys(&self) -> Result<Vec<String>, StoreError> {
-        let mut keys = self.lock_files()?;
-        keys.retain(|key| is_locked(&self.lock_path(key)));
-        Ok(keys)
+        let mut locked = Vec::new();
+        for key in self.lock_files()? {
+            if is_locked(&self.lock_path(&key))? {
+                locked.push(key);
+            }
+        }
+        Ok(locked)
     }
 
     /// Keys that have a lock's file, held or not, sorted.
@@ -131,36 +131,41 @@ impl Store {
             {
                 return Ok(Locked::Held(Entered { _file: None }));
             }
+            // Who may only read the store keeps garbage collection away, too.
+            Err(StoreError::Io { source, .. })
+                if source.kind() == io::ErrorKind::PermissionDenied =>
+            {
+                at(&path, File::open(&path))?
+            }
             file => file?,
         };
-        match file.try_lock_shared() {
-            Ok(()) => self.check_format().map(|_| Locked::Held(Entered { _file: Some(file) })),
-            Err(TryLockError::WouldBlock) => Ok(Locked::By(holder_in(&path))),
-            Err(TryLockError::Error(source)) => Err(StoreError::Io { path, source }),
+        if !is_taken(&path, file.try_lock_shared())? {
+            return Ok(Locked::By(holder_in(&path)));
         }
+        self.check_format()?;
+        Ok(Locked::Held(Entered { _file: Some(file) }))
     }
 
     /// Closes the store unless somebody is inside, or a newer program has marked it meanwhile.
     pub fn try_close(&self) -> Result<Locked<Closed>, StoreError> {
-        let path = self.gate_path();
         let mut file = self.gate()?;
-        match file.try_lock() {
-            Ok(()) => {
-                self.check_format()?;
-                let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
-                file.set_len(0).and_then(|()| file.write_all(text.as_bytes())).ok();
-                Ok(Locked::Held(Closed { _file: file }))
-            }
-            Err(TryLockError::WouldBlock) => Ok(Locked::By(None)),
-            Err(TryLockError::Error(source)) => Err(StoreError::Io { path, source }),
+        if !is_taken(&self.gate_path(), file.try_lock())? {
+            return Ok(Locked::By(None));
         }
+        self.check_format()?;
+        let text = serde_json::to_string(&Holder::this_process()).unwrap_or_default();
+        file.set_len(0).and_then(|()| file.write_all(text.as_bytes())).ok();
+        Ok(Locked::Held(Closed { _file: file }))
     }
 }
 
-/// Whether somebody holds the lock of a file.
-pub(crate) fn is_locked(path: &Path) -> bool {
-    File::open(path)
-        .is_ok_and(|file| matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock)))
+/// Returns whether somebody holds the lock of a file; nobody does if the file is not found.
+pub(crate) fn is_locked(path: &Path) -> Result<bool, StoreError> {
+    let file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
+        file => at(path, file)?,
+    };
+    Ok(!is_taken(path, file.try_lock_shared())?)
 }
 
 fn holder_in(path: &Path) -> Option<Holder> {
@@ -179,6 +184,7 @@ fn is_at(file: &File, path: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::testing::UNREADABLE;
 
     fn store() -> (tempfile::TempDir, Store) {
         let dir = tempfile::tempdir().unwrap();
@@ -230,6 +236,18 @@ mod tests {
         drop(lock);
         store.remove_lock("k").unwrap();
         assert!(!dir.path().join("locks/k").exists());
+    }
+
+    /// A lock's file that can't be read may be held.
+    #[test]
+    fn unreadable_locks_are_errors() {
+        let (dir, store) = store();
+        drop(held(store.try_lock("k").unwrap()));
+        assert!(store.locked_keys().unwrap().is_empty());
+        let [_, loops] = UNREADABLE;
+        loops(&dir.path().join("locks/k"));
+        let said = store.locked_keys().unwrap_err().to_string();
+        assert!(said.contains("locks/k: "), "{said}");
     }
 
     #[test]

@@ -2,7 +2,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
-use artifact::{Damage, MANIFEST_FILE, Manifest, sync_folder};
+use artifact::{Damage, MANIFEST_FILE, Manifest, sync_folder, write_json_atomically};
 
 use crate::error::{StoreError, at};
 use crate::folder::Store;
@@ -29,11 +29,15 @@ impl Store {
         Ok(foreign)
     }
 
-    /// Whether an object has its own manifest and files of the right sizes; no content is read.
-    pub fn is_whole(&self, identity: &str) -> bool {
-        let manifest =
-            self.manifest(identity).ok().filter(|manifest| manifest.identity() == identity);
-        manifest.is_some_and(|manifest| manifest.check_sizes(&self.object(identity)).is_ok())
+    /// Returns whether an object has its own manifest and files of the right sizes; no content is
+    /// read. An object that can't be read is an error.
+    pub fn is_whole(&self, identity: &str) -> Result<bool, Damage> {
+        let manifest = self.own_manifest(identity);
+        match manifest.and_then(|manifest| manifest.check_sizes(&self.object(identity))) {
+            Ok(()) => Ok(true),
+            Err(unreadable @ Damage::Unreadable { .. }) => Err(unreadable),
+            Err(_) => Ok(false),
+        }
     }
 
     /// An object's manifest.
@@ -43,12 +47,36 @@ impl Store {
 
     /// Re-hashes one object.
     pub fn verify(&self, identity: &str) -> Result<(), Damage> {
-        let folder = self.object(identity);
+        self.own_manifest(identity)?.check_contents(&self.object(identity))
+    }
+
+    /// Returns an object's manifest if the manifest is the object's own.
+    fn own_manifest(&self, identity: &str) -> Result<Manifest, Damage> {
         let manifest = self.manifest(identity)?;
         if manifest.identity() != identity {
-            return Err(Damage::Content { path: folder.join(MANIFEST_FILE) });
+            return Err(Damage::Content { path: self.object(identity).join(MANIFEST_FILE) });
         }
-        manifest.check_contents(&folder)
+        Ok(manifest)
+    }
+
+    /// Writes an object's manifest again if the files beside it have the object's identity; returns
+    /// whether they have.
+    pub(crate) fn repair(&self, identity: &str, kind: &str) -> Result<bool, StoreError> {
+        use io::ErrorKind::{NotADirectory, NotFound, Other};
+        let object = self.object(identity);
+        let found = match Manifest::of_folder(kind, &object) {
+            // Files are missing, or have names that no manifest can have.
+            Err(error) if matches!(error.kind(), NotFound | NotADirectory | Other) => {
+                return Ok(false);
+            }
+            found => at(&object, found)?,
+        };
+        if found.identity() != identity {
+            return Ok(false);
+        }
+        let path = object.join(MANIFEST_FILE);
+        at(&path, write_json_atomically(&path, &found))?;
+        Ok(true)
     }
 
     /// Moves a checked folder to an object's place, unless a whole object `is_there`. Two actions
@@ -75,8 +103,10 @@ impl Store {
                     ) => {}
                 Err(source) => return Err(StoreError::Io { path: object, source }),
             }
-            if self.verify(identity).is_ok() {
-                return Ok(());
+            match self.verify(identity) {
+                Ok(()) => return Ok(()),
+                Err(unreadable @ Damage::Unreadable { .. }) => return Err(unreadable.into()),
+                Err(_) => {}
             }
             match self.discard(&object) {
                 // The other action was faster.
@@ -86,9 +116,15 @@ impl Store {
         }
     }
 
-    /// Removes an object; records that name it count as absent from then on.
+    /// Removes an object; records that name it count as absent from then on. Somebody else may have
+    /// removed it already.
     pub fn remove_object(&self, identity: &str) -> Result<(), StoreError> {
-        self.discard(&self.object(identity))
+        match self.discard(&self.object(identity)) {
+            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                Ok(())
+            }
+            result => result,
+        }
     }
 }
 
@@ -110,7 +146,8 @@ pub(crate) fn make_durable(folder: &Path, manifest: &Manifest) -> Result<(), Sto
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::make;
+    use crate::action::Record;
+    use crate::testing::{UNREADABLE, begin, entered, make};
 
     /// A name is either an object's or foreign.
     #[test]
@@ -131,6 +168,31 @@ mod tests {
         assert!(is_hash(&"0a".repeat(32)));
         for name in ["", "..", &"0A".repeat(32), &"g".repeat(64), &"0".repeat(63), "/etc/passwd"] {
             assert!(!is_hash(name), "{name}");
+        }
+    }
+
+    /// An object that can't be read may be whole: it is neither a miss nor replaced.
+    #[test]
+    fn unreadable_objects_are_errors() {
+        let [folder, looped] = UNREADABLE;
+        for (file, damage) in [(MANIFEST_FILE, folder), (MANIFEST_FILE, looped), ("x", looped)] {
+            let dir = tempfile::tempdir().unwrap();
+            let store = Store::open(dir.path()).unwrap();
+            let done = make(&store, "a", "1234");
+            let path = store.object(&done.output).join(file);
+            damage(&path);
+            let checked = store.check(begin(&store, "b", Some("1234")), "text").unwrap();
+            for problem in [
+                store.is_whole(&done.output).map_err(StoreError::from).err(),
+                store.hit(&done.key()).err(),
+                store.verify(&done.output).map_err(StoreError::from).err(),
+                store.publish(&entered(&store), checked, Record::default()).err(),
+            ] {
+                let said = problem.unwrap().to_string();
+                let words = format!("cannot read {}", path.display());
+                assert!(said.starts_with(&words) && !said.contains("--remove"), "{said}");
+            }
+            assert!(path.symlink_metadata().is_ok(), "it stays");
         }
     }
 

@@ -1,184 +1,81 @@
-use std::collections::BTreeSet;
 use std::fs::{self, File};
-use std::io::{self, Write as _};
-use std::path::{Path, PathBuf};
+use std::io;
+use std::path::PathBuf;
 
-use artifact::{unix_time, write_atomically};
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
+use artifact::write_atomically;
 
-use crate::action::Record;
-use crate::error::{StoreError, at};
-use crate::folder::{Store, unique};
-use crate::lock::{Entered, Holder, is_locked};
-
-/// A line of a run's file: what the run needs becomes known while it goes on.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum RunLine {
-    /// The first: who runs what.
-    Run { holder: Holder, command: Vec<String> },
-    /// An action whose record or checkpoints it needs.
-    Action { stage: String, key: String },
-    /// An action whose key depends on what others will make.
-    Waiting(Waiting),
-    /// The last, unless the run was killed.
-    Ended { unix: u64 },
-}
-
-/// A node that can't have a key yet. Any record of its stage with its parameters may turn out to be
-/// its own.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Waiting {
-    /// Name of the program, as in the key's part `stage`.
-    pub program: String,
-    /// All parameters, as in the key's parts `parameter NAME`.
-    pub parameters: Map<String, Value>,
-}
-
-impl Waiting {
-    /// Whether a record may be the node's.
-    pub fn may_be(&self, record: &Record) -> bool {
-        let named = record
-            .key_parts
-            .iter()
-            .filter_map(|(name, value)| Some((name.strip_prefix("parameter ")?, value)));
-        record.key_parts.get("stage").and_then(Value::as_str) == Some(&self.program)
-            && named.clone().count() == self.parameters.len()
-            && named.into_iter().all(|(name, value)| self.parameters.get(name) == Some(value))
-    }
-}
-
-/// What is written down of a run: `runs/ID.jsonl`. A pin, `pins/NAME.jsonl`, has the same form.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Run {
-    /// The file's name without its ending.
-    pub id: String,
-    /// Who runs it, where the file says so.
-    pub holder: Option<Holder>,
-    /// The command line.
-    pub command: Vec<String>,
-    /// Keys of the actions that it needs.
-    pub keys: BTreeSet<String>,
-    /// Nodes whose keys weren't known when it started.
-    pub waiting: Vec<Waiting>,
-    /// When it ended; a run that was killed has none.
-    pub ended_unix: Option<u64>,
-    /// Whether it goes on right now.
-    pub in_progress: bool,
-}
-
-impl Run {
-    /// When it was last known to go on, seconds since 1970.
-    pub fn used_unix(&self) -> u64 {
-        self.ended_unix.or(self.holder.as_ref().map(|h| h.since_unix)).unwrap_or_default()
-    }
-
-    fn read(path: &Path) -> Option<Self> {
-        let id = path.file_stem()?.to_str()?.to_owned();
-        let text = String::from_utf8_lossy(&fs::read(path).ok()?).into_owned();
-        let mut run = Self {
-            id,
-            holder: None,
-            command: Vec::new(),
-            keys: BTreeSet::new(),
-            waiting: Vec::new(),
-            ended_unix: None,
-            in_progress: is_locked(path),
-        };
-        // A line that a kill cut short says nothing.
-        for line in text.lines().filter_map(|line| serde_json::from_str(line).ok()) {
-            match line {
-                RunLine::Run { holder, command } => {
-                    (run.holder, run.command) = (Some(holder), command);
-                }
-                RunLine::Action { key, .. } => {
-                    run.keys.insert(key);
-                }
-                RunLine::Waiting(waiting) => run.waiting.push(waiting),
-                RunLine::Ended { unix } => run.ended_unix = Some(unix),
-            }
-        }
-        Some(run)
-    }
-}
-
-/// A run in progress, which writes down what it needs. Garbage collection keeps that as long as
-/// this lives, and as long afterwards as it is told to.
-#[derive(Debug)]
-pub struct RunFile {
-    id: String,
-    /// None in a store that can't be written: nobody collects garbage there.
-    file: Option<File>,
-}
-
-impl RunFile {
-    /// The run's own name.
-    pub fn id(&self) -> &str {
-        &self.id
-    }
-
-    /// The run needs this action. Whoever says so has entered the store, so that the action can't
-    /// go in between.
-    pub fn needs(&self, _: &Entered, stage: &str, key: &str) -> Result<(), StoreError> {
-        self.write(&RunLine::Action { stage: stage.to_owned(), key: key.to_owned() })
-    }
-
-    /// The run may need any record that this node may have.
-    pub fn waits(&self, _: &Entered, waiting: Waiting) -> Result<(), StoreError> {
-        self.write(&RunLine::Waiting(waiting))
-    }
-
-    /// The run has ended; what it needed is kept for as long as its owner wants.
-    pub fn end(self) -> Result<(), StoreError> {
-        self.write(&RunLine::Ended { unix: unix_time() })
-    }
-
-    fn write(&self, line: &RunLine) -> Result<(), StoreError> {
-        let Some(mut file) = self.file.as_ref() else { return Ok(()) };
-        let text =
-            serde_json::to_string(line).map_err(|e| StoreError::NoArtifact(e.to_string()))?;
-        // One write a line: threads of a run share the file.
-        at(Path::new(&self.id), file.write_all(format!("{text}\n").as_bytes()))
-    }
-}
+use crate::error::{StoreError, at, lock_error};
+use crate::folder::{Store, unique_name};
+use crate::lock::{Entered, Holder};
+use crate::run::{ENDING, Form, Run, RunFile, RunLine};
 
 impl Store {
     /// Begins a run's file. `command` is for people.
     pub fn begin_run(&self, _: &Entered, command: Vec<String>) -> Result<RunFile, StoreError> {
         let holder = Holder::this_process();
-        let folder = self.root().join("runs");
-        let id = format!("{}-{}-{}", holder.since_unix, holder.pid, unique());
-        let path = folder.join(format!("{id}.jsonl"));
-        let opened = fs::create_dir_all(&folder)
-            .and_then(|()| File::options().create_new(true).append(true).open(&path));
-        let file = match opened {
-            Ok(file) => Some(file),
-            Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => None,
-            Err(source) => return Err(StoreError::Io { path, source }),
-        };
-        if let Some(file) = &file {
-            at(&path, file.lock())?;
-        }
-        let run = RunFile { id, file };
+        let run = self.create_run(holder.since_unix)?;
         run.write(&RunLine::Run { holder, command })?;
         Ok(run)
     }
 
-    /// All runs that are written down, by their names.
+    /// Creates the locked file of a run that begins now.
+    fn create_run(&self, unix: u64) -> Result<RunFile, StoreError> {
+        loop {
+            let id = unique_name(unix)?;
+            let path = Form::Run.path(self, &id);
+            let opened = fs::create_dir_all(self.root().join(Form::Run.folder()))
+                .and_then(|()| File::options().create_new(true).append(true).open(&path));
+            match opened {
+                Ok(file) => {
+                    file.lock().map_err(|source| lock_error(&path, source))?;
+                    return Ok(RunFile { id, file: Some(file) });
+                }
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(error) if error.kind() == io::ErrorKind::ReadOnlyFilesystem => {
+                    return Ok(RunFile { id, file: None });
+                }
+                Err(source) => return Err(StoreError::Io { path, source }),
+            }
+        }
+    }
+
+    /// All runs that are written down, by their names. A damaged file is an error.
     pub fn runs(&self) -> Result<Vec<Run>, StoreError> {
-        self.read_runs("runs")
+        self.read_all(Form::Run)
     }
 
-    /// All pins, by their names.
+    /// All pins, by their names. A damaged pin is an error.
     pub fn pins(&self) -> Result<Vec<Run>, StoreError> {
-        self.read_runs("pins")
+        self.read_all(Form::Pin)
     }
 
-    fn read_runs(&self, folder: &str) -> Result<Vec<Run>, StoreError> {
-        let names = self.names(folder)?;
-        let files = names.iter().filter(|name| name.ends_with(".jsonl"));
-        Ok(files.filter_map(|name| Run::read(&self.root().join(folder).join(name))).collect())
+    /// The run or pin of a name.
+    pub fn run_or_pin(&self, name: &str) -> Result<Option<Run>, StoreError> {
+        for form in [Form::Run, Form::Pin] {
+            // No path is made of a name that isn't there.
+            if self.run_names(form)?.iter().any(|id| id == name) {
+                return Run::read(self, form, name);
+            }
+        }
+        Ok(None)
+    }
+
+    /// Names of all pins, damaged ones included, sorted.
+    pub fn pin_names(&self) -> Result<Vec<String>, StoreError> {
+        self.run_names(Form::Pin)
+    }
+
+    fn run_names(&self, form: Form) -> Result<Vec<String>, StoreError> {
+        let names = self.names(form.folder())?;
+        Ok(names.iter().filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect())
+    }
+
+    fn read_all(&self, form: Form) -> Result<Vec<Run>, StoreError> {
+        let mut runs = Vec::new();
+        for id in self.run_names(form)? {
+            runs.extend(Run::read(self, form, &id)?);
+        }
+        Ok(runs)
     }
 
     /// Pins actions under a name: garbage collection keeps them until [`Store::unpin`].
@@ -197,27 +94,23 @@ impl Store {
         );
         let texts = lines.iter().map(serde_json::to_string).collect::<Result<Vec<_>, _>>();
         let text = texts.map_err(|e| StoreError::NoArtifact(e.to_string()))?.join("\n") + "\n";
-        let path = self.pin_path(name);
+        let path = Form::Pin.path(self, name);
         at(&path, write_atomically(&path, text.as_bytes()))
     }
 
-    /// Takes a pin away; whether there was one.
+    /// Removes a pin, however damaged; returns whether there was one.
     pub fn unpin(&self, name: &str) -> Result<bool, StoreError> {
-        let path = self.pin_path(name);
-        match fs::remove_file(&path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
-            result => at(&path, result).map(|()| true),
+        match self.discard(&Form::Pin.path(self, name)) {
+            Err(StoreError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => {
+                Ok(false)
+            }
+            result => result.map(|()| true),
         }
-    }
-
-    fn pin_path(&self, name: &str) -> PathBuf {
-        self.root().join("pins").join(format!("{name}.jsonl"))
     }
 
     /// Removes a run's file, what its sinks left, and what it submitted to a cluster.
     pub fn remove_run(&self, id: &str) -> Result<(), StoreError> {
-        let (path, scratch) =
-            (self.root().join("runs").join(format!("{id}.jsonl")), self.scratch(id));
+        let (path, scratch) = (Form::Run.path(self, id), self.scratch(id));
         // A sink's leftovers have no value.
         fs::remove_dir_all(&scratch).ok();
         fs::remove_dir_all(self.root().join("slurm").join(id)).ok();
@@ -232,10 +125,13 @@ impl Store {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use serde_json::json;
 
     use super::*;
-    use crate::testing::entered;
+    use crate::run::Waiting;
+    use crate::testing::{UNREADABLE, entered};
 
     #[test]
     fn a_run_is_in_progress_while_its_file_is_held() {
@@ -264,43 +160,83 @@ mod tests {
     }
 
     #[test]
-    fn a_waiting_node_may_be_any_record_of_its_stage_and_parameters() {
-        let waiting = Waiting {
-            program: "prep".into(),
-            parameters: json!({"lr": 2, "kernel": null}).as_object().unwrap().clone(),
-        };
-        for (parts, expected) in [
-            (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
-                    "input a": "x"}),
-                true,
-            ),
-            (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
-                    "input a": "y", "code": "z"}),
-                true,
-            ),
-            (json!({"stage": "prep", "parameter lr": 3, "parameter kernel": null}), false),
-            (json!({"stage": "prep", "parameter lr": 2}), false),
-            (
-                json!({"stage": "prep", "parameter lr": 2, "parameter kernel": null,
-                    "parameter more": 1}),
-                false,
-            ),
-            (json!({"stage": "eval", "parameter lr": 2, "parameter kernel": null}), false),
-        ] {
-            let record =
-                Record { key_parts: parts.as_object().unwrap().clone(), ..Record::default() };
-            assert_eq!(waiting.may_be(&record), expected, "{parts}");
-        }
-    }
-
-    #[test]
     fn pins_come_and_go() {
         let dir = tempfile::tempdir().unwrap();
         let store = Store::open(dir.path()).unwrap();
         store.pin(&entered(&store), "paper", Vec::new(), &[("prep".into(), "k".into())]).unwrap();
         assert_eq!(store.pins().unwrap()[0].keys, BTreeSet::from(["k".to_owned()]));
+        assert_eq!(store.run_or_pin("paper").unwrap().unwrap().keys.len(), 1);
+        assert_eq!(store.run_or_pin("../pins/paper").unwrap(), None);
         assert!(store.unpin("paper").unwrap() && !store.unpin("paper").unwrap());
+    }
+
+    const FIRST: &str = r#"{"run":{"holder":{"pid":1,"host":"h","since_unix":5},"command":[]}}"#;
+    const ACTION: &str = r#"{"action":{"stage":"s","key":"k"}}"#;
+
+    /// What a kill or a full disk leaves of a run's file is read as far as it goes. A pin is written
+    /// whole, so it is read whole or not at all.
+    #[test]
+    fn damaged_files_of_runs_and_pins_are_errors() {
+        let (whole, ended) = (format!("{FIRST}\n{ACTION}\n"), r#"{"ended":{"unix":9}}"#);
+        for (text, is_run, is_pin) in [
+            (whole.clone(), true, true),
+            (format!("{FIRST}\n{ACTION}"), true, true),
+            (format!("{FIRST}\n"), true, false),
+            (FIRST[..20].to_owned(), true, false),
+            (String::new(), true, false),
+            (format!("{whole}{{\"act"), true, false),
+            (format!("{FIRST}\n{{\"act{ACTION}\n{ended}\n"), true, false),
+            (format!("{ACTION}\n"), false, false),
+            ("my notes".to_owned(), false, false),
+            ("\0".repeat(100), false, false),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            let store = Store::open(dir.path()).unwrap();
+            for file in ["runs/x.jsonl", "pins/x.jsonl"] {
+                fs::write(dir.path().join(file), &text).unwrap();
+            }
+            assert_eq!((store.runs().is_ok(), store.pins().is_ok()), (is_run, is_pin), "{text:?}");
+            if let Err(error) = store.runs() {
+                let said = error.to_string();
+                assert!(said.contains("runs/x.jsonl") && said.contains("move it away"), "{said}");
+            }
+            if let Err(error) = store.pins() {
+                let said = error.to_string();
+                assert!(said.contains("pins/x.jsonl") && said.contains("unpin x`"), "{said}");
+            }
+            assert_eq!(store.pin_names().unwrap(), ["x"]);
+            assert!(store.unpin("x").unwrap() && store.pins().unwrap().is_empty());
+        }
+    }
+
+    #[test]
+    fn unreadable_files_of_runs_and_pins_are_errors() {
+        for (file, read) in [
+            ("runs/x.jsonl", Store::runs as fn(&Store) -> Result<Vec<Run>, StoreError>),
+            ("pins/x.jsonl", Store::pins),
+        ] {
+            for damage in UNREADABLE {
+                let dir = tempfile::tempdir().unwrap();
+                let store = Store::open(dir.path()).unwrap();
+                damage(&dir.path().join(file));
+                let said = read(&store).unwrap_err().to_string();
+                assert!(said.contains(file), "{said}");
+                assert!(store.run_or_pin("x").is_err());
+                assert_eq!(store.unpin("x").unwrap(), file.starts_with("pins"));
+            }
+        }
+    }
+
+    /// Two containers share a store, a second and the process number 1.
+    #[test]
+    fn names_of_runs_have_random_digits() {
+        let dir = tempfile::tempdir().unwrap();
+        let store = Store::open(dir.path()).unwrap();
+        let ids: BTreeSet<String> =
+            (0..100).map(|_| store.create_run(5).unwrap().id().to_owned()).collect();
+        assert_eq!(ids.len(), 100);
+        let random = |id: &String| u32::from_str_radix(id.rsplit_once('-').unwrap().1, 16).unwrap();
+        let large = ids.iter().filter(|id| random(id) > u32::MAX / 2).count();
+        assert!((20..80).contains(&large), "{large} of 100 have the first bit set");
     }
 }

@@ -1,6 +1,8 @@
 //! Actions for tests.
 
 use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::Path;
 
 use serde_json::json;
 
@@ -8,6 +10,18 @@ use crate::action::{Record, Unfinished};
 use crate::attempt::Attempt;
 use crate::folder::Store;
 use crate::lock::{Entered, Locked};
+
+/// Ways in which a file can't be read, not even by root: a folder in its place, and a loop of links.
+pub(crate) const UNREADABLE: [fn(&Path); 2] = [
+    |path| {
+        fs::remove_file(path).ok();
+        fs::create_dir(path).unwrap();
+    },
+    |path| {
+        fs::remove_file(path).ok();
+        symlink(path.file_name().unwrap(), path).unwrap();
+    },
+];
 
 pub(crate) fn entered(store: &Store) -> Entered {
     match store.try_enter().unwrap() {

@@ -78,7 +78,8 @@ impl NodeJob<'_> {
         let key = hash_json(&key_parts);
         let entered = self.enter()?;
         self.file.needs(&entered, &self.node.stage, &key).map_err(fail)?;
-        Ok(self.store.hit(&key).map_or(Found::ToDo(Action { key_parts, hashes }), Found::Cached))
+        let record = self.store.hit(&key).map_err(fail)?;
+        Ok(record.map_or(Found::ToDo(Action { key_parts, hashes }), Found::Cached))
     }
 
     /// Makes it; whether it had to.
@@ -100,7 +101,8 @@ impl NodeJob<'_> {
             let entered = self.enter()?;
             // Another runner may have made it while this one waited.
             let kind = &self.node.program.description.output.kind;
-            if let Some(record) = self.store.hit_or_repair(&entered, &key, kind) {
+            let record = self.store.hit_or_repair(&entered, &key, kind).map_err(fail)?;
+            if let Some(record) = record {
                 return Ok((record, false));
             }
             self.store.begin(&entered, &action, &self.node.parameters).map_err(fail)?

@@ -20,7 +20,7 @@ pub(crate) fn diff(
     json: bool,
 ) -> anyhow::Result<ExitCode> {
     let (before, now) = (side(session, before)?, side(session, now)?);
-    let differences = now.differences(&before, &session.store);
+    let differences = now.differences(&before, &session.store)?;
     if json {
         return print_json(&differences);
     }
@@ -50,8 +50,8 @@ fn lines(difference: &StageDifference) -> Vec<String> {
 /// key, or a stage with `-p` and `-i`.
 fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let store = &session.store;
-    if let Some(run) = store.runs()?.into_iter().chain(store.pins()?).find(|run| run.id == text) {
-        return Ok(Lineage::of(store, run.keys));
+    if let Some(run) = store.run_or_pin(text)? {
+        return Lineage::of(store, run.keys);
     }
     let is_hash = text.len() >= LEAST_HASH_LETTERS && text.bytes().all(|b| b.is_ascii_hexdigit());
     if is_hash {
@@ -66,7 +66,7 @@ fn side(session: &Session, text: &str) -> anyhow::Result<Lineage> {
                 ))
                 .into());
             }
-            return Ok(Lineage::of(store, [record.key()]));
+            return Lineage::of(store, [record.key()]);
         }
     }
     stage(session, text)
@@ -97,7 +97,7 @@ fn stage(session: &Session, text: &str) -> anyhow::Result<Lineage> {
     let states = session.states(&plan)?;
     match of_stage(&plan, &stage)?[..] {
         [index] => match &states[index] {
-            State::Cached(record) => Ok(Lineage::of(&session.store, [record.key()])),
+            State::Cached(record) => Lineage::of(&session.store, [record.key()]),
             _ => Err(Failure::BadInput(format!("{text} isn't made yet; run it first")).into()),
         },
         _ => {

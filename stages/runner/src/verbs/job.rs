@@ -48,15 +48,15 @@ pub(crate) fn job(folder: &Path, number: usize) -> anyhow::Result<ExitCode> {
 /// The command line of the run whose submission this is; nothing where that is forgotten.
 fn submitted_by(store: &Store, folder: &Path) -> Vec<String> {
     let id = folder.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-    let runs = store.runs().unwrap_or_default();
-    runs.into_iter().find(|run| run.id == id).map(|run| run.command).unwrap_or_default()
+    let run = store.run_or_pin(id).ok().flatten();
+    run.map(|run| run.command).unwrap_or_default()
 }
 
 /// Puts the job into the queue once more, where its stage has left something to go on from.
 fn go_on_later(plan: &Plan, store: &Store) -> anyhow::Result<()> {
     let state = plan.states(store)?.pop();
-    let has_checkpoint =
-        state.and_then(|state| state.key()).is_some_and(|key| store.has_checkpoint(&key));
+    let key = state.and_then(|state| state.key());
+    let has_checkpoint = key.map_or(Ok(false), |key| store.has_checkpoint(&key))?;
     let Some(id) = slurm::this_job().filter(|_| has_checkpoint) else {
         report_line!(
             "nerf-sr: its time is up, and it left no checkpoint to go on from; give it more \

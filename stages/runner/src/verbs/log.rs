@@ -2,8 +2,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::UNIX_EPOCH;
 
+use anyhow::Context as _;
 use artifact::{label, print_line, print_lines};
-use planning::{Plan, Request, State};
+use planning::{Plan, PlanError, Request, State};
 use stage_call::utc;
 use store::{Store, StoreError};
 
@@ -15,7 +16,7 @@ use crate::session::{Session, of_stage};
 pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Result<ExitCode> {
     let plan = session.plan(what)?;
     let nodes = of_stage(&plan, stage);
-    let logs = nodes.as_ref().map_or_else(|_| Vec::new(), |nodes| logs_of(session, &plan, nodes));
+    let logs = nodes.as_ref().map_or(Ok(Vec::new()), |nodes| logs_of(session, &plan, nodes))?;
     for (label, path, text) in &logs {
         print_line!("{label} ({}):", path.display());
         print_lines(text);
@@ -34,14 +35,21 @@ pub(crate) fn log(session: &Session, stage: &str, what: &Request) -> anyhow::Res
         utc(last.unix)
     );
     print_line!("{} ({}):", last.label, last.path.display());
-    print_lines(&text_of(&last.path));
+    print_lines(&text_of(&last.path)?);
     Ok(ExitCode::SUCCESS)
 }
 
 /// Label, file and text of the logs that there are of some nodes.
-fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, PathBuf, String)> {
+fn logs_of(
+    session: &Session,
+    plan: &Plan,
+    nodes: &[usize],
+) -> anyhow::Result<Vec<(String, PathBuf, String)>> {
     // What can't be known, say of a folder that is gone, may still have a log from before.
-    let Ok(states) = session.states(plan) else { return Vec::new() };
+    let states = match plan.states(&session.store) {
+        Err(PlanError::Source { .. }) => return Ok(Vec::new()),
+        states => states?,
+    };
     let jobs = job_logs(session, plan);
     let mut logs = Vec::new();
     for &node in nodes {
@@ -54,11 +62,11 @@ fn logs_of(session: &Session, plan: &Plan, nodes: &[usize]) -> Vec<(String, Path
             .chain(jobs.get(node).cloned().flatten())
             .filter(|path| path.is_file())
         {
-            let text = text_of(&path);
+            let text = text_of(&path)?;
             logs.push((plan.nodes[node].label(), path, text));
         }
     }
-    logs
+    Ok(logs)
 }
 
 /// What the newest job of each node said, where nodes were submitted.
@@ -84,36 +92,33 @@ struct StageRun {
 
 /// The last run of a stage, finished or not, whatever it was run with.
 fn last_of(store: &Store, stage: &str) -> Result<Option<StageRun>, StoreError> {
-    let finished = store.records()?.into_iter().map(|record| {
-        let unix = record.started_unix + record.seconds as u64;
-        (
-            record.stage.clone(),
-            StageRun {
-                unix,
-                label: label(&record.stage, &record.point),
-                path: store.action(&record.key(), "log"),
-            },
-        )
-    });
-    let unfinished = store.partials()?.into_iter().filter_map(|key| {
-        let (action, path) = (store.unfinished(&key)?, attempt_log(store, &key));
-        let unix = std::fs::metadata(&path)
-            .ok()?
-            .modified()
-            .ok()?
-            .duration_since(UNIX_EPOCH)
-            .ok()?
-            .as_secs();
-        Some((
-            action.stage.clone(),
-            StageRun { unix, label: label(&action.stage, &action.point), path },
-        ))
-    });
-    let of_stage =
-        finished.chain(unfinished).filter(|(name, run)| name == stage && run.path.is_file());
-    Ok(of_stage.map(|(_, run)| run).max_by_key(|run| run.unix))
+    let mut runs = Vec::new();
+    for record in store.records()?.into_iter().filter(|record| record.stage == stage) {
+        runs.push(StageRun {
+            unix: record.started_unix + record.seconds as u64,
+            label: label(&record.stage, &record.point),
+            path: store.action(&record.key(), "log"),
+        });
+    }
+    for key in store.partials()? {
+        let path = attempt_log(store, &key);
+        if let Some(action) = store.unfinished(&key)?.filter(|action| action.stage == stage)
+            && let Some(unix) = changed_unix(&path)
+        {
+            runs.push(StageRun { unix, label: label(&action.stage, &action.point), path });
+        }
+    }
+    runs.retain(|run| run.path.is_file());
+    Ok(runs.into_iter().max_by_key(|run| run.unix))
 }
 
-fn text_of(path: &Path) -> String {
-    String::from_utf8_lossy(&std::fs::read(path).unwrap_or_default()).into_owned()
+/// When a file was changed last, seconds since 1970; `None` if that isn't known.
+fn changed_unix(path: &Path) -> Option<u64> {
+    let time = std::fs::metadata(path).ok()?.modified().ok()?;
+    Some(time.duration_since(UNIX_EPOCH).ok()?.as_secs())
+}
+
+fn text_of(path: &Path) -> anyhow::Result<String> {
+    let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }

@@ -36,7 +36,7 @@ pub(crate) fn unpin(session: &Session, name: &str) -> anyhow::Result<ExitCode> {
         print_line!("{name} is no longer pinned");
         return Ok(ExitCode::SUCCESS);
     }
-    let known: Vec<String> = session.store.pins()?.into_iter().map(|pin| pin.id).collect();
+    let known = session.store.pin_names()?;
     let known = if known.is_empty() {
         "nothing is pinned".to_owned()
     } else {

@@ -13,7 +13,7 @@ pub(crate) fn plan(session: &Session, what: &Request, json: bool) -> anyhow::Res
     let plan = session.plan(what)?;
     let states = session.states(&plan)?;
     if json {
-        return print_json(&PlanReport::new(session, &plan, &states, &[]));
+        return print_json(&PlanReport::new(session, &plan, &states, &[])?);
     }
     for (i, state) in states.iter().enumerate() {
         print_line!("{:<40} {}", plan.nodes[i].label(), words(session, &plan, i, state, None));

@@ -15,7 +15,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
     let states = session.states(&plan)?;
     let (jobs, besides) = session.jobs(&plan);
     if json {
-        let mut report = PlanReport::new(session, &plan, &states, &[]);
+        let mut report = PlanReport::new(session, &plan, &states, &[])?;
         report.nodes.iter_mut().zip(jobs).for_each(|(node, job)| node.job = job);
         return print_json(&report);
     }
@@ -34,7 +34,7 @@ pub(crate) fn status(session: &Session, what: &Request, json: bool) -> anyhow::R
                 )
             }
             State::WillRun { key_parts }
-                if session.store.partial(&hash_json(key_parts)).join("work").exists() =>
+                if session.store.has_checkpoint(&hash_json(key_parts))? =>
             {
                 "has a checkpoint to go on from".to_owned()
             }

@@ -20,7 +20,7 @@ pub(crate) fn why(
     let states = session.states(&plan)?;
     let records = session.store.records()?;
     if json {
-        return print_json(&PlanReport::new(session, &plan, &states, &records).only(stage));
+        return print_json(&PlanReport::new(session, &plan, &states, &records)?.only(stage));
     }
     let line = |index: usize| explained(session, &plan, &states, &records, index);
     if let Some(sink) = plan.sinks.iter().find(|sink| sink.stage == stage) {
