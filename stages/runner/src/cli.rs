@@ -210,9 +210,9 @@ enum Verb {
         #[command(flatten)]
         what: What,
     },
-    /// Read every artifact again and compare its hashes
+    /// Read every artifact and record again, and compare hashes
     Verify {
-        /// Remove damaged artifacts, so that the next run makes them again
+        /// Remove damaged artifacts and records, so that the next run makes them again
         #[arg(long)]
         remove: bool,
     },

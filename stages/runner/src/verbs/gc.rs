@@ -1,9 +1,10 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use anyhow::Context as _;
 use artifact::{Failure, print_line, report_line};
 use garbage::{Choice, Root, Verdict, judge};
-use planning::Request;
+use planning::{PlanError, Request};
 use serde_json::json;
 use stage::stop_on_signals;
 use stage_call::seconds;
@@ -22,7 +23,7 @@ pub(crate) fn gc(
     let store = &session.store;
     let needed = needed(session, what)?;
     if style.dry_run {
-        return style.tell(&judge(store, needed, choice)?);
+        return style.tell(&judge(store, needed, choice).context(UNREAD)?);
     }
     let stop = stop_on_signals()?;
     let closed = match until_held(&stop, &|_, waited| say_wait(waited), || store.try_close()) {
@@ -30,12 +31,16 @@ pub(crate) fn gc(
         Err(failure) if failure.code == 130 => return Err(Failure::Interrupted.into()),
         Err(failure) => return Err(failure.into()),
     };
-    let verdict = judge(store, needed, choice)?;
+    let verdict = judge(store, needed, choice).context(UNREAD)?;
     verdict.carry_out(store, &closed)?;
     drop(closed);
     store.empty_trash()?;
     style.tell(&verdict)
 }
+
+/// What a problem means that comes before anything is decided.
+const UNREAD: &str =
+    "nothing was deleted: gc must read the whole store; make this readable or move it away";
 
 fn say_wait(waited: Duration) {
     report_line!(
@@ -77,8 +82,12 @@ impl Style {
 /// What the pipeline needs with these arguments.
 fn needed(session: &Session, what: &Request) -> anyhow::Result<Root> {
     let plan = session.plan(what)?;
+    let states = match plan.states(&session.store) {
+        Err(error @ PlanError::Store(_)) => return Err(anyhow::Error::from(error).context(UNREAD)),
+        states => states?,
+    };
     let mut root = Root { why: "the pipeline needs it".to_owned(), ..Root::default() };
-    for (node, state) in plan.nodes.iter().zip(session.states(&plan)?) {
+    for (node, state) in plan.nodes.iter().zip(states) {
         match state.key() {
             Some(key) => _ = root.keys.insert(key),
             None => root.waiting.push(node.waiting()),
