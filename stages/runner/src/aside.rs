@@ -22,11 +22,15 @@ pub(crate) struct Mark {
 }
 
 impl Mark {
-    /// Of a folder, where it has one. Earlier versions wrote the identity alone.
-    pub(crate) fn read(folder: &Path) -> Option<Self> {
-        let text = fs::read_to_string(folder.join(MARK)).ok()?;
+    /// Reads the mark of a folder; `None` if the folder has none. Earlier versions wrote the identity
+    /// alone.
+    pub(crate) fn read(folder: &Path) -> io::Result<Option<Self>> {
+        let text = match fs::read_to_string(folder.join(MARK)) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            text => text?,
+        };
         let older = || Self { identity: text.clone(), is_whole: true, data_sets: Vec::new() };
-        Some(serde_json::from_str(&text).unwrap_or_else(|_| older()))
+        Ok(Some(serde_json::from_str(&text).unwrap_or_else(|_| older())))
     }
 
     pub(crate) fn write(&self, folder: &Path) -> io::Result<()> {
@@ -45,22 +49,27 @@ impl Mark {
     }
 }
 
-/// Where the target's folder goes when a made one takes its place: beside it, under its data set's
-/// name. None where it may go for good. `is_ours` says whether a folder may be replaced.
+/// Where a page goes when one with a newer mark takes its place: beside the target, under its data
+/// set's name. None where it may go for good. `is_ours` says whether a folder may be replaced.
 pub(crate) fn place_aside(
-    made: &Path,
+    page: &Path,
+    newer: &Mark,
     target: &Path,
     is_ours: impl Fn(&Path) -> bool,
-) -> Option<PathBuf> {
-    let (new, old) = (Mark::read(made)?, Mark::read(target)?);
-    if !old.is_kept_from(&new) {
-        return None;
+) -> io::Result<Option<PathBuf>> {
+    let (Some(old), Some(name)) = (Mark::read(page)?, target.file_name().and_then(OsStr::to_str))
+    else {
+        return Ok(None);
+    };
+    if !old.is_kept_from(newer) {
+        return Ok(None);
     }
-    let name = format!("{}-{}", target.file_name()?.to_str()?, short_name(&old.data_sets));
-    (1..).map(|number| numbered(target, &name, number)).find(|place| {
-        place.symlink_metadata().is_err()
-            || (Mark::read(place).is_some_and(|mark| old.succeeds(&mark)) && is_ours(place))
-    })
+    let name = format!("{name}-{}", short_name(&old.data_sets));
+    let is_free = |place: &PathBuf| match Mark::read(place) {
+        Ok(Some(mark)) => old.succeeds(&mark) && is_ours(place),
+        _ => place.symlink_metadata().is_err(),
+    };
+    Ok((1..).map(|number| numbered(target, &name, number)).find(is_free))
 }
 
 /// A folder of this name beside the target, the first without a number.

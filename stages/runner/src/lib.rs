@@ -9,7 +9,7 @@
 //! * `execute`: carries out a plan, here or by a cluster's jobs; each node under its key's lock.
 //! * `watch`: shows one test view of a field while the field trains.
 //! * `sink`: hands the run's record (`recorded`) to stages that show it (the report), and puts what
-//!   they make in its place (`publish`, `aside`).
+//!   they make in its place (`publish`, `owned`, `aside`).
 
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 
@@ -21,6 +21,7 @@ mod identities;
 mod limits;
 mod lineage;
 mod node_report;
+mod owned;
 mod publish;
 mod recorded;
 mod remedy;

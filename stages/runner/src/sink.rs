@@ -34,8 +34,8 @@ pub(crate) fn is_shown(
 
 /// What became of a sink.
 pub(crate) enum Shown {
-    /// It ran and wrote this folder. What stood there and shows something else was put aside.
-    Written { folder: PathBuf, aside: Option<PathBuf> },
+    /// It ran and wrote this folder. Pages that show something else were put aside.
+    Written { folder: PathBuf, aside: Vec<PathBuf> },
     /// The folder shows this record already.
     UpToDate(PathBuf),
     /// Something it shows isn't there.

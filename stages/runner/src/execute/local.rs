@@ -321,7 +321,7 @@ fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Re
     let shown = shown.map_err(|e| anyhow!("{}: {e}", sink.stage))?;
     match &shown {
         Shown::Written { folder, aside } => {
-            say_aside(sink, aside.as_deref());
+            say_aside(sink, aside);
             print_line!("{}: {}", sink.stage, page(folder).display());
         }
         Shown::UpToDate(folder) => {
@@ -333,8 +333,8 @@ fn show_one(showing: &Showing<'_>, sink: &Sink, outcome: &Outcome) -> anyhow::Re
 }
 
 /// Says where what stood in a sink's place is now.
-pub(crate) fn say_aside(sink: &Sink, aside: Option<&Path>) {
-    if let Some(folder) = aside {
+pub(crate) fn say_aside(sink: &Sink, aside: &[PathBuf]) {
+    for folder in aside {
         print_line!("{}: what was there before is now {}", sink.stage, page(folder).display());
     }
 }

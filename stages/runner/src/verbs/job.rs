@@ -119,7 +119,7 @@ impl Task<'_> {
         let course = Course { command, ..Course::before(records) };
         match show(&showing, sink, &course)? {
             Shown::Written { folder, aside } => {
-                say_aside(sink, aside.as_deref());
+                say_aside(sink, &aside);
                 print_line!("{}: {}", sink.stage, folder.display());
             }
             Shown::UpToDate(folder) => print_line!("{}: {}", sink.stage, folder.display()),
