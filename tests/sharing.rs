@@ -217,6 +217,40 @@ fn somebody_elses_folder_is_not_replaced() {
     project.ok(&["run", "-p", "render-depth.samples_per_axis=2"]);
 }
 
+/// A run was killed when its page had taken the place of another data set's, which wasn't put aside
+/// yet: it is put aside by the next run, and the data set's page isn't lost.
+#[test]
+fn a_page_that_a_kill_left_is_put_aside() {
+    let project = Project::fast();
+    project.demo_data("demo");
+    for name in ["a", "b"] {
+        let mut copy = Command::new("cp");
+        copy.arg("-rL").args([project.path("data/demo"), project.path(name)]);
+        assert!(copy.status().unwrap().success());
+    }
+    let out = |name: &str| project.path("out").join(name);
+    let run = ["run", "-i", "dataset=a"];
+    project.ok(&run);
+    let page = std::fs::read(out("report/index.html")).unwrap();
+    std::fs::rename(out("report"), project.path("page")).unwrap();
+    let run = ["run", "-i", "dataset=b"];
+    project.ok(&run);
+    for more in [&[][..], &["-p", "render-depth.samples_per_axis=2"]] {
+        let mut copy = Command::new("cp");
+        copy.arg("-r").arg(project.path("page"));
+        assert!(copy.arg(out(".report.nerf-sr-new")).status().unwrap().success());
+        let said = project.ok(&[&run[..], more].concat());
+        assert!(
+            said.contains("what was there before is now") && said.contains("report-a"),
+            "{said}"
+        );
+        assert!(std::fs::read(out("report-a/index.html")).unwrap() == page);
+        assert!(is_whole(&out("report")));
+        std::fs::remove_dir_all(out("report-a")).unwrap();
+        assert_eq!(std::fs::read_dir(out("")).unwrap().count(), 1, "nothing is left beside");
+    }
+}
+
 /// A small tmpfs for the pages: needs root, as CI has; says so where it can't be mounted.
 #[test]
 fn a_full_disk_leaves_the_old_page() {

@@ -1,4 +1,5 @@
-//! Which published folders may be replaced: those in which everything is a sink's own, unchanged.
+//! Ownership of published folders: a folder may be replaced if a sink wrote all of it, and nobody
+//! has changed it since.
 
 use std::fs;
 use std::io;
@@ -8,16 +9,16 @@ use artifact::{Damage, MANIFEST_FILE, Manifest, list_files};
 
 use crate::aside::{MARK, Mark};
 
-/// Why a folder may not be replaced.
+/// Reason why a folder may not be replaced.
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum ForeignError {
-    /// It is a file or a link.
+    /// A file or a link stands in the folder's place.
     #[error("{0} is not a folder of nerf-sr's")]
     NoFolder(PathBuf),
-    /// A file in it that no sink of ours put there.
+    /// No sink wrote this file.
     #[error("{0} is not nerf-sr's")]
     File(PathBuf),
-    /// A file in it that isn't as a sink of ours left it.
+    /// This file differs from what a sink wrote.
     #[error("{0} was changed by somebody")]
     Changed(PathBuf),
     /// The folder, or a file in it, can't be read.
@@ -25,16 +26,16 @@ pub(crate) enum ForeignError {
     Unreadable {
         /// The folder or file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         problem: io::Error,
     },
-    /// The files in it can't be listed.
+    /// The folder's files can't be listed.
     #[error("{0}")]
     Unlisted(io::Error),
 }
 
-/// Whether all in a folder is what a sink of ours put there; else which file isn't. An empty folder
-/// may be replaced, too.
+/// Checks that a folder has nothing but what a sink wrote; otherwise names the first other file. An
+/// empty folder passes.
 pub(crate) fn owned(target: &Path, kind: &str) -> Result<(), ForeignError> {
     let is_link = target.symlink_metadata().is_ok_and(|meta| meta.file_type().is_symlink());
     if is_link || !target.is_dir() {

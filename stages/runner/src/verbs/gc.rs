@@ -38,7 +38,7 @@ pub(crate) fn gc(
     style.tell(&verdict)
 }
 
-/// What a problem means that comes before anything is decided.
+/// Context of an error that comes before anything is deleted.
 const UNREAD: &str =
     "nothing was deleted: gc must read the whole store; make this readable or move it away";
 

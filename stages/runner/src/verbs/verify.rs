@@ -36,7 +36,7 @@ pub(crate) fn verify(store: &Store, remove: bool) -> anyhow::Result<ExitCode> {
 /// A verification in progress.
 struct Verifying<'a> {
     store: &'a Store,
-    /// Whether damaged artifacts and records are removed.
+    /// True if damaged artifacts and records are to be removed.
     remove: bool,
     bar: &'a ProgressBar,
     tally: Tally,

@@ -1,0 +1,253 @@
+//! Publishing next to pages, leftovers of kills and somebody's files.
+
+use super::*;
+use crate::aside::MARK;
+use artifact::{MANIFEST_FILE, write_json};
+use std::ffi::OsString;
+
+/// A folder as a sink leaves it.
+fn made(dir: &Path, text: &str) -> PathBuf {
+    let folder = dir.join("made");
+    remove(&folder).unwrap();
+    fs::create_dir_all(folder.join("views")).unwrap();
+    fs::write(folder.join("index.html"), text).unwrap();
+    fs::write(folder.join("views/a.png"), "png").unwrap();
+    write_json(&folder.join(MANIFEST_FILE), &Manifest::of_folder("page", &folder).unwrap())
+        .unwrap();
+    let mark = Mark { identity: text.to_owned(), is_whole: true, data_sets: Vec::new() };
+    mark.write(&folder).unwrap();
+    folder
+}
+
+fn published(dir: &Path, text: &str) -> Result<PathBuf, StageFailure> {
+    publish(&made(dir, text), &dir.join("out"), "report", "page", &AtomicBool::new(false))
+        .map(|published| published.folder)
+}
+
+#[test]
+fn a_page_replaces_a_page() {
+    let dir = tempfile::tempdir().unwrap();
+    let target = published(dir.path(), "one").unwrap();
+    assert!(shows(&target, "one") && !shows(&target, "two"));
+    published(dir.path(), "two").unwrap();
+    assert_eq!(fs::read_to_string(target.join("index.html")).unwrap(), "two");
+    // One that lost a file is no longer whole, but ours.
+    fs::remove_file(target.join("views/a.png")).unwrap();
+    published(dir.path(), "two").unwrap();
+    assert!(target.join("views/a.png").exists());
+    assert_eq!(fs::read_dir(dir.path().join("out")).unwrap().count(), 1, "nothing is left beside");
+    let empty = dir.path().join("out/report");
+    remove(&empty).unwrap();
+    fs::create_dir(&empty).unwrap();
+    published(dir.path(), "three").unwrap();
+}
+
+/// A page of a data set as a sink leaves it.
+fn page(dir: &Path, text: &str, data_set: &str, is_whole: bool) -> PathBuf {
+    let folder = made(dir, text);
+    let data_sets = vec![data_set.to_owned()];
+    let mark = Mark { identity: text.to_owned(), is_whole, data_sets };
+    mark.write(&folder).unwrap();
+    folder
+}
+
+fn publish_page(dir: &Path, text: &str, data_set: &str, is_whole: bool) -> Option<OsString> {
+    let (folder, out) = (page(dir, text, data_set, is_whole), dir.join("out"));
+    let published = publish(&folder, &out, "report", "page", &AtomicBool::new(false)).unwrap();
+    assert!(published.aside.len() <= 1);
+    published.aside.first().map(|aside| aside.file_name().unwrap().to_owned())
+}
+
+fn page_text(dir: &Path, folder: &str) -> String {
+    fs::read_to_string(dir.join("out").join(folder).join("index.html")).unwrap()
+}
+
+/// Pages of data sets, one after the other: what was whole before is found again.
+#[test]
+fn what_shows_something_else_is_put_aside() {
+    let dir = tempfile::tempdir().unwrap();
+    assert_eq!(publish_page(dir.path(), "lego 1", "data/lego", true), None);
+    assert_eq!(
+        publish_page(dir.path(), "lego 2", "data/lego", true),
+        None,
+        "a newer one of the same"
+    );
+    assert_eq!(publish_page(dir.path(), "chair 1", "data/chair", true).unwrap(), "report-lego");
+    assert_eq!(publish_page(dir.path(), "lego 3", "data/lego", true).unwrap(), "report-chair");
+    assert_eq!(
+        (page_text(dir.path(), "report"), page_text(dir.path(), "report-lego")),
+        ("lego 3".into(), "lego 2".into())
+    );
+    assert_eq!(publish_page(dir.path(), "lego broken", "data/lego", false).unwrap(), "report-lego");
+    assert_eq!(page_text(dir.path(), "report-lego"), "lego 3");
+    // Another folder of that name has its own place, and so has what isn't ours.
+    assert_eq!(publish_page(dir.path(), "other 1", "more/lego", true).unwrap(), "report-lego-2");
+    fs::write(dir.path().join("out/report-lego-2/notes.txt"), "precious").unwrap();
+    assert_eq!(publish_page(dir.path(), "chair 2", "data/chair", true).unwrap(), "report-lego-3");
+    assert_eq!(
+        (page_text(dir.path(), "report-lego"), page_text(dir.path(), "report-lego-2")),
+        ("lego 3".into(), "lego broken".into())
+    );
+    assert_eq!(
+        (page_text(dir.path(), "report-lego-3"), page_text(dir.path(), "report")),
+        ("other 1".into(), "chair 2".into())
+    );
+}
+
+/// Folders of `out` with the text of each one's page, sorted.
+fn pages(dir: &Path) -> Vec<String> {
+    let names = fs::read_dir(dir.join("out")).unwrap();
+    let mut pages: Vec<String> = names
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .map(|name| format!("{name}: {}", page_text(dir, &name)))
+        .collect();
+    pages.sort();
+    pages
+}
+
+/// What a kill leaves of a publishing is ended by the next one: whole pages are found again.
+#[test]
+fn pages_left_by_a_kill_are_put_aside() {
+    const NEW: &str = ".report.nerf-sr-new";
+    const OLD: &str = ".report.nerf-sr-old";
+    type Lying<'a> = &'a [(&'a str, &'a str, &'a str, bool)];
+    let lego = ("lego 1", "lego", true);
+    let cases: [(&str, Lying<'_>, &[&str]); 8] = [
+        (
+            "exchanged, and killed before the old page was put aside",
+            &[("report", "chair 1", "chair", true), (NEW, lego.0, lego.1, lego.2)],
+            &["report-lego: lego 1", "report: chair 2"],
+        ),
+        (
+            "a whole page before a part of one",
+            &[("report", "chair 1", "chair", false), (NEW, "chair 0", "chair", true)],
+            &["report-chair: chair 0", "report: chair 2"],
+        ),
+        (
+            "one that was to be deleted",
+            &[("report", "chair 1", "chair", true), (NEW, "chair 0", "chair", true)],
+            &["report: chair 2"],
+        ),
+        (
+            "copied, and killed before it was put in its place",
+            &[("report", lego.0, lego.1, lego.2), (NEW, "chair 2", "chair", true)],
+            &["report-lego: lego 1", "report: chair 2"],
+        ),
+        ("the first page of all", &[(NEW, "chair 2", "chair", true)], &["report: chair 2"]),
+        (
+            "without exchange, killed between two renames",
+            &[(OLD, lego.0, lego.1, lego.2), (NEW, "chair 2", "chair", true)],
+            &["report-lego: lego 1", "report: chair 2"],
+        ),
+        (
+            "without exchange, killed before the third",
+            &[("report", "chair 1", "chair", true), (OLD, lego.0, lego.1, lego.2)],
+            &["report-lego: lego 1", "report: chair 2"],
+        ),
+        (
+            "killed while an older page was deleted",
+            &[
+                ("report", "chair 1", "chair", true),
+                (NEW, lego.0, lego.1, lego.2),
+                (".report.nerf-sr-scrap", "lego 0", "lego", true),
+            ],
+            &["report-lego: lego 1", "report: chair 2"],
+        ),
+    ];
+    for (what, lying, expected) in cases {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("out")).unwrap();
+        for (name, text, data_set, is_whole) in lying {
+            let made = page(dir.path(), text, data_set, *is_whole);
+            fs::rename(made, dir.path().join("out").join(name)).unwrap();
+        }
+        publish_page(dir.path(), "chair 2", "chair", true);
+        assert_eq!(pages(dir.path()), expected, "{what}");
+    }
+}
+
+/// A leftover means that there is something to do, even where the page itself is right.
+#[test]
+fn a_page_with_a_leftover_beside_it_is_not_up_to_date() {
+    let dir = tempfile::tempdir().unwrap();
+    let target = published(dir.path(), "one").unwrap();
+    for name in [".report.nerf-sr-new", ".report.nerf-sr-old"] {
+        let leftover = target.with_file_name(name);
+        fs::create_dir(&leftover).unwrap();
+        assert!(!shows(&target, "one"), "{name}");
+        published(dir.path(), "one").unwrap();
+        assert!(shows(&target, "one") && !leftover.exists(), "{name}");
+    }
+}
+
+/// Half a copy is no page; somebody's files are nobody else's to delete.
+#[test]
+fn leftovers_that_are_no_pages_are_not_put_aside() {
+    let dir = tempfile::tempdir().unwrap();
+    publish_page(dir.path(), "chair 1", "chair", true);
+    let leftover = dir.path().join("out/.report.nerf-sr-new");
+    fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
+    fs::remove_file(leftover.join("index.html")).unwrap();
+    publish_page(dir.path(), "chair 2", "chair", true);
+    assert_eq!(pages(dir.path()), ["report: chair 2"]);
+    for (file, words) in
+        [("notes.txt", "notes.txt is not nerf-sr's"), ("index.html", "index.html was changed")]
+    {
+        fs::rename(page(dir.path(), "lego 1", "lego", true), &leftover).unwrap();
+        fs::write(leftover.join(file), "precious").unwrap();
+        let message = published(dir.path(), "chair 3").unwrap_err().message;
+        assert!(message.contains(words) && message.contains("move it away"), "{message}");
+        assert_eq!(fs::read_to_string(leftover.join(file)).unwrap(), "precious");
+        assert_eq!(page_text(dir.path(), "report"), "chair 2");
+        remove(&leftover).unwrap();
+    }
+}
+
+fn all_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let files = list_files(folder).unwrap().into_iter();
+    files.map(|(relative, file)| (relative, fs::read(file).unwrap())).collect()
+}
+
+/// Whatever isn't ours stays to the byte, and is named.
+#[test]
+fn what_is_not_ours_is_not_replaced() {
+    type Damage = fn(&Path);
+    let cases: [(&str, Damage); 9] = [
+        ("cannot read ", |t| {
+            fs::remove_file(t.join(MARK)).unwrap();
+            fs::create_dir(t.join(MARK)).unwrap();
+        }),
+        ("report/notes.txt is not nerf-sr's", |t| {
+            fs::write(t.join("notes.txt"), "precious").unwrap();
+        }),
+        ("report/views/mine.png is not nerf-sr's", |t| {
+            fs::write(t.join("views/mine.png"), "precious").unwrap();
+        }),
+        ("report/index.html was changed", |t| {
+            fs::write(t.join("index.html"), "my own words").unwrap();
+        }),
+        ("index.html is not nerf-sr's", |t| fs::remove_file(t.join(MANIFEST_FILE)).unwrap()),
+        ("index.html is not nerf-sr's", |t| fs::write(t.join(MANIFEST_FILE), "{}").unwrap()),
+        ("index.html is not nerf-sr's", |t| {
+            let manifest = Manifest { kind: "scene".into(), ..Manifest::read(t).unwrap() };
+            write_json(&t.join(MANIFEST_FILE), &manifest).unwrap();
+        }),
+        ("report is not a folder", |t| {
+            fs::rename(t, t.with_extension("real")).unwrap();
+            std::os::unix::fs::symlink(t.with_extension("real"), t).unwrap();
+        }),
+        ("report is not a folder", |t| {
+            remove(t).unwrap();
+            fs::write(t, "precious").unwrap();
+        }),
+    ];
+    for (words, damage) in cases {
+        let dir = tempfile::tempdir().unwrap();
+        let target = published(dir.path(), "one").unwrap();
+        damage(&target);
+        let before = all_files(&dir.path().join("out"));
+        let message = published(dir.path(), "two").unwrap_err().message;
+        assert!(message.contains(words) && message.contains("--out"), "{words}: {message}");
+        assert_eq!(all_files(&dir.path().join("out")), before, "{words}");
+    }
+}
