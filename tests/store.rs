@@ -84,7 +84,7 @@ fn gc_deletes_nothing_where_a_file_may_not_be_read() {
     for (folder, ending, decides) in NEEDED {
         let path = first(&project, folder, ending);
         let permissions = fs::metadata(&path).unwrap().permissions();
-        fs::set_permissions(&path, PermissionsExt::from_mode(0)).unwrap();
+        fs::set_permissions(&path, PermissionsExt::from_mode(0o0)).unwrap();
         let name = format!("{folder}/{}", path.file_name().unwrap().to_str().unwrap());
         let refused = [&name, "Permission denied", "owned by user", "umask 002", "--store"];
         for arguments in [&["gc", "--keep-days", "0"][..], &["gc", "--dry-run"]] {
@@ -172,7 +172,7 @@ fn a_damaged_record_stops_gc_until_it_is_removed_or_made_again() {
 fn a_colleagues_files_are_not_called_damaged() {
     let project = pinned();
     let object = first(&project, "objects", "");
-    fs::set_permissions(&object, PermissionsExt::from_mode(0)).unwrap();
+    fs::set_permissions(&object, PermissionsExt::from_mode(0o0)).unwrap();
     let Some(verified) = unprivileged(&project, &["verify", "--remove"]) else { return };
     fs::set_permissions(&object, PermissionsExt::from_mode(0o777)).unwrap();
     let said = &verified.stdout;
