@@ -3,6 +3,7 @@
 #![allow(missing_docs, reason = "a test")]
 mod common;
 
+use artifact::hash_json;
 use common::Project;
 use serde_json::{Value, json};
 
@@ -70,8 +71,8 @@ fn plain(line: &str) -> String {
     }
 }
 
-/// Changes the parts of a stage's key as another version would have written them; under its name as
-/// a file, the next run finds it no more.
+/// Changes the parts of a stage's key as another version would have written them; under the key that
+/// these come to, the next run finds the record no more.
 fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
     let actions = std::fs::read_dir(project.path(".nerf-sr/actions"))
         .unwrap()
@@ -81,11 +82,8 @@ fn change_key(project: &Project, stage: &str, part: &str, value: &Value) {
         if record["stage"] == stage {
             record["key_parts"][part].clone_from(value);
             std::fs::remove_file(&path).unwrap();
-            std::fs::write(
-                path.with_file_name(format!("{}.json", "0".repeat(64))),
-                record.to_string(),
-            )
-            .unwrap();
+            let name = format!("{}.json", hash_json(&record["key_parts"]));
+            std::fs::write(path.with_file_name(name), record.to_string()).unwrap();
         }
     }
 }
