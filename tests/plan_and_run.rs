@@ -169,7 +169,7 @@ impl World {
     fn records(&self) -> BTreeMap<String, bool> {
         let store = store::Store::open(&self.project.path(".nerf-sr")).unwrap();
         let keys = store.records().unwrap().into_iter().map(|record| record.key());
-        keys.map(|key| (key.clone(), store.hit(&key).is_some())).collect()
+        keys.map(|key| (key.clone(), store.hit(&key).unwrap().is_some())).collect()
     }
 
     /// One value or a sweep's.

@@ -77,7 +77,7 @@ fn what_is_here_is_not_overwritten() {
     let other = Store::open(&setup.path("other")).unwrap();
     let own = make(&other, "eval", &[], &[("metrics.json", b"mine".to_vec())]);
     let (code, _, _) = setup.pull("other", &[]);
-    assert_eq!((code, other.hit(&own.key())), (0, Some(own)));
+    assert_eq!((code, other.hit(&own.key()).unwrap()), (0, Some(own)));
     let train = &setup.records[2];
     fs::write(other.object(&train.output).join("field.bin"), "cut short").unwrap();
     assert_eq!(setup.pull("other", &[]).0, 0);

@@ -110,7 +110,7 @@ pub(crate) fn succeed(command: &mut Command) -> String {
 /// Every record is of a whole artifact, and nothing is left over.
 pub(crate) fn assert_clean(store: &Store) {
     for record in store.records().unwrap() {
-        assert_eq!(store.hit(&record.key()).as_ref(), Some(&record));
+        assert_eq!(store.hit(&record.key()).unwrap().as_ref(), Some(&record));
     }
     for object in store.objects().unwrap() {
         store.verify(&object).unwrap();
